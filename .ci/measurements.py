@@ -108,6 +108,14 @@ TABLE = {
         (*BATHS, "ase", "openmm", "free_energy"), script("35_more_free_energies", "--full more-free-energies"), 80
     ),
     "openmm.json": Measurement(OPENMM, script("06_openmm"), None),
+    "openmm_barostats.json": Measurement(
+        (*OPENMM, "thermostats"),
+        (
+            "env KCONS_BAROSTATS=F python -m pytest -m validation -k each_beside_each"
+            " tests/contracts/test_openmm_barostat_ensembles.py",
+        ),
+        5,
+    ),
     "openmm_compare.json": Measurement(OPENMM, script("11_openmm_compare"), 20),
     "openmm_constraints.json": Measurement(OPENMM, script("08_openmm_constraints"), 20),
     "openmm_four_femtoseconds.json": Measurement(OPENMM, script("24_openmm_four_femtoseconds"), None),

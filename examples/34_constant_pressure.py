@@ -424,13 +424,14 @@ RUNS: dict[str, Any] = {
         )
     },
     **{
-        f"dumbbells, {b}, {kind}, Langevin": partial(
-            compared, partial(run_fluid, "dumbbells", b, "Langevin", 240_000, kind)
+        f"dumbbells, {b}, {kind}, Langevin": partial(compared, partial(run_fluid, "dumbbells", b, "Langevin", n, kind))
+        for b, kind, n in (
+            ("Monte Carlo", "flexible", 240_000),
+            *(("rescaling", kind, 120_000) for kind in ("flexible", "anisotropic")),
         )
-        for b, kind in (("Monte Carlo", "flexible"), ("rescaling", "flexible"), ("rescaling", "anisotropic"))
     },
     **{
-        f"OpenMM, {b}, {e}": partial(compared, partial(run_in_openmm, e, b, 600_000 if b == "flexible" else 60_000))
+        f"OpenMM, {b}, {e}": partial(compared, partial(run_in_openmm, e, b, 360_000 if b == "flexible" else 60_000))
         for b, e in BESIDE
     },
     **{f"cost, rescaling, {n}": partial(cost, n, turns) for n, turns in ((108, 60), (500, 20))},
@@ -481,9 +482,8 @@ def short_runs() -> None:
     for barostat in ("Monte Carlo", "rescaling"):
         one = run_fluid("dumbbells", barostat, "Langevin", 600)
         volume, error = volumes.mean_and_error(one["volumes"])
-        print(
-            f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {one['acceptance']:.0%} of trials accepted"
-        )
+        accepted = f"{one['acceptance']:.0%} of trials accepted"
+        print(f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {accepted}")
     short = crystal(100, 1)
     print("A crystal of rigid diatomics: sides", ", ".join(f"{side:.4f}" for side, _ in short["sides"]))
     short = slab(60)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from operator import is_
 from typing import Any, Literal
@@ -273,20 +273,20 @@ class ConstrainedDynamics(MolecularDynamics):
         return self._state
 
     def _resume(self, state: State) -> None:
-        """Go on from `state` exactly; the atoms are changed only if it fits them."""
-        system = self._systems()
-        n = len(self.atoms)
-        x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
-        require_on_surface(system.motion.constraint_set, x, state.time)
-        away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
-        if away > START_TOLERANCE * np.abs(v).max(initial=0.0) and away > system.rest(x, v, state.time):
-            raise InputError(
-                f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?", item="state"
-            )
-        self.time, self.nsteps = float(state.time), int(state.step)
-        self._momenta, _ = self._put(x, v)
-        self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
-        self._cell = _cell_of(self.atoms)
+        """Go on from `state` exactly, in the cell that a barostat left; the atoms are changed only if it fits them."""
+        with _in_cell(self.atoms, state.cell):
+            system = self._systems()
+            n = len(self.atoms)
+            x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
+            require_on_surface(system.motion.constraint_set, x, state.time)
+            away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
+            if away > START_TOLERANCE * np.abs(v).max(initial=0.0) and away > system.rest(x, v, state.time):
+                message = f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?"
+                raise InputError(message, item="state")
+            self.time, self.nsteps = float(state.time), int(state.step)
+            self._momenta, _ = self._put(x, v)
+            self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
+            self._cell = _cell_of(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
         """What a thermostat goes on with where somebody moved the atoms."""
@@ -335,6 +335,19 @@ class ConstrainedDynamics(MolecularDynamics):
         if self._only_forces:
             return applied_forces(self.atoms)
         return self.atoms.get_forces(apply_constraint=False)
+
+
+@contextmanager
+def _in_cell(atoms: Atoms, cell: FloatArray | None) -> Iterator[None]:
+    """Atoms in this cell, if any; in their own again where what follows fails."""
+    before = atoms.cell.array.copy()
+    if cell is not None:
+        atoms.cell[...] = cell
+    try:
+        yield
+    except BaseException:
+        atoms.cell[...] = before
+        raise
 
 
 def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:

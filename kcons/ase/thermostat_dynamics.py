@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import generator_of, seed_from
+from kcons.constraints.arguments import generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, Stepper, System
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
-from kcons.thermostats.freedom import Momentum, open_directions, positive
+from kcons.thermostats.freedom import Momentum, open_directions
 from kcons.thermostats.isokinetic.isokinetic import Convention
-from kcons.thermostats.pressure import Barostat, ConstantPressure
+from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
@@ -53,7 +53,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
-        self.barostat = barostat
+        self.barostat = None if barostat is None else require_barostat(barostat)
         if restart is not None:
             if "state" in kwargs:
                 raise InputError("give restart or state, not both", item="restart")
@@ -96,11 +96,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         system = AtomsSystem(motion, self._force, self._energy, self.atoms, stressless=self._only_forces, far=FAR)
         self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
         return system
-
-    def _resume(self, state: State) -> None:
-        if state.cell is not None and self.barostat is not None:
-            self.atoms.cell[...] = state.cell
-        super()._resume(state)
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the state, all it takes to continue to the last bit with `restart=file` (see `State.save`).

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
@@ -20,7 +20,6 @@ from kcons.thermostats.freedom import (
     Momentum,
     carried,
     freedom,
-    positive,
     refuse_friction,
     warn_of_conserved_momenta,
 )

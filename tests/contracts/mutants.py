@@ -425,6 +425,12 @@ MUTANTS = [
         "pass",
         "tests/models/test_projected_steps.py::test_the_next_step_starts_from_the_projection",
     ),
+    (
+        "solvers/sparse/row_functions.py",
+        "and before[1] == time and before[2] == value:",
+        "and before[1] == time:",
+        "tests/solvers/sparse/test_row_functions.py::test_a_gradient_is_found_again_where_the_value_has_changed",
+    ),
     # -- steppers, thermostats, arrays --
     (
         "steppers/adaptive/multistep.py",

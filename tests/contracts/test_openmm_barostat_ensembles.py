@@ -1,10 +1,14 @@
 """OpenMM's barostats beside our integrators: volumes of rigid ideal gases have their exact distribution.
 
 N is the number of molecules as OpenMM counts them: joined by constraints of the System, by bonds, and by the bonds of
-no strength of `hold(..., join=True)`.
+no strength of `hold(..., join=True)`. KCONS_BAROSTATS names a file, if any, into which the validation runs write what
+they find; see docs/constant_pressure.md.
 """
 
 from __future__ import annotations
+
+import os
+from pathlib import Path
 
 import numpy as np
 import openmm
@@ -13,6 +17,7 @@ from openmm_systems import started, state_of
 from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
+from kcons.comparison import environment, json_files
 from kcons.constraints import Distance
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold, molecular_pressure
 from kcons.thermostats.multistep import autocorrelation_time
@@ -126,10 +131,12 @@ SHAPED = {
 
 
 def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
-    """Rigid molecules, and an energy that keeps the shape of the box and knows nothing of its volume.
+    """What was found, with the p of the exact distribution for N and for `off` more and less, which are told from it.
+
+    Rigid molecules, and an energy that keeps the shape of the box and knows nothing of its volume.
 
     Without it shapes of a gas wander; it is stiff enough that no box vector has to be replaced by a shorter one, about
-    which OpenMM's flexible barostat is not exact, also beside its own integrators. N is told from `off` more and less.
+    which OpenMM's flexible barostat is not exact, also beside its own integrators.
     """
     system, x = gas(n=n, side=side)
     system.addForce(openmm.CustomVolumeForce(f"{20 * KT}*((ax^2+bx^2+by^2+cx^2+cy^2+cz^2)/v^(2/3)-3)"))
@@ -142,6 +149,8 @@ def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
     box = context.getState().getPeriodicBoxVectors(asNumpy=True)._value
     assert (abs(box[np.tril_indices(3, -1)]) > 1e-3).all() == (barostat == "flexible")
     integrator.check()
+    told = {"ensemble": ensemble, "barostat": barostat, "steps": count, "molecules": n, "off": off}
+    return told | {"independent": count / autocorrelation_time(found), "less": less, "p": right, "more": more}
 
 
 @pytest.mark.parametrize(
@@ -151,15 +160,26 @@ def test_volumes_beside_barostats_of_shapes(ensemble, barostat):
     judge_beside(ensemble, barostat, 8000 if barostat == "flexible" else 4000, 3)
 
 
+@pytest.fixture(scope="module")
+def measured():
+    """Name -> what was found; written when all are done."""
+    found, here = {}, environment()
+    yield found
+    if file := os.environ.get("KCONS_BAROSTATS"):
+        known = json_files.read(file)["runs"] if Path(file).exists() else {}
+        json_files.write(file, {"format": "kcons barostats", "environment": here, "runs": known | found})
+
+
 @pytest.mark.validation
 @pytest.mark.parametrize("ensemble", ENSEMBLES)
 @pytest.mark.parametrize("barostat", SHAPED)
-def test_volumes_of_each_beside_each(ensemble, barostat):
+def test_volumes_of_each_beside_each(ensemble, barostat, measured):
     """With fewer molecules OpenMM's trials reach volumes below zero, but for those of the flexible barostat."""
     if barostat == "flexible":  # six lengths at once: few volumes are independent
-        judge_beside(ensemble, barostat, 20_000, 2)
+        found = judge_beside(ensemble, barostat, 20_000, 2)
     else:
-        judge_beside(ensemble, barostat, 20_000, 2 if barostat == "membrane" else 1, N, SIDE)
+        found = judge_beside(ensemble, barostat, 20_000, 2 if barostat == "membrane" else 1, N, SIDE)
+    measured[f"{barostat}, {ensemble}"] = found
 
 
 @pytest.mark.parametrize("joined", [False, True])

@@ -40,6 +40,21 @@ def test_the_page_shows_them():
             assert line in text, line
 
 
+def test_each_barostat_of_openmm_beside_each_ensemble():
+    """The page shows p of the exact distribution, and the largest of those with too many or too few molecules."""
+    runs = json.loads((FOLDER / "openmm_barostats.json").read_text(encoding="utf-8"))["runs"]
+    barostats, ensembles = ("isotropic", "three axes", "membrane", "flexible"), ("Langevin", "NoseHoover", "Isokinetic")
+    assert set(runs) == {f"{b}, {e}" for b in barostats for e in ensembles}
+    text = page("constant_pressure.md")
+    for barostat in barostats:
+        found = [runs[f"{barostat}, {e}"] for e in ensembles]
+        n, off = found[0]["molecules"], found[0]["off"]
+        wrong = max(p for one in found for p in (one["less"], one["more"]))
+        assert min(one["p"] for one in found) > 0.01 and wrong < 1e-3 and off <= 2
+        seen = " | ".join(f"{one['p']:.2f}" for one in found)
+        assert f"| {barostat} | {n} | {seen} | {wrong:.0e} for N ± {off} |" in text
+
+
 def test_density_of_water_is_that_of_openmm():
     ours, theirs = (one_of(of(f"water, {name}", "density")) for name in ("Monte Carlo", "OpenMM"))
     error = np.hypot(ours[1], theirs[1])

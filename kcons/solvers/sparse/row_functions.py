@@ -314,41 +314,76 @@ def _of_jitted_coefficients(coefficients: Any, width: int, timed: bool, step: fl
 
 
 class PythonRows:
-    """The rows of one object whose functions are Python's; what these raise is kept until the kernel has ended."""
+    """The rows of one object whose functions are Python's; what these raise is kept until the kernel has ended.
+
+    Beside a function that takes a microsecond everything done here shows.
+    """
 
     def __init__(self, item: FunctionRows | CustomVelocity, numbers: FloatArray) -> None:
         self.error: BaseException | None = None
         width, count = item.width, 3 * item.width
         start = numbers.ctypes.data
-        row: Callable[..., Any] = _velocity_row(item) if isinstance(item, CustomVelocity) else item.row
-        room = count if item.holonomic else 2 * count
+        row = _velocity_row(item) if isinstance(item, CustomVelocity) else _position_row(item)
+        shape = (width, 3) if item.holonomic else (2, width, 3)
+        # By address: places, rows, values, gradients.
+        places: dict[int, FloatArray] = {}
+        rows: dict[int, int] = {}
+        values: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+        def piece(address: int, size: int) -> FloatArray:
+            first = (address - start) >> 3
+            return numbers[first : first + size]
 
         def called(r: int, p: int, time: float, out: int) -> None:
-            at = (out - start) >> 3
             try:
-                first = (r - start) >> 3
-                # A copy: the function may keep what it sees.
-                place = numbers[first : first + room].reshape(-1, width, 3).copy()
-                value, slope = row(int(numbers[(p - start) >> 3]), *place, time)
-                numbers[at] = value
-                numbers[at + 1 : at + 1 + count] = slope.reshape(count)
+                if r not in places:
+                    places[r] = piece(r, math.prod(shape)).reshape(shape)
+                if p not in rows:
+                    rows[p] = int(piece(p, 1)[0])
+                if out not in values:
+                    values[out] = piece(out, 1), piece(out + 8, count).reshape(width, 3)
+                value, slope = values[out]
+                value[0], slope[...] = row(rows[p], places[r], time)
             except BaseException as error:
                 self.error = self.error or error
-                numbers[at : at + 1 + count] = np.nan
+                piece(out, 1 + count)[:] = np.nan
 
         self._function = _C_ROW(called)
         self.address = ctypes.cast(self._function, ctypes.c_void_p).value
 
 
-def _velocity_row(item: CustomVelocity) -> Callable[..., tuple[float, FloatArray]]:
+def _position_row(item: FunctionRows) -> Callable[[int, FloatArray, float], tuple[float, FloatArray]]:
+    """Its rows; of a place that comes twice running, as the end of a step and the start of the next, one gradient.
+
+    The value is found again, and the gradient with it where the value is another: what the function reads besides may
+    have changed.
+    """
+    last: dict[int, tuple[bytes, float, float, FloatArray]] = {}
+
+    def row(k: int, place: FloatArray, time: float) -> tuple[float, FloatArray]:
+        # A copy: the function may keep what it sees.
+        r = place.copy()
+        r.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
+        here, value, before = r.tobytes(), item.row_value(k, r, time), last.get(k)
+        if before is not None and before[0] == here and before[1] == time and before[2] == value:
+            return value, before[3]
+        slope = item.row_gradient(k, r, time)
+        last[k] = here, time, value, slope.copy()
+        return value, slope
+
+    return row
+
+
+def _velocity_row(item: CustomVelocity) -> Callable[[int, FloatArray, float], tuple[float, FloatArray]]:
     """Its rows as functions of the end of a way; coefficients of a place that comes twice running are found once."""
     last: dict[int, tuple[bytes, float, FloatArray]] = {}
 
-    def row(k: int, place: FloatArray, way: FloatArray, time: float) -> tuple[float, FloatArray]:
+    def row(k: int, place_and_way: FloatArray, time: float) -> tuple[float, FloatArray]:
+        place = place_and_way[0]
         here, before = place.tobytes(), last.get(k)
         if before is None or before[0] != here or before[1] != time:
-            before = last[k] = here, time, item.row(k, place, time).copy()
-        return float(np.vdot(before[2], way)), before[2]
+            before = last[k] = here, time, item.row(k, place.copy(), time).copy()
+        return float(np.vdot(before[2], place_and_way[1])), before[2]
 
     return row
 

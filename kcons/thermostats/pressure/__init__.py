@@ -10,7 +10,7 @@
 - `measured`: the pressure of a state
 """
 
-from kcons.thermostats.pressure.barostat import Barostat
+from kcons.thermostats.pressure.barostat import Barostat, require_barostat
 from kcons.thermostats.pressure.cell_rescaling import CellRescaling
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.constant_pressure import ConstantPressure
@@ -29,4 +29,5 @@ __all__ = [
     "constraint_virial",
     "find_pieces",
     "instantaneous_pressure",
+    "require_barostat",
 ]

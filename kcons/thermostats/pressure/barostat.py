@@ -11,13 +11,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import check_pairs, finite_number, seed_number, whole_number
+from kcons.constraints.arguments import check_pairs, finite_number, positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.langevin import wind
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
@@ -176,11 +175,16 @@ class Barostat:
         known = self._pieces.get(system)
         if known is None:
             require_periodic(system, self.strains.axes, self.strains.kind)
+            self._check_width(system, system.cell)
             known = find_pieces(system, positions, self.strains.axes, self.molecules, self.held, time)
             if self.strains.flexible and not known.open.all():
                 raise UnsupportedError("a cell that changes its angles turns what is held in space; use another kind")
             self._pieces[system] = known
         return known
+
+    def goes_on_from(self, variables: FloatArray) -> bool:
+        """Whether these are variables of a barostat of this kind."""
+        return variables.shape == (MODES + 3 * len(self.strains),)
 
     def begin(self, system: CellSystem) -> FloatArray:
         """Variables of a run that begins in the system's present cell."""
@@ -206,12 +210,17 @@ class Barostat:
         InputError
             The trial cell is too small, for a constraint or the cutoff; `ImageError` where rows would mean others.
         NonFiniteError
-            An energy is NaN.
+            An energy is NaN, or that of the present cell infinite.
         """
         assert state.barostat is not None and state.cell is not None
         pieces = self.pieces(system, state.positions, state.time)
         wind(self._bits, (self.seed, 1), state.step)
         before = self._place(system, state.cell, state.positions, state)
+        if not math.isfinite(before.energy):
+            raise NonFiniteError(
+                f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
+                "atoms overlap, or the force field returns what is no energy"
+            )
         trial = self._trial(system, pieces, before, state, thermal_energy, dt, self._random)
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)
@@ -243,16 +252,19 @@ class Barostat:
         return replace(state, positions=positions, remainder=remainder, forces=after.forces, barostat=variables)
 
     def _enter(self, system: CellSystem, cell: FloatArray, positions: FloatArray) -> None:
+        self._check_width(system, cell)
+        system.set_cell(cell, positions)
+
+    def _check_width(self, system: CellSystem, cell: FloatArray) -> None:
         if self.cutoff is not None:
             inverse = np.linalg.inv(cell)[:, system.periodic]
             width = 1 / float(np.linalg.norm(inverse, axis=0).max())
             if width < 2 * self.cutoff:
                 raise InputError(
-                    f"the cell has shrunk to a width of {width:g}, less than twice the cutoff ({self.cutoff:g}): use a "
-                    "larger system, a smaller cutoff, or look whether the pressure is meant",
+                    f"the cell has a width of {width:g}, less than twice the cutoff ({self.cutoff:g}): use a larger "
+                    "system, a smaller cutoff, or look whether the pressure is meant, by which it may have shrunk",
                     item="cell",
                 )
-        system.set_cell(cell, positions)
 
     def _place(self, system: CellSystem, cell: FloatArray, positions: FloatArray, state: State) -> Place:
         stress = forces = None
@@ -312,3 +324,16 @@ def _added(x: FloatArray, d: FloatArray, remainder: FloatArray | None) -> tuple[
         return y, None
     part = y - x
     return y, remainder + ((x - (y - part)) + (d - part))
+
+
+def require_barostat(given: object) -> Barostat:
+    """What is given, if it is a barostat.
+
+    Raises
+    ------
+    InputError
+        It is not.
+    """
+    if isinstance(given, Barostat):
+        return given
+    raise InputError(f"barostat is {given!r}; give MonteCarloBarostat(pressure) or CellRescaling(...)", item="barostat")

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.steppers import State
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.pressure.barostat import Barostat, Place, Trial
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.centre_moves import work_of_shapes
@@ -46,6 +46,9 @@ class CellRescaling(Barostat):
         super().__init__(pressure, **kwargs)
         self.tau = positive(tau, "tau")
         self.compressibility = positive(compressibility, "compressibility")
+
+    def goes_on_from(self, variables: FloatArray) -> bool:
+        return super().goes_on_from(variables) and not self._modes(variables)[2].any()
 
     def _drift(
         self, system: CellSystem, pieces: Pieces, place: Place, time: float, thermal_energy: float, dt: float

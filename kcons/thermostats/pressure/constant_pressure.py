@@ -13,7 +13,7 @@ from kcons.steppers.stepper import Listed
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
-from kcons.thermostats.pressure.barostat import WORK, Barostat
+from kcons.thermostats.pressure.barostat import WORK, Barostat, require_barostat
 from kcons.thermostats.pressure.cell_system import CellSystem
 
 
@@ -26,6 +26,11 @@ class ConstantPressure(Listed):
         Others keep no temperature, or remember energies and forces of the cell that was.
     barostat : Barostat
 
+    Raises
+    ------
+    InputError
+        What is given is no barostat.
+
     Notes
     -----
     `State.barostat` holds the cell (`State.cell`), the energy that trials have brought, and what the barostat has
@@ -37,7 +42,7 @@ class ConstantPressure(Listed):
     symplectic = False
 
     def __init__(self, stepper: Stepper, barostat: Barostat) -> None:
-        self.stepper, self.barostat = stepper, barostat
+        self.stepper, self.barostat = stepper, require_barostat(barostat)
 
     def __repr__(self) -> str:
         return f"ConstantPressure({self.stepper!r}, {self.barostat!r})"
@@ -90,7 +95,7 @@ class ConstantPressure(Listed):
             if self.barostat.needs_stress:
                 system.stress(state.positions, state.time)
             return state
-        if state.barostat.shape != self.barostat.begin(system).shape:
+        if not self.barostat.goes_on_from(state.barostat):
             raise InputError(
                 f"the state carries variables of another barostat, not of {self.barostat!r}; start with "
                 "dataclasses.replace(state, barostat=None)",

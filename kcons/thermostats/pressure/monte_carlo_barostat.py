@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.steppers import State
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.pressure.barostat import Barostat, Place, Trial
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Pieces
@@ -47,6 +47,10 @@ class MonteCarloBarostat(Barostat):
     def __init__(self, pressure: float, *, width: float = 0.01, **kwargs: Any) -> None:
         super().__init__(pressure, **kwargs)
         self.width = positive(width, "width")
+
+    def goes_on_from(self, variables: FloatArray) -> bool:
+        # Logarithms of widths are negative; other barostats adapt nothing.
+        return super().goes_on_from(variables) and bool((self._modes(variables)[2] < 0).all())
 
     def begin(self, system: CellSystem) -> FloatArray:
         variables = super().begin(system)

@@ -120,6 +120,8 @@ def find_pieces(
         Bonds of unknown atoms.
     """
     motion, n_atoms = system.motion, system.n_atoms
+    if not n_atoms:
+        raise UnsupportedError("no piece of the system could follow the cell: it has no atoms")
     constraint_set = motion.constraint_set
     links = [_chained(c.atoms) for c in constraint_set.constraints if c.n_rows and c.width > 1]
     nearest = [_chained(c.atoms if c.whole is None else c.atoms[~c.whole]) for c in constraint_set.constraints]

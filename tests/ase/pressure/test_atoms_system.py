@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ase import units
@@ -13,6 +15,7 @@ from pressure_systems import p_value
 from scipy import stats
 
 from kcons.ase import (
+    ConstrainedDynamics,
     ConstrainedLangevin,
     ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
@@ -79,6 +82,23 @@ def test_a_run_goes_on_bit_for_bit(name, which, tmp_path):
     assert np.array_equal(other.positions, atoms.positions)
     assert np.array_equal(other.get_momenta(), atoms.get_momenta())
     assert np.array_equal(again.state.barostat, whole.state.barostat)
+
+
+def test_a_run_goes_on_without_its_barostat_in_its_cell(tmp_path):
+    """Also where it is refused, the cell of the atoms is their own."""
+    atoms, _ = gas()
+    other = atoms.copy()
+    whole = MADE["langevin"](atoms, barostat=barostats(every=1)["monte carlo"])
+    whole.run(5)
+    whole.save(tmp_path / "state.npz")
+    other.calc = Free()
+    MADE["langevin"](other, restart=tmp_path / "state.npz").run(3)
+    assert other.cell.array.tolist() == atoms.cell.array.tolist() != [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
+    third, _ = gas()
+    state = replace(whole.state, positions=1.1 * atoms.positions)
+    with pytest.raises(InputError, match="off row"):
+        ConstrainedDynamics(third, FS, state=state)
+    assert third.cell.array.tolist() == [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
 
 
 # -- forces, and what moves ---------------------------------------------------------------------------
@@ -225,6 +245,9 @@ def test_an_energy_that_is_nan():
 
 def test_what_has_no_temperature_or_no_cell():
     atoms, _ = gas()
+    for wrong in ("Monte Carlo", MonteCarloBarostat, 1.0):
+        with pytest.raises(InputError, match=r"barostat is .*; give"):
+            MADE["langevin"](atoms, barostat=wrong)
     with pytest.raises(UnsupportedError, match="keeps no temperature"):
         ConstrainedMonteCarlo(atoms, FS, TEMPERATURE, 3, barostat=MonteCarloBarostat(0.0))
     with pytest.raises(UnsupportedError, match="friction"):

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pressure_systems import gas, started
+from pressure_systems import gas, no_force, started
 
 from kcons.constraints import FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
-from kcons.thermostats.pressure import CellSystem, MonteCarloBarostat
+from kcons.thermostats.pressure import CellRescaling, CellSystem, MonteCarloBarostat
 
 
 @pytest.mark.parametrize(
@@ -78,6 +78,24 @@ def test_overlaps_are_rejected():
         vars(state)["step"] = k
         assert np.array_equal(system.cell, 12 * np.eye(3))
         assert np.array_equal(state.positions, x)
+
+
+@pytest.mark.parametrize("energy", [np.inf, -np.inf])
+@pytest.mark.parametrize("barostat", [MonteCarloBarostat(1.0), CellRescaling(1.0, 1.0, 1.0)])
+def test_an_energy_that_judges_nothing(barostat, energy):
+    """Otherwise all trials would be accepted."""
+    functions = {"potential": lambda x, t, h: energy, "stress": lambda x, t, h: np.zeros((3, 3))}
+    system, x = gas(n=4, force=no_force, **functions)
+    state = started(system, x, barostat)
+    with pytest.raises(NonFiniteError, match="inf at step 0, by which no trial"):
+        barostat.move(system, state, 1.0, 1.0)
+    assert np.array_equal(system.cell, 12 * np.eye(3))
+
+
+def test_a_cell_too_small_for_the_cutoff_is_refused_at_the_start():
+    system, x = gas(n=4)
+    with pytest.raises(InputError, match=r"width of 12, less than twice the cutoff \(6.1\)"):
+        MonteCarloBarostat(1.0, cutoff=6.1).pieces(system, x)
 
 
 def test_remainders_of_far_positions_are_kept():

@@ -105,6 +105,10 @@ def test_nothing_is_left_to_move():
     system = system_of(FixedAtoms(np.arange(5)), x)
     with pytest.raises(UnsupportedError, match="no piece"):
         find_pieces(system, x, ALL, held="stay")
+    none = np.zeros((0, 3))
+    empty = CellSystem(Motion(ConstraintSet([], none, np.zeros(0), cell=[5, 5, 5]), none))
+    with pytest.raises(UnsupportedError, match="no atoms"):
+        find_pieces(empty, none, ALL)
 
 
 def test_a_framework_through_the_cell_is_refused():
