@@ -158,6 +158,8 @@ def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
 
 
 def _for_each(option: str, given: Sequence[float], count: int) -> list[float]:
+    if not given:
+        raise InputError(f"give {option}: only dihedrals have a range by themselves, a whole turn", item=option)
     if len(given) not in (1, count):
         raise InputError(f"{option} has {len(given)} numbers for {count} coordinates; give one for each", item=option)
     return list(given) * (count if len(given) == 1 else 1)

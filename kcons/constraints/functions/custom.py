@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, lent, numbers
+from kcons.constraints.arguments import ANY, TAKES_TIME, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
@@ -61,14 +61,20 @@ class FunctionRows(Constraint):
         for name, given in (("function", function), ("gradient", gradient)):
             if not callable(given) and (given is not None or name == "function"):
                 raise InputError(f"{self.family}: {name} must be a function, not {given!r:.60}", item=name)
+        timed = bool(time_dependent) or time_derivatives is not None
+        last = ("t",) if timed else ()
+        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME)
+        check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
+        check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
+        check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
         for name, size in (("length", length), ("time_step", time_step)):
-            if size is not None and not (np.isfinite(size) and size > 0):
-                raise InputError(f"{self.family}: {name} must be positive, not {size}", item=name)
+            if size is not None:
+                positive(size, f"{self.family}: {name}")
         self.function = function
         self.gradient_function = gradient
         self.hessian_vector = hessian_vector
         self.time_derivatives = time_derivatives
-        self.time_dependent = bool(time_dependent) or time_derivatives is not None
+        self.time_dependent = timed
         self.length = length
         self.time_step = float(time_step)
 

@@ -25,7 +25,7 @@ from kcons.ase.constraints_object import Constraints
 from kcons.ase.topology import bonds_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
@@ -43,7 +43,6 @@ from kcons.free_energy.scans.relaxation import FIRST, relax
 from kcons.motion.minimisation import minimise
 from kcons.motion.motion import Motion
 from kcons.steppers.files import as_path
-from kcons.thermostats.freedom import positive
 
 #: Energy by which a structure has to be lower to be handed on to the neighbours, in eV (10^-5 hartree).
 LOWER = 2.7e-4

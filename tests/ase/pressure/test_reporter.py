@@ -12,7 +12,7 @@ from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
 from kcons.constraints import Distance
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats.pressure import MonteCarloBarostat
 
 
@@ -80,3 +80,8 @@ def test_forces_of_ase_constraints_have_no_stress():
     reporter = PressureReporter(dynamics, virial="difference")
     reporter()
     assert np.isfinite(reporter.mean)
+
+
+def test_what_is_no_way_to_the_pressure():
+    with pytest.raises(InputError, match="virial is 'mol'; choose 'molecular', 'atomic' or 'difference'"):
+        PressureReporter(None, virial="mol")
