@@ -130,7 +130,9 @@ class NoseHooverChain(Listed):
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use Langevin")
         if system.motion.plan.driven:
-            raise UnsupportedError("targets move, and scaled velocities would not follow them; use Langevin")
+            raise UnsupportedError(
+                "targets move, or rows hold velocities, and scaled velocities would not follow them; use Langevin"
+            )
         self.stepper.check(system)
 
     def start(self, system: System, state: State) -> State:
