@@ -35,6 +35,7 @@ from kcons.constraints.functions.formula import Formula
 from kcons.constraints.target import FloatArray
 from kcons.constraints.velocity import CustomVelocity
 from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.sparse.rows_at_once import FEWEST, rows_at_once
 
 FUNCTION = int(RowKind.FUNCTION)
 #: A function of positions relative to the first atom.
@@ -393,18 +394,23 @@ def row_function(item: Constraint, numbers: FloatArray) -> Any:
 
     `numbers` are those among which the function will find its arguments.
     """
-    if isinstance(item, Formula):
-        return _compiled(item.code().row)
+    plain = plain_row(item)
+    if plain is not None:
+        return _compiled(plain)
     if isinstance(item, FunctionRows):
         gradient = item.gradient_function
         if item.by_row and gradient is not None and is_jitted(item.function) and is_jitted(gradient):
             return _of_jitted(item.function, gradient, item.width, item.time_dependent)
         return PythonRows(item, numbers)
-    if isinstance(item, CustomVelocity):
-        if is_jitted(item.coefficients):
-            return _of_jitted_coefficients(item.coefficients, item.width, item.time_dependent, 1e-6 * item.length)
-        return PythonRows(item, numbers)
-    return _compiled(FAMILIES[item.family])
+    assert isinstance(item, CustomVelocity)
+    if is_jitted(item.coefficients):
+        return _of_jitted_coefficients(item.coefficients, item.width, item.time_dependent, 1e-6 * item.length)
+    return PythonRows(item, numbers)
+
+
+def plain_row(item: Constraint) -> Callable[..., None] | None:
+    """``row(r, p, t, out)`` of a family or a formula."""
+    return item.code().row if isinstance(item, Formula) else FAMILIES.get(item.family)
 
 
 class GivenRows:
@@ -420,12 +426,13 @@ class GivenRows:
         First parameter of each row.
     """
 
-    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, widest: int) -> None:
-        """`rows` of the set in the order of the kernels; `widest` is the most atoms that one of them has."""
+    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, room: int) -> None:
+        """`rows` of the set in the order of the kernels; `room` is for the numbers that functions get and give."""
         kinds, starts = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
         order = np.full(constraint_set.n_rows, -1)
         order[rows] = np.arange(len(rows))
-        end = ROOM + 9 * widest + 1
+        items = np.zeros(constraint_set.n_rows, np.int64)
+        end = ROOM + room
         tables: list[tuple[Constraint, int, FloatArray]] = []
         for item, first in zip(constraint_set.constraints, constraint_set.starts, strict=False):
             mine = slice(first, first + item.n_rows)
@@ -434,7 +441,7 @@ class GivenRows:
                 continue
             here = here[np.argsort(order[mine][here])]
             table = item.parameters().reshape(item.n_rows, -1)[here]
-            kinds[mine] = item.kind
+            kinds[mine], items[mine] = item.kind, len(tables)
             if item.kind in (FUNCTION, VELOCITY):
                 kinds[mine] += item.relative
                 numbered = [here[:, None]] if item.functions else []
@@ -445,7 +452,8 @@ class GivenRows:
             starts[first + here] = end + (np.arange(len(here)) * size if count > 1 else 0)
             tables.append((item, end, table))
             end += table.size
-        self.kinds, self.starts = kinds[rows], starts[rows]
+        self.kinds, self.starts, self._items = kinds[rows], starts[rows], items[rows]
+        self._tables = [item for item, _, _ in tables]
         self.numbers = np.zeros(end)
         self.functions = []
         for item, first, table in tables:
@@ -453,6 +461,25 @@ class GivenRows:
             if item.kind in (FUNCTION, VELOCITY):
                 self.functions.append(row_function(item, self.numbers))
                 self.numbers.view(np.int64)[first : first + table.size : table.shape[1]] = self.functions[-1].address
+
+    def at_once(self, block: int) -> IntArray:
+        """Of each `block` of rows the address of the function for all, and how far apart their parameters are.
+
+        0 and 0 where rows are called one by one: few, of several atoms or objects, functions of Python. Shape (n, 2).
+        """
+        n = len(self.starts)
+        first = np.arange(0, n, block)
+        size = np.minimum(block, n - first)
+        apart = np.diff(self.starts, append=0)
+        alike = (apart == np.repeat(apart[first], size)) & (np.diff(self._items, append=-1) == 0)
+        alike[first + size - 1] = True
+        fit = np.logical_and.reduceat(alike, first) & (size >= FEWEST) if n else np.zeros(0, bool)
+        runs = np.zeros((len(first), 2), np.int64)
+        for k, item in enumerate(self._tables):
+            mine, row = fit & (self._items[first] == k), plain_row(item)
+            if mine.any() and row is not None and item.width == 1 and item.holonomic:
+                runs[mine, 0], runs[mine, 1] = rows_at_once(row).address, apart[first[mine]]
+        return runs
 
     @property
     def python(self) -> list[PythonRows]:
