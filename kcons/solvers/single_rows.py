@@ -118,6 +118,16 @@ def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-d
         put(numbers, ROOM + 2 * BLOCK + i, number(x, g + 2))
 
 
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignore[no-untyped-def]
+    """The same of where the multipliers have moved them."""
+    for i in range(stop - begin):
+        lam, p = number(solution, begin + i), 3 * (first + i)
+        put(numbers, ROOM + i, number(base, 3 * i) + lam * number(pushes, p))
+        put(numbers, ROOM + BLOCK + i, number(base, 3 * i + 1) + lam * number(pushes, p + 1))
+        put(numbers, ROOM + 2 * BLOCK + i, number(base, 3 * i + 2) + lam * number(pushes, p + 2))
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
@@ -179,11 +189,7 @@ def _positions(  # type: ignore[no-untyped-def]
         while left > 0:
             left = 0
             if rows != 0:
-                for i in range(stop - begin):
-                    lam, slot = number(solution, begin + i), first + i
-                    put(numbers, ROOM + i, number(base, 3 * i) + lam * number(pushes, 3 * slot))
-                    put(numbers, ROOM + BLOCK + i, number(base, 3 * i + 1) + lam * number(pushes, 3 * slot + 1))
-                    put(numbers, ROOM + 2 * BLOCK + i, number(base, 3 * i + 2) + lam * number(pushes, 3 * slot + 2))
+                _pushed(begin, stop, first, base, pushes, solution, numbers)
                 call_rows(numbers, rows, stop - begin, ROOM, shared, apart, number(numbers, 0), outs)
             for k in range(begin, stop):
                 at = WORDS * (k - begin)

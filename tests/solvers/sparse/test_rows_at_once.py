@@ -15,7 +15,7 @@ from kcons.solvers.sparse import row_functions
 from kcons.solvers.sparse.row_functions import GivenRows, plain_row, row_function
 from kcons.solvers.sparse.rows_at_once import BLOCK, FEWEST, rows_at_once
 
-AXIS = np.array([0.0, 0.6, 0.8])
+AXIS, OFF = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.0, 0.0])
 #: More than one block, of which the last one is not full.
 MANY = np.arange(BLOCK + FEWEST)
 
@@ -28,11 +28,11 @@ def scattered(n: int) -> np.ndarray:
 
 #: Of these atoms, with parameters that all share or that each has for itself.
 ITEMS = {
-    "Sphere": lambda atoms, own: Sphere(atoms, np.add([0.1, 0, 0], own)),
-    "Plane": lambda atoms, own: Plane(atoms, np.add([0.1, 0, 1], own)),
-    "Cylinder": lambda atoms, own: Cylinder(atoms, np.add([0.1, 0, 0], own), AXIS),
-    "Ellipsoid": lambda atoms, own: Ellipsoid(atoms, np.add([0.1, 0, 0], own), [1.0, 2.0, 3.0], target=None),
-    "Torus": lambda atoms, own: Torus(atoms, np.add([0.1, 0, 0], own), AXIS, 0.5),
+    "Sphere": lambda atoms, own: Sphere(atoms, OFF + own),
+    "Plane": lambda atoms, own: Plane(atoms, AXIS + own),
+    "Cylinder": lambda atoms, own: Cylinder(atoms, OFF + own, AXIS),
+    "Ellipsoid": lambda atoms, own: Ellipsoid(atoms, OFF + own, [1.0, 2.0, 3.0], target=None),
+    "Torus": lambda atoms, own: Torus(atoms, OFF + own, AXIS, 0.5),
     "Formula": lambda atoms, own: Formula("z1 - a*sin(x1 + t)*y1**2", atoms, {"a": 0.5 + np.ravel(own[..., 0])}, None),
 }
 
