@@ -466,9 +466,8 @@ def show(result: dict[str, Any]) -> None:
     print("\n| barostat | molecules | a step costs more by |\n| --- | --- | --- |")
     for name, one in runs.items():
         if name.startswith("cost, rescaling"):
-            print(
-                f"| {one['barostat']} | {one['molecules']} rigid diatomics | {told((one['ratio'] - 1, one['error']), 1, 100)} % |"
-            )
+            cost = told((one["ratio"] - 1, one["error"]), 1, 100)
+            print(f"| {one['barostat']} | {one['molecules']} rigid diatomics | {cost} % |")
     for seed in (1, 2):
         sides, stress = (
             ", ".join(told(pair, digits) for pair in runs[f"crystal {seed}"][key])

@@ -12,7 +12,7 @@ from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
 from kcons.constraints import Distance
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats.pressure import MonteCarloBarostat
 
 
@@ -77,6 +77,8 @@ def test_forces_of_ase_constraints_have_no_stress():
     for virial in ("molecular", "atomic"):
         with pytest.raises(UnsupportedError, match="no stress"):
             PressureReporter(dynamics, virial=virial)()
+    with pytest.raises(InputError, match="temperature_K is -1"):
+        PressureReporter(dynamics, temperature_K=-1)
     reporter = PressureReporter(dynamics, virial="difference")
     reporter()
     assert np.isfinite(reporter.mean)
