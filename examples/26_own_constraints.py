@@ -140,6 +140,49 @@ def many_particles(name: str, n: int) -> Callable[[int], float]:
     return block
 
 
+class Counted:
+    """A function that counts its calls and keeps the last place."""
+
+    def __init__(self, function: Callable[[np.ndarray], object]) -> None:
+        self.function, self.calls, self.place = function, 0, np.zeros((1, 3))
+
+    def __call__(self, r: np.ndarray) -> object:
+        self.calls, self.place = self.calls + 1, r
+        return self.function(r)
+
+    def seconds(self, repeats: int = 300) -> float:
+        """Of one call."""
+        begin = time.process_time()
+        for _ in range(repeats):
+            self.function(self.place)
+        return (time.process_time() - begin) / repeats
+
+
+def beside_own_calls(size: int, turns: int) -> None:
+    """What a step takes with Python functions, beside what the calls that it makes of them take alone."""
+    print(f"{'Python functions':22}{'calls':>8}{'µs of these':>14}{'µs a step':>12}{'ratio':>8}")
+    value, slope = quartic.py_func, quartic_gradient.py_func
+    for name, given in {"Custom, Python": [value, slope], "Custom, no gradient": [value]}.items():
+        counted = [Counted(function) for function in given]
+        HELD["counted"] = lambda atoms, counted=counted: Custom(atoms[:, None], *counted)
+        step = one_particle("counted")
+        step(size)
+        for each in counted:
+            each.calls = 0
+        step(size)
+        calls = [each.calls / size for each in counted]
+        del HELD["counted"]
+        step, found = one_particle(name), []
+        step(size)
+        for _ in range(turns):
+            own = 1e6 * sum(n * each.seconds() for n, each in zip(calls, counted, strict=True))
+            found.append((own, step(size)))
+        own, whole = np.median(found, axis=0)
+        ratio = np.median([b / a for a, b in found])
+        print(f"{name:22}{sum(calls):8.1f}{own:14.1f}{whole:12.1f}{ratio:8.1f}")
+    print()
+
+
 def medians(blocks: dict[str, Callable[[int], float]], size: int, turns: int) -> dict[str, float]:
     """The median of blocks taken in turn; the first, which may compile, does not count."""
     found: dict[str, list[float]] = {name: [] for name in blocks}
@@ -272,6 +315,7 @@ def main() -> None:
     n, turns = (100_000, 7) if full else (1_000, 3)
     one = {name: one_particle(name) for name in (*HELD, *BODIES)}
     show("One particle, or one body", "µs a step", medians(one, 1000 if full else 50, turns))
+    beside_own_calls(1000 if full else 200, 9)
     compiled = [name for name in HELD if name not in ("Custom, Python", "Custom, no gradient")]
     show(f"{n:,} particles", "ns a row", medians({name: many_particles(name, n) for name in compiled}, 3, turns))
 

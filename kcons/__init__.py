@@ -34,6 +34,7 @@ __version__ = "0.1.0"
 __all__ = ["ConstraintSet", "Motion", "Rattle", "State", "System", "__version__", "constraints", "errors", "run"]
 
 #: What is imported when it is first asked for, and where it is: the command needs none of it to print its help.
+_FOLDERS = {"constraints", "errors", "models", "motion", "plan", "solvers", "steppers", "thermostats", "topology"}
 _LATE = {
     "ConstraintSet": "kcons.constraints.constraint_set",
     "Motion": "kcons.motion.motion",
@@ -43,7 +44,7 @@ _LATE = {
 
 def __getattr__(name: str) -> Any:
     """Of modules: PEP 562."""
-    if name in ("constraints", "errors"):
+    if name in _FOLDERS:
         return import_module(f"{__name__}.{name}")
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

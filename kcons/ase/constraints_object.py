@@ -355,7 +355,9 @@ def _listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) 
     for item in result:
         if not isinstance(item, Constraint):
             raise InputError(
-                f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE", item="constraints"
+                f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE, and constraints_of "
+                "gives those of a name as a list",
+                item="constraints",
             )
     return result
 

@@ -9,12 +9,12 @@ import numpy as np
 from ase import Atoms, units
 
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
-from kcons.constraints.arguments import seed_from
+from kcons.constraints.arguments import positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.steppers import State, Stepper
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Tuned, tune
-from kcons.thermostats.freedom import open_directions, positive
+from kcons.thermostats.freedom import open_directions
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL
 
 

@@ -12,11 +12,10 @@ from ase.calculators.mixing import SumCalculator
 from kcons.ase.binding import FORCES_ONLY
 from kcons.ase.dynamics import name_step
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
-from kcons.constraints.arguments import numbers, seed_from
+from kcons.constraints.arguments import numbers, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats import ForceGroups, IsokineticSpheres, LangevinRespa
-from kcons.thermostats.freedom import positive
 
 Bath = Literal["langevin", "spheres"]
 

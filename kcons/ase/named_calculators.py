@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, UnsupportedError, did_you_mean
 
 
 def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> Any:
@@ -46,9 +46,13 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
     except UnsupportedError:
         raise
     except Exception as error:
+        from ase.calculators.names import names
+
+        known = ["gfn2", "gfn1", *names]
+        why = "" if ":" not in name and name not in known else f" with these settings ({type(error).__name__}: {error})"
         raise InputError(
-            f"no calculator {name!r} with these settings ({type(error).__name__}: {error}); there are gfn2, gfn1, "
-            "those of ASE by name, and MODULE:NAME",
+            f"there is no calculator {name!r}{why}{did_you_mean(name, known)}; there are gfn2, gfn1, those of ASE by "
+            "name (emt, lj, ...), and MODULE:NAME for what makes any other",
             item="calculator",
         ) from error
 

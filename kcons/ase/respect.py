@@ -10,6 +10,7 @@ from weakref import WeakSet
 import numpy as np
 from ase import Atoms
 
+from kcons.constraints.arguments import finite_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -134,7 +135,7 @@ def worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[in
 
 
 def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> None:
-    """Refuse positions that are off the constraints.
+    """Refuse positions that are off the constraints, or not finite there.
 
     Raises
     ------
@@ -143,8 +144,12 @@ def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) ->
     worst = worst_row(held, x, time)
     if worst is not None:
         row, miss = worst
+        finite_array(x, held.n_atoms, "position")
+        target = held.target(time)[row]
+        turns = held.row_name(row).partition("(")[0].endswith(("Angle", "Dihedral"))
+        degrees = f", in radian: is it {target:.6g} degrees?" if turns and abs(target) > 2 * np.pi else ""
         raise InputError(
-            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}); moving "
+            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {target:.6g}{degrees}); moving "
             "them from there would turn the correction into velocity. Use constrain(..., project=True) or "
             "Constraints.restore(atoms) first",
             item="positions",

@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import generator_of, seed_from
+from kcons.constraints.arguments import generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, Stepper, System
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
-from kcons.thermostats.freedom import Momentum, open_directions, positive
+from kcons.thermostats.freedom import Momentum, open_directions
 from kcons.thermostats.isokinetic.isokinetic import Convention
 from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
 

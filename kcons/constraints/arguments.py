@@ -146,7 +146,45 @@ def check_pairs(pairs: ArrayLike, n_atoms: int | None = None) -> IntArray:
 def refuse_other(value: Any, kind: type | tuple[type, ...], item: str, remedy: str) -> None:
     """Raise `InputError` for what is no `kind`."""
     if not isinstance(value, kind):
-        raise InputError(f"{item} is {value!r}; give {remedy}", item=item)
+        raise InputError(f"{item} is {value!r:.120}; give {remedy}", item=item)
+
+
+#: What to say of functions of constraints that were given other arguments.
+TAKES_TIME = "; say time_dependent=True for functions that take the time t as well"
+
+
+def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "") -> None:
+    """Refuse what is no function, or cannot be called with as many arguments; None is none.
+
+    Parameters
+    ----------
+    item : str
+        What it is, for messages.
+    function : callable or None
+    arguments : tuple of str
+        Names of what it is called with.
+    hint : str
+        Ends the sentence.
+
+    Raises
+    ------
+    InputError
+    """
+    if function is not None and not callable(function):
+        raise InputError(
+            f"{item} is {function!r:.120}; give a function of {', '.join(arguments)}", item=item.rpartition(": ")[2]
+        )
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # no function, or one that does not say what it takes
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        raise InputError(
+            f"{item} takes {signature}, but is called with ({', '.join(arguments)}){hint}",
+            item=item.rpartition(": ")[2],
+        ) from None
 
 
 def finite_number(value: Any, item: str) -> float:
@@ -165,6 +203,23 @@ def finite_number(value: Any, item: str) -> float:
     if not math.isfinite(found):
         raise InputError(f"{item} is {value!r}; give a finite number", item=item)
     return found
+
+
+def positive(value: float, item: str) -> float:
+    """`value` as a float.
+
+    Raises
+    ------
+    InputError
+        Not a number above zero, or infinite.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0):
+        raise InputError(f"{item} is {value!r}; give a positive number", item=item.rpartition(": ")[2])
+    return number
 
 
 def whole_number(value: Any, item: str, least: int = 1, most: int | None = None) -> int:

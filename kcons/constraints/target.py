@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import check_call, numbers
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -36,6 +36,14 @@ class MovingTarget:
     rate: TimeFunction | None = None
     acceleration: TimeFunction | None = None
     time_step: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, function in (
+            ("", self.value),
+            ("rate of the ", self.rate),
+            ("acceleration of the ", self.acceleration),
+        ):
+            check_call(f"the {name}target", function, ("t",))
 
     def with_time_step(self, time_step: float) -> MovingTarget:
         """The same with other steps of the differences."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, SPEED, lent, numbers
+from kcons.constraints.arguments import ANY, SPEED, TAKES_TIME, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
@@ -291,9 +291,11 @@ class CustomVelocity(VelocityRows):
         super().__init__(atoms, target)
         if not callable(coefficients):
             raise InputError("CustomVelocity: coefficients must be a function; see LinearVelocity", item="coefficients")
+        last = ("t",) if time_dependent else ()
+        check_call("CustomVelocity: coefficients", coefficients, ("r", *last), TAKES_TIME)
+        check_call("CustomVelocity: derivative", derivative, ("r", "v", *last), TAKES_TIME)
         for name, size in (("length", length), ("time_step", time_step)):
-            if not (np.isfinite(size) and size > 0):
-                raise InputError(f"CustomVelocity: {name} must be positive, not {size}", item=name)
+            positive(size, f"CustomVelocity: {name}")
         self.coefficients = coefficients
         self.derivative = derivative
         self.time_dependent = bool(time_dependent)

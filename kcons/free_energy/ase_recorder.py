@@ -12,7 +12,7 @@ from kcons.ase.binding import applied_forces
 from kcons.ase.topology import bonds_of
 from kcons.constraints import Constraint, Dihedral
 from kcons.errors import InputError
-from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
+from kcons.free_energy.held_coordinates import HeldCoordinates, Sample, named
 from kcons.free_energy.series import Series
 from kcons.motion.motion import Motion
 
@@ -55,7 +55,7 @@ class AseRecorder:
         constraint_forces: bool = False,
     ) -> None:
         self.dynamics = dynamics
-        self.coordinates = dict(coordinates)
+        self.coordinates = named(coordinates)
         self.constraint_forces = constraint_forces
         self._motion = self._engine()
         self._held = self._coordinates_of(self._motion)

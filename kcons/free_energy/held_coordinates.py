@@ -60,6 +60,26 @@ class Sample(NamedTuple):
     mean_kinetic: FloatArray
 
 
+def named(coordinates: Mapping[str, Constraint]) -> dict[str, Constraint]:
+    """Coordinates by name, checked.
+
+    Raises
+    ------
+    InputError
+        No names, or what is no constraint.
+    """
+    if not isinstance(coordinates, Mapping) or not coordinates or not all(isinstance(k, str) for k in coordinates):
+        raise InputError(
+            "no coordinates are named; give a mapping of names to constraints, such as "
+            '{"torsion": Dihedral([[0, 1, 2, 3]])}',
+            item="coordinates",
+        )
+    for name, coordinate in coordinates.items():
+        if not isinstance(coordinate, Constraint):
+            raise InputError(f"{name!r} is {coordinate!r}, and no kcons constraint", item=name)
+    return dict(coordinates)
+
+
 class HeldCoordinates:
     """Coordinates that an engine holds, by name.
 
@@ -117,13 +137,9 @@ class HeldCoordinates:
     ) -> None:
         held = motion if isinstance(motion, ConstraintSet) else motion.sources[0]
         x = as_array(positions, (held.n_atoms, 3), "positions")
-        if not isinstance(coordinates, Mapping) or not coordinates or not all(isinstance(k, str) for k in coordinates):
-            raise InputError("no coordinates are named; give a mapping of names to constraints", item="coordinates")
         names: list[str] = []
         rows: list[int] = []
-        for name, coordinate in coordinates.items():
-            if not isinstance(coordinate, Constraint):
-                raise InputError(f"{name!r} is {coordinate!r}, and no kcons constraint", item=name)
+        for name, coordinate in named(coordinates).items():
             found = rows_like(held, coordinate, name)
             names += [name] if len(found) == 1 else [f"{name}[{k}]" for k in range(len(found))]
             rows += found

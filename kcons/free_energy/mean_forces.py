@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.free_energy.averages import weighted_mean
 from kcons.free_energy.series import Series
-from kcons.thermostats.freedom import positive
 
 
 @dataclass(frozen=True, eq=False)

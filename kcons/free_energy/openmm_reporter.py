@@ -13,7 +13,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint_set import ConstraintSet, same_rows
 from kcons.errors import InputError
-from kcons.free_energy.held_coordinates import HeldCoordinates
+from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
@@ -74,7 +74,7 @@ class HeldCoordinatesReporter:
         append: bool = False,
     ) -> None:
         interval = whole_number(reportInterval, "reportInterval")
-        names = list(coordinates)
+        names = list(named(coordinates))
         self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
         self._beside = accepted(beside)
         self._interval = interval

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from copy import copy
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import FloatArray, lent, numbers
+from kcons.constraints.arguments import TAKES_TIME, FloatArray, check_call, lent, numbers, positive
 from kcons.constraints.target import first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError, NonFiniteError
 
@@ -43,14 +42,14 @@ class MultibodyFunctions:
             if given is not None and constraints is None and name != "force":
                 raise InputError(f"there is a {name} without constraints; give the function g as well", item=name)
         last = ("t",) if time_dependent else ()
-        _check_arguments("mass", mass, ("q",))
-        _check_arguments("force", force, ("q", "v", "t"))
-        _check_arguments("constraints", constraints, ("q", *last))
-        _check_arguments("jacobian", jacobian, ("q", *last))
-        _check_arguments("curvature", curvature, ("q", "v", *last))
+        if callable(mass):
+            check_call("mass", mass, ("q",))
+        check_call("force", force, ("q", "v", "t"))
+        check_call("constraints", constraints, ("q", *last), TAKES_TIME)
+        check_call("jacobian", jacobian, ("q", *last), TAKES_TIME)
+        check_call("curvature", curvature, ("q", "v", *last), TAKES_TIME)
         for name, size in (("length", length), ("time_step", time_step)):
-            if not (np.isfinite(size) and size > 0):
-                raise InputError(f"{name} must be positive, not {size}", item=name)
+            positive(size, name)
         self.force, self.constraints, self.jacobian, self.curvature = force, constraints, jacobian, curvature
         self.time_dependent, self.length, self.time_step = bool(time_dependent), float(length), float(time_step)
         self.m = 0 if constraints is None else None
@@ -160,21 +159,6 @@ class MultibodyFunctions:
                     "(length=...)",
                     item=name,
                 )
-
-
-def _check_arguments(name: str, function: Any, arguments: tuple[str, ...]) -> None:
-    """Refuse a function that cannot be called with these."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # no function, or one that does not say what it takes
-        return
-    try:
-        signature.bind(*arguments)
-    except TypeError:
-        hint = "; say time_dependent=True for constraints that take t" if name not in ("mass", "force") else ""
-        raise InputError(
-            f"{name} takes {signature}, but is called with ({', '.join(arguments)}){hint}", item=name
-        ) from None
 
 
 def check_symmetric(M: FloatArray) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array
+from kcons.constraints.arguments import as_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.motion.motion import Motion
@@ -82,7 +82,7 @@ def minimise(
     Raises
     ------
     InputError
-        A tolerance or length that is not positive; forces of a wrong shape.
+        A tolerance or length that is not positive; a force that takes other arguments, or has a wrong shape.
     NonFiniteError
         A force is not finite.
     ConvergenceError
@@ -96,6 +96,7 @@ def minimise(
     for value, item in ((tolerance, "tolerance"), (longest, "longest")):
         if not value > 0:
             raise InputError(f"{item} is {value}; give a positive number", item=item)
+    check_call("force", force, ("x", "t"))
     descent = _Descent(motion, force, time)
     x = motion.restore_positions(positions, time=time)
     f = descent.forces(x)

@@ -46,6 +46,8 @@ def number(value: Any, of: unit.Unit, item: str) -> float:
     """
     found = plain(value, of, item)
     try:
+        if isinstance(found, str | bytes):
+            raise TypeError
         return float(found)
     except (TypeError, ValueError):
         raise InputError(

@@ -24,16 +24,15 @@ from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.mixed_rows import SPEED_TOLERANCE
 from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
 from kcons.solvers.sparse.row_values import cell_of, miss, near
+from kcons.solvers.sparse.rows_at_once import BLOCK, call_rows
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
 
 _EPS = float(np.finfo(float).eps)
-#: Rows that take their iterations together.
-BLOCK = 32
 #: What is known of one of them: the error that is rounding, the last one, the multiplier that had it, and how
 #: often the step from there was halved, -1 once it has arrived.
 WORDS, ROUNDING, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
 #: Of the pieces of `SingleRows.tables`, those that are named.
-_PUSHES, _SOLUTION = 7, 8
+_PUSHES, _SOLUTION, _RUNS = 7, 8, 9
 
 
 class SingleRows(CalledSolver):
@@ -55,7 +54,10 @@ class SingleRows(CalledSolver):
         incidence = constraint_set.incidence[rows]
         atoms = incidence.indices.astype(np.uint32)
         widest = int(np.diff(incidence.indptr).max(initial=0))
-        self._given = GivenRows(constraint_set, rows, widest)
+        # Of the rows that take their iterations together: places of all or of one, then values and gradients of all.
+        places = 3 * max(widest, BLOCK)
+        self._given = GivenRows(constraint_set, rows, places + BLOCK * (1 + 3 * widest))
+        runs = np.append(ROOM + places, self._given.at_once(BLOCK).ravel())
         # Row by row: its first slot, its first parameter, its kind.
         links = np.zeros((len(rows) + 1, 3), np.uint32)
         links[:, 0], links[:-1, 1], links[:-1, 2] = incidence.indptr, self._given.starts, self._given.kinds
@@ -64,7 +66,7 @@ class SingleRows(CalledSolver):
             (
                 *(self._links, atoms, inverse_masses[atoms], room(3 * widest * BLOCK), room(WORDS * BLOCK)),
                 *(constraint_set.scale[rows], np.ascontiguousarray(constraint_set.target(0.0)[rows])),
-                *(room(3 * len(atoms)), room(len(rows))),
+                *(room(3 * len(atoms)), room(len(rows)), runs),
             )
         )
         self._pushes, self._solution = part_of(self.tables, _PUSHES), part_of(self.tables, _SOLUTION)
@@ -106,6 +108,26 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
         at += 3
 
 
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-def]
+    """Positions of rows of one atom each, as `rows_at_once` takes them."""
+    for i in range(stop - begin):
+        g = 3 * entry(atoms, first + i)
+        put(numbers, ROOM + i, number(x, g))
+        put(numbers, ROOM + BLOCK + i, number(x, g + 1))
+        put(numbers, ROOM + 2 * BLOCK + i, number(x, g + 2))
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignore[no-untyped-def]
+    """The same of where the multipliers have moved them."""
+    for i in range(stop - begin):
+        lam, p = number(solution, begin + i), 3 * (first + i)
+        put(numbers, ROOM + i, number(base, 3 * i) + lam * number(pushes, p))
+        put(numbers, ROOM + BLOCK + i, number(base, 3 * i + 1) + lam * number(pushes, p + 1))
+        put(numbers, ROOM + 2 * BLOCK + i, number(base, 3 * i + 2) + lam * number(pushes, p + 2))
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
@@ -130,16 +152,22 @@ def _positions(  # type: ignore[no-untyped-def]
     state, scale, pushes, solution = piece(t, h, 4), piece(t, h, 5), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
     if not wanted.size:
         wanted = piece(t, h, 6)
-    worst, worst_row, most = 0.0, -1, 0
+    runs = piece(h, h, _RUNS)
+    worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     for begin in range(0, len(solution), BLOCK):
         stop = min(begin + BLOCK, len(solution))
-        first = entry(links, 3 * begin)
+        first, shared = entry(links, 3 * begin), entry(links, 3 * begin + 1) + 2
+        rows, apart = runs[1 + begin // (BLOCK // 2)], runs[2 + begin // (BLOCK // 2)]
+        if rows != 0:
+            _places(x_ref, begin, stop, first, atoms, numbers)
+            call_rows(numbers, rows, stop - begin, ROOM, shared, apart, number(numbers, 1), outs)
         for k in range(begin, stop):
             slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
             relative = entry(links, 3 * k + 2) != FUNCTION
-            out = ROOM + 3 * (end - slot)
-            _gather(x_ref, slot, end, atoms, relative, lattice, periodic, numbers, ROOM)
-            call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
+            out = outs + (k - begin) + 3 * (slot - first)
+            if rows == 0:
+                _gather(x_ref, slot, end, atoms, relative, lattice, periodic, numbers, ROOM)
+                call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
             reach = 0.0
             for p in range(slot, end):
                 rolled()
@@ -160,6 +188,9 @@ def _positions(  # type: ignore[no-untyped-def]
         iteration, left = 0, stop - begin
         while left > 0:
             left = 0
+            if rows != 0:
+                _pushed(begin, stop, first, base, pushes, solution, numbers)
+                call_rows(numbers, rows, stop - begin, ROOM, shared, apart, number(numbers, 0), outs)
             for k in range(begin, stop):
                 at = WORDS * (k - begin)
                 halvings = number(state, at + HALVINGS)
@@ -167,12 +198,13 @@ def _positions(  # type: ignore[no-untyped-def]
                     continue
                 slot, parameters, lam = entry(links, 3 * k), entry(links, 3 * k + 1), number(solution, k)
                 count = 3 * (entry(links, 3 * k + 3) - slot)
-                out = ROOM + count
-                for i in range(count):
-                    rolled()
-                    r = number(base, 3 * (slot - first) + i) + lam * number(pushes, 3 * slot + i)
-                    put(numbers, ROOM + i, r)
-                call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 0), out)
+                out = outs + (k - begin) + 3 * (slot - first)
+                if rows == 0:
+                    for i in range(count):
+                        rolled()
+                        r = number(base, 3 * (slot - first) + i) + lam * number(pushes, 3 * slot + i)
+                        put(numbers, ROOM + i, r)
+                    call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 0), out)
                 slope = 0.0
                 for i in range(count):
                     rolled()
@@ -217,12 +249,23 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type:
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2)
     pushes, solution, driven = piece(t, h, _PUSHES), piece(t, h, _SOLUTION), wanted.size > 0
-    worst, worst_row, most = 0.0, -1, 0
+    runs = piece(h, h, _RUNS)
+    worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
+    begin, rows = 0, np.int64(0)
     for k in range(len(solution)):
         slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
-        out = ROOM + 3 * (end - slot)
-        _gather(x, slot, end, atoms, entry(links, 3 * k + 2) != FUNCTION, lattice, periodic, numbers, ROOM)
-        call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
+        if k % BLOCK == 0:
+            begin, rows = k, runs[1 + k // (BLOCK // 2)]
+            if rows != 0:
+                stop = min(begin + BLOCK, len(solution))
+                _places(x, begin, stop, slot, atoms, numbers)
+                apart = runs[2 + k // (BLOCK // 2)]
+                call_rows(numbers, rows, stop - begin, ROOM, parameters + 2, apart, number(numbers, 1), outs)
+        out = outs + 4 * (k - begin)
+        if rows == 0:
+            out = outs
+            _gather(x, slot, end, atoms, entry(links, 3 * k + 2) != FUNCTION, lattice, periodic, numbers, ROOM)
+            call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
         goal = number(wanted, k) if driven else 0.0
         size, off, whole = abs(goal), goal, 0.0
         for p in range(slot, end):

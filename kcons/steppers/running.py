@@ -7,7 +7,7 @@ from typing import Any, TypeAlias, overload
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, refuse_other, whole_number
+from kcons.constraints.arguments import check_call, finite_number, refuse_other, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
@@ -146,7 +146,7 @@ def run(
     ------
     InputError
         Negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units, or that is no finite number;
-        what is no system, state or stepper.
+        what is no system, state, stepper or observer.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
@@ -164,6 +164,10 @@ def run(
         stepper = Rattle()
     if isinstance(stepper, type) or not hasattr(stepper, "step"):
         raise InputError(f"stepper is {stepper!r}; give an object, such as kcons.Rattle()", item="stepper")
+    refuse_other(observers, Iterable, "observers", "a list of functions of a state")
+    observers = list(observers)
+    for observer in observers:
+        check_call("observers", observer, ("state",))
     stepper.check(system)
     check_every, spare = checked_every(check_every)
     if dt == 0 or not getattr(stepper, "holds", True):

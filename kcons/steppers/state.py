@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, finite_array, lent, numbers, refuse_other
+from kcons.constraints.arguments import as_array, check_call, finite_array, lent, numbers, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
@@ -215,7 +215,7 @@ class System:
     Raises
     ------
     InputError
-        An atom that is not held by FixedAtoms has a mass that is not positive; bad rates of friction.
+        A mass that is not positive, of an atom not held by FixedAtoms; bad friction; functions of other arguments.
     """
 
     def __init__(
@@ -229,14 +229,14 @@ class System:
         far: float = FAR,
     ) -> None:
         refuse_other(motion, Motion, "motion", "a kcons.Motion")
-        if force is not None and not callable(force):
-            raise InputError(f"force is {force!r}; give a function of positions and time", item="force")
+        taken = ("x", "v", "t") if velocity_dependent else ("x", "t")
+        check_call("force", force, taken, "; velocity_dependent says whether it gets velocities v")
+        check_call("potential", potential, ("x", "t"))
         if not far >= 1:
             raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.motion = motion
         self.far = float(far)
-        self.force = force
-        self.potential = potential
+        self.force, self.potential = force, potential
         self.velocity_dependent = velocity_dependent and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses

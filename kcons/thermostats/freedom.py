@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass
 from typing import Literal
@@ -260,23 +259,6 @@ def refuse_friction(system: System) -> None:
             "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "
             "leave it out of the System, and give the rate to Langevin, which brings noise with it"
         )
-
-
-def positive(value: float, item: str) -> float:
-    """`value` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number above zero, or infinite.
-    """
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{item} is {value!r}; give a positive number", item=item)
-    return number
 
 
 def carried(state: State, size: int, name: str) -> bool:

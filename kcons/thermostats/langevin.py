@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, seed_number, whole_number
+from kcons.constraints.arguments import finite_number, positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -14,7 +14,7 @@ from kcons.steppers.executors.piecewise import ArrayStep
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, drifts_of
 from kcons.steppers.stages.compensated_steps import check_finite
 from kcons.steppers.stepper import Listed, stays
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 
 
 def wind(bits: np.random.Philox, key: tuple[int, int], number: int, part: int = 0) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
@@ -20,7 +20,6 @@ from kcons.thermostats.freedom import (
     Momentum,
     carried,
     freedom,
-    positive,
     refuse_friction,
     warn_of_conserved_momenta,
 )
@@ -131,7 +130,9 @@ class NoseHooverChain(Listed):
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use Langevin")
         if system.motion.plan.driven:
-            raise UnsupportedError("targets move, and scaled velocities would not follow them; use Langevin")
+            raise UnsupportedError(
+                "targets move, or rows hold velocities, and scaled velocities would not follow them; use Langevin"
+            )
         self.stepper.check(system)
 
     def start(self, system: System, state: State) -> State:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, generator_of, whole_number
+from kcons.constraints.arguments import as_array, generator_of, positive, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -36,7 +36,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import Point, check_finite
 from kcons.thermostats.configurational_temperature import BLOCKS, Estimate, configurational_temperature
-from kcons.thermostats.freedom import atom_numbers, positive
+from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.thermal_velocities import thermal_velocities
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, generator_of
+from kcons.constraints.arguments import as_array, generator_of, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import System
-from kcons.thermostats.freedom import drift_velocity, open_directions, positive
+from kcons.thermostats.freedom import drift_velocity, open_directions
 
 
 def thermal_velocities(

@@ -24,9 +24,11 @@ from ase_systems import (
     random,
 )
 
+from kcons import ConstraintSet
 from kcons.ase import ConstrainedCalculator, constrain
+from kcons.ase.respect import require_on_surface
 from kcons.constraints import Distance
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 
 #: Classes that do not go through the constraints: our error, in how many steps, and what it says.
 REFUSED = {
@@ -125,3 +127,9 @@ def test_vibrations_that_are_right_do_not_warn(tmp_path):
         Vibrations(loose, name=str(tmp_path / "loose")).run()
         atoms.calc = ConstrainedCalculator(EMT(), atoms.constraints[0])
         Vibrations(atoms, name=str(tmp_path / "calculator")).run()
+
+
+def test_positions_that_are_not_finite_are_named():
+    held = ConstraintSet(Distance([[0, 1]]), [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [1.0, 1.0])
+    with pytest.raises(InputError, match="position of atom 1 is not finite"):
+        require_on_surface(held, np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]))

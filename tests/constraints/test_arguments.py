@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -14,22 +16,25 @@ from kcons.constraints import (
     ImplicitSurface,
     LinearRelation,
     LinearVelocity,
+    MovingTarget,
     Plane,
     Sphere,
 )
 from kcons.constraints.arguments import (
     as_array,
+    check_call,
     check_pairs,
     finite_number,
     generator_of,
     lent,
     numbers,
+    positive,
     seed_from,
     whole_number,
 )
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion import Motion, minimise
 from kcons.steppers import (
     BlanesMoan6,
     BlanesMoan6a,
@@ -43,7 +48,7 @@ from kcons.steppers import (
     System,
     run,
 )
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats import CellSystem, ForceGroups, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 
 X = np.array([[0.9, 0.0, -0.4], [1.5, 0.0, 0.1], [2.0, 0.3, -0.2]])
 MASSES = np.array([1.0, 0.7, 2.0])
@@ -308,6 +313,64 @@ def test_finite_numbers(value):
     with pytest.raises(InputError, match="keep is"):
         finite_number(value, "keep")
     assert finite_number(np.float32(0.5), "keep") == 0.5
+
+
+@pytest.mark.parametrize("value", [None, "x", 0, -1.0, np.nan, np.inf, [1.0, 2.0]])
+def test_positive_numbers(value):
+    with pytest.raises(InputError, match=r"Custom: length is .*; give a positive number") as caught:
+        positive(value, "Custom: length")
+    assert caught.value.item == "length"
+
+
+NONE = ConstraintSet([], X, MASSES)
+OTHER_ARGUMENTS = {
+    "force takes (x), but is called with (x, t)": lambda: System(Motion(NONE, X), lambda x: -x),
+    "force takes (x, v, t), but is called with (x, t); velocity_dependent says": (
+        lambda: System(Motion(NONE, X), lambda x, v, t: -v)
+    ),
+    "force takes (x, t), but is called with (x, v, t)": (
+        lambda: System(Motion(NONE, X), lambda x, t: -x, velocity_dependent=True)
+    ),
+    "potential is 3; give a function of x, t": lambda: System(Motion(NONE, X), lambda x, t: -x, potential=3),
+    "potential takes (x), but is called with (x, t)": (
+        lambda: System(Motion(NONE, X), lambda x, t: -x, potential=lambda x: 0.0)
+    ),
+    "the force of group 'fast' takes (x)": lambda: ForceGroups({"fast": lambda x: x}),
+    "force takes (y), but is called with (x, t)": (
+        lambda: minimise(Motion(NONE, X), lambda y: y, X, tolerance=1.0, longest=1.0)
+    ),
+    "stress takes (x, t), but is called with (x, t, cell)": (
+        lambda: CellSystem(
+            Motion(ConstraintSet([], X, MASSES, cell=[9.0] * 3), X),
+            lambda x, t, cell: x,
+            lambda x, t, cell: 0.0,
+            lambda x, t: np.eye(3),
+        )
+    ),
+    "Custom: function takes (r, t), but is called with (r); say time_dependent": lambda: Custom([0], lambda r, t: 1.0),
+    "Custom: gradient takes (), but is called with (r)": lambda: Custom([0], lambda r: 1.0, lambda: 1.0),
+    "ImplicitSurface: function takes (r), but is called with (r, t)": (
+        lambda: ImplicitSurface([0], lambda r: r[:, 0], time_dependent=True)
+    ),
+    "CustomVelocity: coefficients takes (r, v), but is called with (r)": lambda: CustomVelocity(0, lambda r, v: r),
+    "the target takes (), but is called with (t)": lambda: Distance([[0, 1]], lambda: 1.0),
+    "the rate of the target takes (x, t), but": lambda: Distance([[0, 1]], MovingTarget(lambda t: t, lambda x, t: 1.0)),
+    "observers takes (), but is called with (state)": (
+        lambda: run(System(Motion(NONE, X)), State(X, 0 * X), 0.1, 1, observers=[lambda: None])
+    ),
+}
+
+
+@pytest.mark.parametrize("words", OTHER_ARGUMENTS)
+def test_functions_that_take_other_arguments_are_refused_where_they_are_given(words):
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        OTHER_ARGUMENTS[words]()
+    assert caught.value.item in words
+
+
+@pytest.mark.parametrize("given", [lambda *a: 1, lambda x, t=0: 1, np.add, dict, None])
+def test_what_may_be_called_so_or_does_not_say_is_accepted(given):
+    check_call("force", given, ("x", "t"))
 
 
 @pytest.mark.parametrize("rng", ["x", -1, 2.5])

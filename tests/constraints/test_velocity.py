@@ -107,7 +107,7 @@ def test_directions_that_do_not_exist():
         (lambda: Rolling(0, 1, 0.0, [1.0, 0.0, 0.0]), "radius 0 is not positive"),
         (lambda: Rolling(0, 1, 1.0, [0.0, 0.0, 1.0]), "heading is normal to the ground"),
         (lambda: CustomVelocity([0], [[1.0, 0.0, 0.0]]), "must be a function; see LinearVelocity"),
-        (lambda: CustomVelocity([0], lambda r: r, time_step=0.0), "time_step must be positive"),
+        (lambda: CustomVelocity([0], lambda r: r, time_step=0.0), "time_step is 0.0; give a positive number"),
         (
             lambda: CustomVelocity([0], lambda r: r[0]).gradient(np.ones((1, 1, 3)), 0.0),
             r"returned shape \(3,\) for row 0",

@@ -425,6 +425,24 @@ MUTANTS = [
         "pass",
         "tests/models/test_projected_steps.py::test_the_next_step_starts_from_the_projection",
     ),
+    (
+        "solvers/sparse/rows_at_once.py",
+        "_from(p, stride * i)",
+        "_from(p, 0 * i)",
+        "tests/solvers/sparse/test_rows_at_once.py::test_values_and_gradients_are_those_of_one_row",
+    ),
+    (
+        "solvers/sparse/row_functions.py",
+        "alike[first + size - 1] = True",
+        "alike[:] = True",
+        "tests/solvers/sparse/test_rows_at_once.py::test_who_is_called_one_by_one",
+    ),
+    (
+        "solvers/sparse/row_functions.py",
+        "and before[1] == time and before[2] == value:",
+        "and before[1] == time:",
+        "tests/solvers/sparse/test_row_functions.py::test_a_gradient_is_found_again_where_the_value_has_changed",
+    ),
     # -- steppers, thermostats, arrays --
     (
         "steppers/adaptive/multistep.py",

@@ -7,6 +7,8 @@ import functools
 import importlib
 import importlib.util
 import re
+import subprocess
+import sys
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -217,3 +219,16 @@ def test_there_is_one_digest_of_the_code():
     calls = re.compile(r"\bhashlib\.(?!new)\w+\(")
     places = {path.relative_to(PACKAGE).as_posix() for path in FILES if calls.search(path.read_text(encoding="utf-8"))}
     assert {place for place in places if place.startswith("comparison/")} == {"comparison/study/machine.py"}
+
+
+def test_importing_the_package_imports_nothing_else():
+    """What it names is imported when it is asked for: the command prints its help in a tenth of a second."""
+    code = """
+import sys, kcons
+before = {"numpy", "numba"} & set(sys.modules)
+names = [getattr(kcons, name).__name__ for name in kcons.__all__ if name != "__version__"]
+print(before, names, kcons.steppers.Rattle is kcons.Rattle, "run" in dir(kcons), hasattr(kcons, "glue"))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    names = "['ConstraintSet', 'Motion', 'Rattle', 'State', 'System', 'kcons.constraints', 'kcons.errors', 'run']"
+    assert done.stdout.strip() == f"set() {names} True True False"

@@ -154,6 +154,8 @@ def test_files_are_gone_on_with(tmp_path):
 def test_bad_input():
     with pytest.raises(InputError, match="reportInterval is 0"):
         HeldCoordinatesReporter(io.StringIO(), 0, {"phi": Dihedral([PHI])})
+    with pytest.raises(InputError, match="no coordinates are named; give a mapping"):
+        HeldCoordinatesReporter(io.StringIO(), 1, None)
     system = peptide()
     psi = [6, 8, 14, 16]
     rows = CollectiveRows(system, [torsion(), torsion(psi)], positions=PDB.positions)

@@ -119,6 +119,7 @@ def test_wrong_shapes_are_named(given, item):
         ({"constraints": curve, "curvature": curve}, "curvature"),
         ({"length": 0.0}, "length"),
         ({"time_step": np.nan}, "time_step"),
+        ({"time_step": "x"}, "time_step"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_at_once(given, item):

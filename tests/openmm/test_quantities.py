@@ -58,7 +58,7 @@ def test_numbers_and_arrays():
     assert number(3, nm, "x") == 3.0
     np.testing.assert_allclose(array([1 * nm, 5 * angstrom], nm, "x"), [1, 0.5])
     np.testing.assert_allclose(array([openmm.Vec3(1, 2, 3) * angstrom], nm, "x"), [[0.1, 0.2, 0.3]])
-    for value in (3 * kelvin, "much", None):
+    for value in (3 * kelvin, "much", "2", None):
         with pytest.raises(InputError, match=r"length is .*give"):
             number(value, nm, "length")
     with pytest.raises(InputError, match="positions is 1 K; give it in nm"):

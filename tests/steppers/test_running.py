@@ -52,7 +52,17 @@ def test_bad_run_arguments(steps, every) -> None:
 
 
 @pytest.mark.parametrize(
-    "item, value", [("dt", "0.1"), ("dt", None), ("dt", [0.1]), ("state", None), ("system", None), ("stepper", Rattle)]
+    "item, value",
+    [
+        ("dt", "0.1"),
+        ("dt", None),
+        ("dt", [0.1]),
+        ("state", None),
+        ("system", None),
+        ("stepper", Rattle),
+        ("observers", print),
+        ("observers", [3]),
+    ],
 )
 def test_what_is_no_system_state_time_or_stepper(item, value) -> None:
     system, state = rotor()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, get_args
 
 import numpy as np
 from ase import units
@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
-from kcons.thermostats.freedom import positive
+from kcons.errors import InputError
 from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure
 from kcons.thermostats.pressure.measured import Virial
 
@@ -49,6 +50,8 @@ class PressureReporter:
         molecules: ArrayLike | None = None,
         temperature_K: float | None = None,
     ) -> None:
+        if virial not in get_args(Virial):
+            raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
         self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
         self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
         self._own = isinstance(file, str | Path)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, lent, numbers
+from kcons.constraints.arguments import ANY, TAKES_TIME, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
@@ -22,6 +23,9 @@ from kcons.constraints.target import (
 from kcons.errors import InputError
 
 _FLOAT = np.dtype(np.float64)
+#: Places of a first derivative, in steps, and the weights of the values there.
+_PLACES = (1, -1, 2, -2)
+_DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
 #: Relative deviation of a given derivative from a difference quotient that counts as a mistake.
 _WRONG = 1e-3
 
@@ -57,14 +61,20 @@ class FunctionRows(Constraint):
         for name, given in (("function", function), ("gradient", gradient)):
             if not callable(given) and (given is not None or name == "function"):
                 raise InputError(f"{self.family}: {name} must be a function, not {given!r:.60}", item=name)
+        timed = bool(time_dependent) or time_derivatives is not None
+        last = ("t",) if timed else ()
+        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME)
+        check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
+        check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
+        check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
         for name, size in (("length", length), ("time_step", time_step)):
-            if size is not None and not (np.isfinite(size) and size > 0):
-                raise InputError(f"{self.family}: {name} must be positive, not {size}", item=name)
+            if size is not None:
+                positive(size, f"{self.family}: {name}")
         self.function = function
         self.gradient_function = gradient
         self.hessian_vector = hessian_vector
         self.time_derivatives = time_derivatives
-        self.time_dependent = bool(time_dependent) or time_derivatives is not None
+        self.time_dependent = timed
         self.length = length
         self.time_step = float(time_step)
 
@@ -101,29 +111,27 @@ class FunctionRows(Constraint):
             lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
         )
 
-    def row(self, k: int, r: FloatArray, time: float) -> tuple[float, FloatArray]:
-        """Value and gradient of row `k` alone at `r`, shape (width, 3); for kernels."""
-        here = lent(r)
-        args = (here, time) if self.time_dependent else (here,)
-        value = self._checked(self.function(*args), k, "function", ())
-        if self.gradient_function is None:
-            return float(value), self._differenced_row(k, r, args[1:])
-        return float(value), self._checked(self.gradient_function(*args), k, "gradient", r.shape)
+    def row_value(self, k: int, r: FloatArray, time: float) -> float:
+        """Value of row `k` alone at `r`, shape (width, 3), which cannot be written to; for kernels."""
+        found = self.function(r, time) if self.time_dependent else self.function(r)
+        # Of Python and of NumPy.
+        return found if isinstance(found, float) else float(self._checked(found, k, "function", ()))
 
-    def _differenced_row(self, k: int, r: FloatArray, time: tuple[float, ...]) -> FloatArray:
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        """Gradient of row `k` alone, shape (width, 3); for kernels."""
+        if self.gradient_function is None:
+            return self._differenced_row(k, r, time)
+        found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
+        return np.asarray(self._checked(found, k, "gradient", r.shape))
+
+    def _differenced_row(self, k: int, r: FloatArray, time: float) -> FloatArray:
         """`_differenced_gradient` of one row, without arrays of rows, whose price would be that of the function."""
-        step = 1e-3 * float(self._length(r[None])[0])
-        slope, x = np.empty(r.shape), r.copy()
-        for place in np.ndindex(r.shape):
-            middle, total = x[place], 0.0
-            for turn, weight in enumerate(FIRST_4, start=1):
-                for sign in (turn, -turn):
-                    x[place] = middle + sign * step
-                    value = self._checked(self.function(lent(x.copy()), *time), k, "function", ())
-                    total += weight * value if sign > 0 else -weight * value
-            x[place] = middle
-            slope[place] = total / step
-        return slope
+        step = 1e-3 * (1.0 if self.length is None and self.width == 1 else float(self._length(r[None])[0]))
+        # Four places a coordinate, of which the function may keep what it sees.
+        displaced = r + step * _along(self.width)
+        displaced.setflags(False)  # type: ignore[call-arg]
+        values = [self.row_value(k, place, time) for place in displaced]
+        return np.dot(_DIFFERENCE, np.array(values).reshape(4, -1)).reshape(r.shape) / step
 
     def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
         """What a function returned for row `k`, as float64 of that shape."""
@@ -321,9 +329,11 @@ class ImplicitSurface(FunctionRows):
         """Kernels take rows one by one, and only what knows a single row can be asked for one."""
         return RowKind.FUNCTION if self.n_rows == 1 else RowKind.INTERPRETED
 
-    def row(self, k: int, r: FloatArray, time: float) -> tuple[float, FloatArray]:
-        here = r[None]
-        return float(self.measure(here, time)[0]), self.gradient(here, time)[0]
+    def row_value(self, k: int, r: FloatArray, time: float) -> float:
+        return float(self.measure(r[None], time)[0])
+
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        return np.asarray(self.gradient(r[None], time)[0])
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         flat = [lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments]
@@ -410,6 +420,12 @@ class Custom(FunctionRows):
             found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
             out[k] = self._checked(found, k, name, shape)
         return out
+
+
+@cache
+def _along(width: int) -> FloatArray:
+    """Displacements of `_PLACES` by coordinates, shape (12 width, width, 3)."""
+    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, width, 3)
 
 
 def _contract(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -51,7 +51,8 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
     try:
         tree = ast.parse(formula.strip(), mode="eval").body
     except SyntaxError as error:
-        raise InputError(f"Formula: {formula!r} cannot be read: {error.msg}", item="formula") from None
+        remedy = "; write what is held at zero, the left side less the right one" if "=" in formula else ""
+        raise InputError(f"Formula: {formula!r} cannot be read: {error.msg}{remedy}", item="formula") from None
     found = set()
     for node in ast.walk(tree):
         match node:

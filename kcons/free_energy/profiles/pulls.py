@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers
+from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import FEW_INDEPENDENT, pymbar
 from kcons.thermostats import Estimate
-from kcons.thermostats.freedom import positive
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
 FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03

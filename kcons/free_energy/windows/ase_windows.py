@@ -22,8 +22,9 @@ from kcons.ase.named_calculators import described
 from kcons.ase.topology import bonds_of
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, InputError
 from kcons.free_energy.ase_recorder import AseRecorder
+from kcons.free_energy.held_coordinates import named
 from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
 from kcons.motion import minimise
 
@@ -47,6 +48,8 @@ class AseWindows:
 
     Raises
     ------
+    InputError
+        A calculator instead of what makes one; coordinates without names.
     KconsError
         At `begin`: a coordinate that is undefined at the structure or depends on the other constraints.
     """
@@ -60,9 +63,14 @@ class AseWindows:
         coordinates: Mapping[str, Constraint],
         held: Sequence[Constraint] = (),
     ) -> None:
+        if not callable(calculator):
+            raise InputError(
+                f"calculator is {calculator!r:.80}; give what makes one, such as functools.partial(EMT)",
+                item="calculator",
+            )
         self.atoms = atoms.copy()
         self.calculator = calculator
-        self.coordinates = dict(coordinates)
+        self.coordinates = named(coordinates)
         self.held = [*from_ase_constraints(self.atoms), *held]
         self.atoms.set_constraint()
         self.names = tuple(self.coordinates)

@@ -17,6 +17,7 @@ from kcons.constraints import Angle, Constraint, Dihedral, Distance, Formula
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
+from kcons.free_energy.held_coordinates import named
 from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
@@ -71,7 +72,7 @@ class OpenMMWindows:
     ) -> None:
         n = system.getNumParticles()
         self.positions = nanometers(positions, n)
-        self.coordinates = dict(coordinates)
+        self.coordinates = named(coordinates)
         self.names = tuple(self.coordinates)
         self.angles = angles_of(self.coordinates)
         self.scales = scales_of(self.coordinates, 10.0)

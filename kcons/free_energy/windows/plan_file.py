@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import tomllib
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ import numpy as np
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, UnsupportedError, did_you_mean
 from kcons.free_energy.windows.window import Sampler, Settings
 
 #: Tables of a plan, and what the values of their keys are.
@@ -197,9 +196,8 @@ def _is(value: Any, wanted: str) -> bool:
 
 def _refuse(key: str, known: Any, where: str) -> None:
     if key not in known:
-        near = difflib.get_close_matches(key, known, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"{where} has an unknown key {key!r}{hint} There are {', '.join(known)}", item=key)
+        hint = did_you_mean(key, known)
+        raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
 
 
 def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, FloatArray]:

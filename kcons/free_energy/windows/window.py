@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import ANGLE, LENGTH, numbers, whole_number
+from kcons.constraints.arguments import ANGLE, LENGTH, numbers, positive, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.motion.motion import Motion
-from kcons.thermostats.freedom import positive
 
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints import Formula
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -45,7 +45,6 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
-from kcons.thermostats.freedom import positive
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator

@@ -12,6 +12,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
+from kcons.constraints.arguments import positive
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import (
     NONE,
@@ -33,7 +34,7 @@ from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.freedom import atom_numbers, positive
+from kcons.thermostats.freedom import atom_numbers
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
 #: is continued stays as it is, bit for bit.

@@ -9,14 +9,13 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints.arguments import finite_number, whole_number
+from kcons.constraints.arguments import finite_number, positive, whole_number
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.openmm.quantities import masses_of
-from kcons.thermostats.freedom import positive
 
 #: kJ/mol/nm^3 in bar.
 BAR = 16.6053906717

@@ -10,7 +10,7 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints.arguments import seed_number, whole_number
+from kcons.constraints.arguments import positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -29,7 +29,6 @@ from kcons.openmm.integrator.system_checks import forces_of
 from kcons.openmm.quantities import masses_of
 from kcons.steppers import State
 from kcons.thermostats import Counts, best_share
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     ACCEPTED,
     CHANGE,

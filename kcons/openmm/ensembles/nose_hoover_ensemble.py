@@ -9,7 +9,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import (
     Momenta,
@@ -29,7 +29,6 @@ from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.nose_hoover import HALF, chain_fractions
 
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.

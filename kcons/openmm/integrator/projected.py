@@ -100,8 +100,13 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
         #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
         self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
+        if not hasattr(self._ensemble, "check"):
+            raise InputError(
+                f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin(temperature, friction)",
+                item="ensemble",
+            )
         self._ensemble.check(self.scheme)
-        self.parts = tuple(parts)
+        self.parts = _listed(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         for k, part in enumerate(self.parts, start=1):
@@ -216,6 +221,8 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
 
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
+
+        Nothing is returned where it is; `kcons.openmm.worst_length` tells how well lengths are kept.
 
         Raises
         ------
@@ -426,3 +433,16 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedIntegrator:
         return self.__copy__()
+
+
+def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
+    """Parts, or a single one, as a tuple; `InputError` for what is none."""
+    given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+    for part in given:
+        if not isinstance(part, Part):
+            raise InputError(
+                f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, constraints, "
+                "positions) makes one of constraints, CollectiveRows of Forces, surface_parts of surfaces",
+                item="parts",
+            )
+    return given

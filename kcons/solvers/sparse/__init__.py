@@ -3,6 +3,7 @@
 - `elimination`: order and pattern, found once
 - `substitution`: the sweeps over one cluster
 - `step_control`: what the loops of Newton's method share
+- `rows_at_once`: functions of many rows at once
 - `row_functions`: rows that are called by their addresses
 - `row_values`: values and gradients of compiled rows
 - `distances`: held distances

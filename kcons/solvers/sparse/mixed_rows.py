@@ -114,7 +114,7 @@ class SparseRows(CalledSolver):
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:, 2] = pattern.start, pattern.target_start, slots
         self._made_of = constraint_set, rows, inverse_masses, late
-        self._given = GivenRows(constraint_set, self.rows, int(widths.max(initial=0)))
+        self._given = GivenRows(constraint_set, self.rows, 9 * int(widths.max(initial=0)) + 1)
         links[:-1, 3] = self._given.starts
         n, numbers = len(rows), 4 * len(atom_numbers)
         lines = np.zeros(8 * int(slots[-1]))

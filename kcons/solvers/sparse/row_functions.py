@@ -35,6 +35,7 @@ from kcons.constraints.functions.formula import Formula
 from kcons.constraints.target import FloatArray
 from kcons.constraints.velocity import CustomVelocity
 from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.sparse.rows_at_once import FEWEST, rows_at_once
 
 FUNCTION = int(RowKind.FUNCTION)
 #: A function of positions relative to the first atom.
@@ -314,41 +315,76 @@ def _of_jitted_coefficients(coefficients: Any, width: int, timed: bool, step: fl
 
 
 class PythonRows:
-    """The rows of one object whose functions are Python's; what these raise is kept until the kernel has ended."""
+    """The rows of one object whose functions are Python's; what these raise is kept until the kernel has ended.
+
+    Beside a function that takes a microsecond everything done here shows.
+    """
 
     def __init__(self, item: FunctionRows | CustomVelocity, numbers: FloatArray) -> None:
         self.error: BaseException | None = None
         width, count = item.width, 3 * item.width
         start = numbers.ctypes.data
-        row: Callable[..., Any] = _velocity_row(item) if isinstance(item, CustomVelocity) else item.row
-        room = count if item.holonomic else 2 * count
+        row = _velocity_row(item) if isinstance(item, CustomVelocity) else _position_row(item)
+        shape = (width, 3) if item.holonomic else (2, width, 3)
+        # By address: places, rows, values, gradients.
+        places: dict[int, FloatArray] = {}
+        rows: dict[int, int] = {}
+        values: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+        def piece(address: int, size: int) -> FloatArray:
+            first = (address - start) >> 3
+            return numbers[first : first + size]
 
         def called(r: int, p: int, time: float, out: int) -> None:
-            at = (out - start) >> 3
             try:
-                first = (r - start) >> 3
-                # A copy: the function may keep what it sees.
-                place = numbers[first : first + room].reshape(-1, width, 3).copy()
-                value, slope = row(int(numbers[(p - start) >> 3]), *place, time)
-                numbers[at] = value
-                numbers[at + 1 : at + 1 + count] = slope.reshape(count)
+                if r not in places:
+                    places[r] = piece(r, math.prod(shape)).reshape(shape)
+                if p not in rows:
+                    rows[p] = int(piece(p, 1)[0])
+                if out not in values:
+                    values[out] = piece(out, 1), piece(out + 8, count).reshape(width, 3)
+                value, slope = values[out]
+                value[0], slope[...] = row(rows[p], places[r], time)
             except BaseException as error:
                 self.error = self.error or error
-                numbers[at : at + 1 + count] = np.nan
+                piece(out, 1 + count)[:] = np.nan
 
         self._function = _C_ROW(called)
         self.address = ctypes.cast(self._function, ctypes.c_void_p).value
 
 
-def _velocity_row(item: CustomVelocity) -> Callable[..., tuple[float, FloatArray]]:
+def _position_row(item: FunctionRows) -> Callable[[int, FloatArray, float], tuple[float, FloatArray]]:
+    """Its rows; of a place that comes twice running, as the end of a step and the start of the next, one gradient.
+
+    The value is found again, and the gradient with it where the value is another: what the function reads besides may
+    have changed.
+    """
+    last: dict[int, tuple[bytes, float, float, FloatArray]] = {}
+
+    def row(k: int, place: FloatArray, time: float) -> tuple[float, FloatArray]:
+        # A copy: the function may keep what it sees.
+        r = place.copy()
+        r.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
+        here, value, before = r.tobytes(), item.row_value(k, r, time), last.get(k)
+        if before is not None and before[0] == here and before[1] == time and before[2] == value:
+            return value, before[3]
+        slope = item.row_gradient(k, r, time)
+        last[k] = here, time, value, slope.copy()
+        return value, slope
+
+    return row
+
+
+def _velocity_row(item: CustomVelocity) -> Callable[[int, FloatArray, float], tuple[float, FloatArray]]:
     """Its rows as functions of the end of a way; coefficients of a place that comes twice running are found once."""
     last: dict[int, tuple[bytes, float, FloatArray]] = {}
 
-    def row(k: int, place: FloatArray, way: FloatArray, time: float) -> tuple[float, FloatArray]:
+    def row(k: int, place_and_way: FloatArray, time: float) -> tuple[float, FloatArray]:
+        place = place_and_way[0]
         here, before = place.tobytes(), last.get(k)
         if before is None or before[0] != here or before[1] != time:
-            before = last[k] = here, time, item.row(k, place, time).copy()
-        return float(np.vdot(before[2], way)), before[2]
+            before = last[k] = here, time, item.row(k, place.copy(), time).copy()
+        return float(np.vdot(before[2], place_and_way[1])), before[2]
 
     return row
 
@@ -358,18 +394,23 @@ def row_function(item: Constraint, numbers: FloatArray) -> Any:
 
     `numbers` are those among which the function will find its arguments.
     """
-    if isinstance(item, Formula):
-        return _compiled(item.code().row)
+    plain = plain_row(item)
+    if plain is not None:
+        return _compiled(plain)
     if isinstance(item, FunctionRows):
         gradient = item.gradient_function
         if item.by_row and gradient is not None and is_jitted(item.function) and is_jitted(gradient):
             return _of_jitted(item.function, gradient, item.width, item.time_dependent)
         return PythonRows(item, numbers)
-    if isinstance(item, CustomVelocity):
-        if is_jitted(item.coefficients):
-            return _of_jitted_coefficients(item.coefficients, item.width, item.time_dependent, 1e-6 * item.length)
-        return PythonRows(item, numbers)
-    return _compiled(FAMILIES[item.family])
+    assert isinstance(item, CustomVelocity)
+    if is_jitted(item.coefficients):
+        return _of_jitted_coefficients(item.coefficients, item.width, item.time_dependent, 1e-6 * item.length)
+    return PythonRows(item, numbers)
+
+
+def plain_row(item: Constraint) -> Callable[..., None] | None:
+    """``row(r, p, t, out)`` of a family or a formula."""
+    return item.code().row if isinstance(item, Formula) else FAMILIES.get(item.family)
 
 
 class GivenRows:
@@ -385,12 +426,13 @@ class GivenRows:
         First parameter of each row.
     """
 
-    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, widest: int) -> None:
-        """`rows` of the set in the order of the kernels; `widest` is the most atoms that one of them has."""
+    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, room: int) -> None:
+        """`rows` of the set in the order of the kernels; `room` is for the numbers that functions get and give."""
         kinds, starts = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
         order = np.full(constraint_set.n_rows, -1)
         order[rows] = np.arange(len(rows))
-        end = ROOM + 9 * widest + 1
+        items = np.zeros(constraint_set.n_rows, np.int64)
+        end = ROOM + room
         tables: list[tuple[Constraint, int, FloatArray]] = []
         for item, first in zip(constraint_set.constraints, constraint_set.starts, strict=False):
             mine = slice(first, first + item.n_rows)
@@ -399,7 +441,7 @@ class GivenRows:
                 continue
             here = here[np.argsort(order[mine][here])]
             table = item.parameters().reshape(item.n_rows, -1)[here]
-            kinds[mine] = item.kind
+            kinds[mine], items[mine] = item.kind, len(tables)
             if item.kind in (FUNCTION, VELOCITY):
                 kinds[mine] += item.relative
                 numbered = [here[:, None]] if item.functions else []
@@ -410,7 +452,8 @@ class GivenRows:
             starts[first + here] = end + (np.arange(len(here)) * size if count > 1 else 0)
             tables.append((item, end, table))
             end += table.size
-        self.kinds, self.starts = kinds[rows], starts[rows]
+        self.kinds, self.starts, self._items = kinds[rows], starts[rows], items[rows]
+        self._tables = [item for item, _, _ in tables]
         self.numbers = np.zeros(end)
         self.functions = []
         for item, first, table in tables:
@@ -418,6 +461,25 @@ class GivenRows:
             if item.kind in (FUNCTION, VELOCITY):
                 self.functions.append(row_function(item, self.numbers))
                 self.numbers.view(np.int64)[first : first + table.size : table.shape[1]] = self.functions[-1].address
+
+    def at_once(self, block: int) -> IntArray:
+        """Of each `block` of rows the address of the function for all, and how far apart their parameters are.
+
+        0 and 0 where rows are called one by one: few, of several atoms or objects, functions of Python. Shape (n, 2).
+        """
+        n = len(self.starts)
+        first = np.arange(0, n, block)
+        size = np.minimum(block, n - first)
+        apart = np.diff(self.starts, append=0)
+        alike = (apart == np.repeat(apart[first], size)) & (np.diff(self._items, append=-1) == 0)
+        alike[first + size - 1] = True
+        fit = np.logical_and.reduceat(alike, first) & (size >= FEWEST) if n else np.zeros(0, bool)
+        runs = np.zeros((len(first), 2), np.int64)
+        for k, item in enumerate(self._tables):
+            mine, row = fit & (self._items[first] == k), plain_row(item)
+            if mine.any() and row is not None and item.width == 1 and item.holonomic:
+                runs[mine, 0], runs[mine, 1] = rows_at_once(row).address, apart[first[mine]]
+        return runs
 
     @property
     def python(self) -> list[PythonRows]:

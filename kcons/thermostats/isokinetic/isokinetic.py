@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import positive
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
@@ -24,7 +25,6 @@ from kcons.thermostats.freedom import (
     Momentum,
     carried,
     freedom,
-    positive,
     refuse_friction,
     warn_of_conserved_momenta,
 )

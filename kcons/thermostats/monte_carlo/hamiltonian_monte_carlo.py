@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.arguments import finite_number, seed_number
+from kcons.constraints.arguments import finite_number, positive, seed_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     ConvergenceError,
@@ -21,7 +21,7 @@ from kcons.errors import (
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.executors.frame import Frame
 from kcons.steppers.stepper import stays
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.

@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError
 from kcons.steppers import State
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTENTIAL, SIZE, seed_number, stream
 
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, whole_number
+from kcons.constraints.arguments import finite_number, positive, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     POTENTIAL,
     SIZE,

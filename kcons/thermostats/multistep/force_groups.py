@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import check_call, numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 
@@ -40,8 +40,9 @@ class ForceGroups:
         for name, force in groups.items():
             if not isinstance(name, str) or not name:
                 raise InputError(f"a group of forces is called {name!r}; give it a name, a text", item="groups")
-            if not callable(force):
-                raise InputError(f"the forces of group {name!r} are {force!r}; give a function", item=name)
+            if force is None:
+                raise InputError(f"the force of group {name!r} is None; give a function of x, t", item=name)
+            check_call(f"the force of group {name!r}", force, ("x", "t"))
             if id(force) in seen:
                 raise InputError(
                     f"groups {seen[id(force)]!r} and {name!r} overlap: both are {force!r}, whose forces would count "

@@ -11,13 +11,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import check_pairs, finite_number, seed_number, whole_number
+from kcons.constraints.arguments import check_pairs, finite_number, positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.langevin import wind
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array
+from kcons.constraints.arguments import as_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -61,6 +61,8 @@ class CellSystem(System):
             raise InputError(
                 "give force and potential, or neither: a change of the cell is judged by the energy", item="potential"
             )
+        for name, function in (("force", force), ("potential", potential), ("stress", stress)):
+            check_call(name, function, ("x", "t", "cell"))
         self._matrix = lattice[0].copy()
         self.periodic: NDArray[np.bool_] = lattice[1].any(axis=0)
         self._pbc: bool | list[bool] = True if self.periodic.all() else self.periodic.tolist()

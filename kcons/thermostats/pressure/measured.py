@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.pressure.barostat import Place
 from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
 from kcons.thermostats.pressure.cell_system import CellSystem

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.steppers import State
-from kcons.thermostats.freedom import positive
 from kcons.thermostats.pressure.barostat import Barostat, Place, Trial
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Pieces

@@ -82,3 +82,8 @@ def test_forces_of_ase_constraints_have_no_stress():
     reporter = PressureReporter(dynamics, virial="difference")
     reporter()
     assert np.isfinite(reporter.mean)
+
+
+def test_what_is_no_way_to_the_pressure():
+    with pytest.raises(InputError, match="virial is 'mol'; choose 'molecular', 'atomic' or 'difference'"):
+        PressureReporter(None, virial="mol")

@@ -102,8 +102,8 @@ def test_a_gradient_that_vanishes_is_refused():
     [
         (lambda: Custom([0, 1], 3.0, gap_gradient), "function must be a function"),
         (lambda: Custom([0, 1], gap, 3.0), "gradient must be a function"),
-        (lambda: Custom([0, 1], gap, gap_gradient, length=0.0), "length must be positive"),
-        (lambda: Custom([0, 1], gap, gap_gradient, time_step=np.nan), "time_step must be positive"),
+        (lambda: Custom([0, 1], gap, gap_gradient, length=0.0), "length is 0.0; give a positive number"),
+        (lambda: Custom([0, 1], gap, gap_gradient, time_step=np.nan), "time_step is nan; give a positive number"),
     ],
 )
 def test_arguments_are_checked(make, message):

@@ -25,6 +25,7 @@ NAMES = {**FUNCTIONS, "pi": np.pi, "": np.float64}
         ("atan2(x1)", "atan2", "atan2 of two"),
         ("x1^2", "formula", r"is not allowed.* a power is written \*\*"),
         ("x1 -", "formula", "cannot be read"),
+        ("z1 = x1**2", "formula", "cannot be read.*write what is held at zero, the left side less the right one"),
         ("x1 if x2 else 0", "formula", "is not allowed"),
         ("x1.real", "formula", "is not allowed"),
         ("__import__('os').getcwd()", "formula", "is not allowed|no function"),

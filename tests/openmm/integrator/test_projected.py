@@ -24,6 +24,7 @@ from openmm_systems import (
     water_box,
 )
 
+from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.integrator.states.copies import program_of
@@ -52,6 +53,14 @@ def test_units_and_arguments():
         ProjectedIntegrator(0.001, "rattel")
     with pytest.raises(InputError, match="check_every"):
         ProjectedIntegrator(0.001, check_every=-1)
+    for ensemble in ("langevin", 300):
+        with pytest.raises(InputError, match=f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin"):
+            ProjectedIntegrator(0.001, ensemble=ensemble)
+    for parts in (Distance([[0, 1]]), [Distance([[0, 1]])]):
+        with pytest.raises(InputError, match=r"no part of an integrator; kcons\.openmm\.hold"):
+            ProjectedIntegrator(0.001, parts=parts)
+    alone = holding()
+    assert ProjectedIntegrator(0.001, parts=alone).parts == (alone,)
     meeting = [holding(), holding()]
     for part in meeting:
         part.meets_system = True

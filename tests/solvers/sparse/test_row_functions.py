@@ -178,6 +178,49 @@ def test_coefficients_are_found_once_for_a_place():
     assert len(places) <= 10 * 6
 
 
+@pytest.mark.parametrize("known", [True, False], ids=["gradient", "differences"])
+def test_gradients_are_found_once_for_a_place(known):
+    """A step asks where it begins, at each iteration, and twice where it ends: three gradients."""
+    values, slopes = [], []
+
+    def quartic(r):
+        values.append(r)
+        return float(np.sum(r**4))
+
+    def slope(r):
+        slopes.append(r.tobytes())
+        return 4.0 * r**3
+
+    x = np.array([[1.0, 0.2, 0.5]])
+    motion = Motion(ConstraintSet(Custom([0], quartic, slope if known else None), x, [1.0]), x)
+    system = System(motion, None)
+    state = run(system, State(x, motion.project_velocities(x, [[0.2, 1.0, 0.5]])), 0.003, 2)
+    values.clear()
+    slopes.clear()
+    run(system, state, 0.003, 10)
+    if known:
+        assert len(slopes) == len(set(slopes)) and len(slopes) <= 31
+        assert len(values) <= len(slopes) + 2 * 10
+    else:
+        assert len(values) <= 31 * 13 + 2 * 10
+    assert all(not r.flags.writeable and r.shape == (1, 3) for r in values)
+
+
+def test_a_gradient_is_found_again_where_the_value_has_changed():
+    """At one place and time: of what the function reads besides nothing is known."""
+    radius = [1.0]
+    item = Custom([0], lambda r: np.linalg.norm(r * radius), lambda r: r * radius[0] ** 2 / np.linalg.norm(r * radius))
+    x = np.array([[3.0, 0.0, 4.0]])
+    motion = Motion(ConstraintSet(item, x, [1.0]), x)
+    for scale in (1.0, 2.0, 0.5):
+        radius[0] = scale
+        multipliers = np.zeros(1)
+        motion.project_velocities(x, np.array([[0.6, 0.0, 0.8]]), multipliers=multipliers)
+        assert multipliers[0] == pytest.approx(1.0 / scale, rel=1e-12)
+    found = motion.project_positions(x, x)
+    np.testing.assert_allclose(np.linalg.norm(found * scale), 5.0, rtol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("item", "plain"),
     [

@@ -47,7 +47,7 @@ def test_a_difference_does_not_trust_an_array_that_is_used_again():
         ({}, "no groups"),
         ([springs], "no groups"),
         ({"": springs}, "a group of forces is called ''"),
-        ({"slow": 3}, "group 'slow' are 3"),
+        ({"slow": 3}, "group 'slow' is 3"),
         ({"fast": springs, "slow": springs}, "'fast' and 'slow' overlap"),
     ],
 )
