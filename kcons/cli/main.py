@@ -196,13 +196,16 @@ def _compare(chosen: argparse.Namespace) -> int:
         return _compare_averages(chosen, budget, folder, asked)
     if chosen.criterion == "temperature":
         raise InputError(
-            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}; here error and drift are known",
+            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}, whose averages are known. Whether a "
+            "step is right for averages of your own system: run it, and ask kcons check TRAJECTORY --topology FILE "
+            "--forces ..., or kcons compare FILE --slow FORCES --fast FORCES",
             item="criterion",
         )
     if chosen.criterion == "drift" and target is not None:
         raise InputError("--target-error is an error of trajectories; leave --criterion drift out", item="criterion")
     from kcons.cli.progress import Bars
     from kcons.comparison.methods import methods
+    from kcons.comparison.methods.snippets import code
     from kcons.comparison.work_precision import answer, measure, recommendation, report
     from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
 
@@ -243,6 +246,9 @@ def _compare(chosen: argparse.Namespace) -> int:
     ranked = answer.answer(result, chosen.criterion or "error", target)
     first = [recommendation.sentences(result)] if result.recommendation is not None else []
     first += [] if ranked is None else [answer.text(ranked)]
+    if ranked is not None and ranked.ranked and target is None:  # a recommendation has its lines of code
+        best = ranked.ranked[0].point
+        first.append(f"In Python:\n\n{code(test_system, best.method, best.number, _expression(chosen))}".rstrip())
     for words in first:
         terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(report.table(result, narrow=not report.fits(result, terminal.width)), explained, terminal)

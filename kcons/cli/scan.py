@@ -70,6 +70,11 @@ def add(commands: Any) -> None:
             metavar="ATOM",
             help="held as it is" if size > 2 else "held as it is; may be repeated",
         )
+    scan.add_argument(
+        "--constrain",
+        choices=("hbonds", "allbonds", "hangles", "allangles"),
+        help="bonds (guessed from distances) and angles that are held as they are",
+    )
     forces = scan.add_argument_group("energy and forces")
     forces.add_argument(
         "--calculator",
@@ -88,6 +93,10 @@ def _scan(chosen: argparse.Namespace) -> int:
     coordinates, values = _grid(chosen)
     atoms = _structure(chosen.structure)
     held = _held(chosen)
+    if chosen.constrain is not None:
+        from kcons.ase import constraints_of
+
+        held += constraints_of(atoms, chosen.constrain, guess_bonds=True)
     atoms.calc = _calculator(chosen.calculator, _settings(chosen.settings))
     held += getattr(atoms.calc, "held", [])
 

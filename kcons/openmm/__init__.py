@@ -31,6 +31,7 @@ try:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
     from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
     from kcons.openmm.integrator.schemes import SCHEMES
+    from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.surfaces.formulas import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
@@ -66,4 +67,5 @@ __all__ = [
     "surface_parts",
     "take_constraints",
     "velocities_of",
+    "worst_length",
 ]

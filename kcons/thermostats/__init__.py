@@ -30,6 +30,7 @@ from kcons.thermostats.multistep import (
 )
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.pressure import (
+    Barostat,
     CellRescaling,
     CellSystem,
     ConstantPressure,
@@ -42,6 +43,7 @@ from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSp
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
+    "Barostat",
     "CellRescaling",
     "CellSystem",
     "ConstantPressure",

@@ -31,6 +31,7 @@ def test_compare_writes_table_plot_and_json(tmp_path, capsys):
     assert lines[2].split() == ["method", "at", "error", "cost", "times"]
     assert printed.out.index("Use kcons") < printed.out.index("chain of 4 rigid bonds")
     assert "error: root-mean-square distance" in printed.out
+    assert "In Python:" in lines and "dynamics = ConstrainedDynamics(atoms, " in printed.out  # how to use the answer
     assert f"wrote {out / 'compare.json'}" in printed.out
     assert "reference solution" in printed.err  # progress goes to the other stream
     data = json.loads((out / "compare.json").read_text())
@@ -258,7 +259,7 @@ def test_ctrl_c_before_anything_is_done(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["chain", "--criterion", "temperature"], "is for thermostat"),
+        (["chain", "--criterion", "temperature"], "ask kcons check TRAJECTORY --topology FILE --forces"),
         (["thermostat", "--criterion", "drift"], "is for trajectories"),
         (["chain", "--criterion", "drift", "--target-error", "1e-3"], "leave --criterion drift out"),
     ],

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import ase.io
 import numpy as np
 import pytest
 from ase.build import molecule
@@ -58,6 +59,16 @@ def test_two_coordinates_and_what_is_held(run, tmp_path):
     assert plan["settings"]["both_ways"] is False
     points = json.loads((tmp_path / "scan-peroxide" / "scan.json").read_text())["points"]
     assert len(points) == 6 and all(p["error"] is None for p in points)
+
+
+def test_bonds_by_name_are_held(run, tmp_path):
+    words = ("--dihedral", 2, 0, 1, 3, "--from", 100, "--to", 120, "--steps", 1)
+    assert run("peroxide.xyz", *words, "--constrain", "hbonds", *EMT) == 0
+    first = ase.io.read("peroxide.xyz")
+    for atoms in ase.io.read(tmp_path / "scan-peroxide" / "scan.extxyz", ":"):
+        for pair in ((0, 2), (1, 3)):
+            assert atoms.get_distance(*pair) == pytest.approx(first.get_distance(*pair), abs=1e-7)
+        assert atoms.get_distance(0, 1) != pytest.approx(first.get_distance(0, 1), abs=1e-3)  # relaxed
 
 
 def test_points_that_fail_are_told_by_the_exit_status(run, capsys):

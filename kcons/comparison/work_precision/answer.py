@@ -38,6 +38,8 @@ class Point:
     value : float
         Error, drift, or deviation of a temperature.
     cost : float
+    number : float
+        The setting, of a comparison of trajectories.
     """
 
     method: str
@@ -45,6 +47,7 @@ class Point:
     setting: str
     value: float
     cost: float
+    number: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def answer(comparison: Comparison, criterion: Criterion = "error", limit: float 
         value = _value(m, criterion)
         if m.status == "ok" and value is not None and math.isfinite(value) and cost_of(m, judged.decides) > 0:
             setting = f"rtol {m.setting:.0e}" if m.adaptive else f"{m.setting:.4g} {units['time']}"
-            pairs.append((m, Point(m.method, m.title, setting, value, cost_of(m, judged.decides))))
+            pairs.append((m, Point(m.method, m.title, setting, value, cost_of(m, judged.decides), m.setting)))
     if not pairs:
         return None
     limit_is = "asked for"
@@ -287,7 +290,11 @@ def text(found: Answer) -> str:
 
 
 def _short(title: str) -> str:
-    return title if len(title) <= TITLE else f"{title[: TITLE - 1]}…"
+    """At most `TITLE` letters; what is left out is not the tolerance, by which methods differ that are called alike."""
+    if len(title) <= TITLE:
+        return title
+    head, comma, tail = title.rpartition(", ")
+    return f"{head[: TITLE - 1 - len(comma + tail)]}…{comma}{tail}"
 
 
 def _spent(cost: float, found: Answer) -> str:

@@ -91,7 +91,7 @@ class _Windows:
         return self.process(closed).posterior((at[:, None], [-1]))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Profile:
     """A free energy along one coordinate.
 
@@ -125,6 +125,27 @@ class Profile:
     _known: _Windows
     _closed: bool
     _added: Callable[[FloatArray], FloatArray] | None = None
+
+    def __repr__(self) -> str:
+        ends = f"{self.windows[0]:.6g} to {self.windows[-1]:.6g}"
+        return f"<Profile: {len(self.windows)} windows from {ends}, {self.method!r}>"
+
+    def __str__(self) -> str:
+        """A line for each window, and how far the free energy reaches."""
+        low, high = (int(f(self.F)) for f in (np.argmin, np.argmax))
+        own = np.array([int(np.argmin(np.abs(self.x - x))) for x in self.windows])
+        columns = (self.windows, self.mean_forces, self.mean_force_errors, self.F[own], self.error[own])
+        rows = [
+            f"{x:10.4f} {f:11.4f} +- {e:<9.4f} {F:10.4f} +- {dF:.4f}" for x, f, e, F, dF in zip(*columns, strict=True)
+        ]
+        rise = self.difference(self.x[low], self.x[high])
+        return "\n".join(
+            [
+                f"{'window':>10} {'dF/dx':>11}{'':13} {'F':>10}",
+                *rows,
+                f"from {self.x[low]:.4g} to {self.x[high]:.4g} F rises by {rise.value:.4g} +- {rise.error:.2g}",
+            ]
+        )
 
     def difference(self, a: float, b: float) -> Estimate:
         """F(b) - F(a) with its standard error."""

@@ -116,7 +116,10 @@ class Descent:
                 raise self._given_up(here, fmax, f"{most} evaluations; allow more, or start nearer to the minimum")
             if radius < LEAST:
                 raise self._given_up(
-                    here, fmax, "no step lowers the energy any further: forces are not its gradient, or not so exact"
+                    here,
+                    fmax,
+                    "no step lowers the energy any further: forces are not its gradient, or not so exact; take a "
+                    "larger fmax, or a calculator whose energies are smoother",
                 )
             step, expected = self._step(here, radius)
             try:

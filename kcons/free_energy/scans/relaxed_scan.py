@@ -65,6 +65,8 @@ class Scan:
     grid : Grid
     atoms : ase.Atoms
         As given, without calculator and constraints.
+    held : list of Constraint
+        What was held besides the coordinates.
     attempts : list of Attempt
         All relaxations, in the order in which they were made.
     best : dict
@@ -73,6 +75,7 @@ class Scan:
 
     grid: Grid
     atoms: Atoms
+    held: list[Constraint] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
     best: dict[Point, Attempt] = field(default_factory=dict)
 
@@ -108,8 +111,15 @@ class Scan:
         """Calls of energy and forces in all."""
         return sum(attempt.evaluations for attempt in self.attempts)
 
-    def structure(self, point: Point) -> Atoms:
+    def structure(self, point: Point, *, hold: bool = False) -> Atoms:
         """The minimum at a point, its values and energy in `info`.
+
+        Parameters
+        ----------
+        point : tuple of int
+            Numbers of its values in the lists of the scan.
+        hold : bool
+            Whether the atoms get the constraints they had there: what was held besides, and the coordinates.
 
         Raises
         ------
@@ -125,6 +135,10 @@ class Scan:
         found.info["energy"] = self.best[point].energy
         for key, v in zip(self.grid.keys, self.grid.shown(point), strict=True):
             found.info[key] = v
+        if hold:
+            pairs = zip(self.grid.coordinates, self.grid.values, point, strict=True)
+            here = [item.with_target(float(values[n])) for item, values, n in pairs]
+            found.set_constraint(Constraints([*self.held, *here]))
         return found
 
     def _table(self, entries: dict[Point, float]) -> FloatArray:
@@ -306,7 +320,7 @@ class _Wavefront:
         self.both_ways = bool(settings["both_ways"])
         bare = surface.atoms.copy()
         bare.set_constraint()
-        self.scan = Scan(grid, bare)
+        self.scan = Scan(grid, bare, surface.held)
         #: The attempt whose structure a point has handed on to its neighbours.
         self._handed: dict[Point, int] = {}
         self._queue: deque[tuple[Point, int | None]] = deque()

@@ -11,6 +11,7 @@ import ase.io
 import numpy as np
 from ase import units
 from rich import box
+from rich.console import Console
 from rich.table import Table
 
 from kcons import __version__
@@ -60,9 +61,18 @@ def summary(scan: Scan) -> str:
     return "\n".join(lines)
 
 
+class _Shown(Table):
+    """A table that `print` shows as a terminal does."""
+
+    def __str__(self) -> str:
+        page = io.StringIO()
+        Console(file=page, width=200, color_system=None).print(self)
+        return page.getvalue().rstrip()
+
+
 def table(scan: Scan) -> Table:
-    """A row a point; energies above the lowest one."""
-    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1))
+    """A row a point; energies above the lowest one. Print it."""
+    shown = _Shown(box=box.SIMPLE_HEAD, padding=(0, 1))
     for name, unit in zip(scan.grid.names, scan.grid.units, strict=True):
         shown.add_column(f"{name}\n{unit}", justify="right")
     for heading in ("energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"):

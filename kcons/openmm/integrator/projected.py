@@ -222,6 +222,8 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
 
+        Nothing is returned where it is; `kcons.openmm.worst_length` tells how well lengths are kept.
+
         Raises
         ------
         KconsError

@@ -19,6 +19,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 
@@ -128,6 +129,30 @@ class SystemRows:
         distances = Distance(pairs.reshape(-1, 2), self.lengths[rest])
         rows = ConstraintSet([distances], x[atoms], self.masses[atoms])
         return count + make_plan(rows, np.ascontiguousarray(x[atoms]), 0.0).rank
+
+
+def worst_length(context: openmm.Context) -> tuple[str, float]:
+    """The constraint of the System that is off most at the present positions.
+
+    Of any integrator, so that those of OpenMM can be asked as well.
+
+    Parameters
+    ----------
+    context : openmm.Context
+
+    Returns
+    -------
+    name : str
+        The constraint, its particles and its length; of a System without constraints, words that say so.
+    off : float
+        The part of its length by which it is off; 0 without constraints.
+    """
+    rows = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
+    if not rows.n_rows:
+        return "no constraint of the System", 0.0
+    off = np.abs(rows.stretches(np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)))
+    row = int(np.argmax(off))
+    return rows.name(row), float(off[row])
 
 
 def _settled(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:

@@ -168,3 +168,15 @@ def test_at_one_step_the_temperature_itself_decides():
 
 def test_one_thermostat_at_one_step_is_judged_by_the_limit():
     assert answer.answer_of_averages(fluid(sampled("only", 0.02, 0.001, 0.001, 1.0))).limit == 0.01
+
+
+def test_what_is_left_out_of_long_names_is_not_what_they_differ_by():
+    tolerances = ("1e-4", "1e-5", "1e-12")
+    long = [replace(m, title=f"OpenMM + kcons compiled RATTLE, {t}") for m, t in zip(RATTLE, tolerances, strict=True)]
+    named = [replace(m, method=m.title, setting=2.0, error=1e-3) for m in long]
+    found = answer.answer(made(*named))
+    lines = plain_text(answer.ranking(found)).splitlines()
+    for tolerance in tolerances:
+        assert any("OpenMM + kcons compiled" in line and f"…, {tolerance} " in line for line in lines)
+    assert max(len(line) for line in lines) <= 80
+    assert found.ranked[0].point.number == 2.0

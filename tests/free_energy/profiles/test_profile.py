@@ -319,3 +319,13 @@ def test_bad_input_is_refused(x, f, e, options, item, message):
     with pytest.raises(InputError, match=message) as caught:
         integrate(x, f, e, **options)
     assert caught.value.item == item
+
+
+def test_a_profile_prints_its_windows_and_not_its_arrays():
+    x = np.linspace(1.0, 2.0, 5)
+    profile = integrate(x, 2.0 * x, np.full(5, 0.01))
+    assert repr(profile) == "<Profile: 5 windows from 1 to 2, 'gp'>"
+    first, *lines, last = str(profile).splitlines()
+    assert first.split() == ["window", "dF/dx", "F"] and len(lines) == 5
+    assert [float(word) for word in lines[-1].replace("+-", "").split()[:3]] == [2.0, 4.0, 0.01]
+    assert last.startswith("from 1 to 2 F rises by 3")

@@ -52,7 +52,7 @@ def test_an_attempt_of_another_scan_is_refused(tmp_path):
 
 def test_the_plan_has_to_be_the_same(tmp_path):
     made(tmp_path)
-    with pytest.raises(OccupiedError, match=r"another scan in it \(settings differ\)"):
+    with pytest.raises(OccupiedError, match=r"another scan in it \(of other settings\)"):
         made(tmp_path, {"fmax": 0.02})
     plan = json.loads((tmp_path / PLAN).read_text())
     (tmp_path / PLAN).write_text(json.dumps({**plan, "colour": 1}))
@@ -71,7 +71,7 @@ def test_without_a_folder_nothing_is_kept():
 
 
 def test_python_functions_need_no_folder(tmp_path):
-    row = Custom([[0]], lambda r, t: r[0, 0], lambda r, t: np.array([[1.0, 0, 0]]))
+    row = Custom([[0]], lambda r: r[0, 0], lambda r: np.array([[1.0, 0, 0]]))
     grid = Grid([row], [[0.1]])
     Attempts(None, chain(4, threefold), grid, [], {})
     with pytest.raises(InputError, match="Python function"):
@@ -86,7 +86,7 @@ def test_the_calculator_has_to_be_the_same(tmp_path):
     for epsilon in (0.1, 0.1, 0.2):
         atoms.calc = LennardJones(epsilon=epsilon)
         if epsilon == 0.2:
-            with pytest.raises(OccupiedError, match=r"\(calculator differ\)"):
+            with pytest.raises(OccupiedError, match=r"\(of other calculator\)"):
                 Attempts(tmp_path, atoms, grid, [], {})
         else:
             Attempts(tmp_path, atoms, grid, [], {})

@@ -12,6 +12,7 @@ from ase.calculators.emt import EMT
 from ase.constraints import FixAtoms, Hookean
 from scan_systems import chain, threefold, two_wells
 
+from kcons.ase import constrain
 from kcons.constraints import Angle, CustomVelocity, Dihedral, Distance, FixedAtoms
 from kcons.errors import (
     CalculatorError,
@@ -43,6 +44,18 @@ def test_a_torsion_has_its_profile():
     assert found.evaluations == atoms.calc.calls
     there = found.structure((3,))
     assert there.info["dihedral_0_1_2_3"] == pytest.approx(-90) and there.info["energy"] == found.energies[3]
+
+
+def test_structures_with_what_was_held_there():
+    atoms = chain(4, threefold)
+    first, last = Distance([[0, 1]]), Distance([[2, 3]])
+    constrain(atoms, [first])
+    found = scan(atoms, TURN, RING[6:8], fmax=1e-2, held=last)
+    there = found.structure((1,), hold=True)
+    (held,) = there.constraints
+    assert [c.atoms.tolist() for c in held.constraints] == [c.atoms.tolist() for c in (first, last, TURN)]
+    assert held.report(there).residual < 1e-12 and held.constraints[2].target_at(0.0) == RING[7]
+    assert not found.structure((1,)).constraints
 
 
 def test_two_coordinates():
@@ -234,7 +247,7 @@ def test_bad_coordinates():
     with pytest.raises(UnsupportedError, match="moves with time"):
         scan(atoms, Distance([[0, 1]], lambda t: 1.0 + t), [1.2])
     with pytest.raises(UnsupportedError, match="velocities"):
-        scan(atoms, TURN, RING, held=CustomVelocity([[0, 1]], lambda r, t: np.ones((len(r), 2, 3))))
+        scan(atoms, TURN, RING, held=CustomVelocity([[0, 1]], lambda r: np.ones((2, 3))))
     with pytest.raises(InputError, match="fmax is 0; give a positive number"):
         scan(atoms, TURN, RING, fmax=0)
     for wrong in ({"fmax": "x"}, {"evaluations": 2.5}, {"held": 3}, {"held": [TURN, None]}, {"folder": 3}):

@@ -39,6 +39,7 @@ def test_table_and_summary():
     assert float(last[1]) == pytest.approx(energies[2] - energies.min(), abs=2e-3)
     said = scan_report.summary(line())
     assert said.startswith("3 of 4 points") and "failed: Dihedral(0, 1, 2, 3) = 57.2958: CalculatorError" in said
+    assert str(scan_report.table(line())).splitlines()[1].split()[0] == rows[1][0]  # what print shows
     two = rendered(scan_report.table(surface()))
     assert "Distance(1, 2)" in two and "1.3000" in two and "40.00" in two
 

@@ -15,7 +15,7 @@ from openmm_systems import (
 )
 
 from kcons.errors import UnsupportedError
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import ProjectedIntegrator, worst_length
 from kcons.openmm.integrator.system_checks import SystemRows, refuse_motion_remover
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
@@ -122,3 +122,25 @@ def test_motion_remover_beside_what_is_held_in_space():
     system.addForce(openmm.CMMotionRemover())
     with pytest.raises(UnsupportedError, match=r"a plane holds particles in space.*removeCMMotion=False"):
         refuse_motion_remover(system, "a plane")
+
+
+@pytest.mark.parametrize("kind", [ProjectedIntegrator, openmm.VerletIntegrator])
+def test_the_length_that_is_off_most(kind):
+    system = openmm.System()
+    for _ in range(3):
+        system.addParticle(12.0)
+    system.addConstraint(0, 1, 0.1)
+    system.addConstraint(1, 2, 0.2)
+    context = openmm.Context(system, kind(0.001), openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.21, 0.0]])
+    name, off = worst_length(context)
+    assert "constraint 1 of the System (particles 1 and 2, 0.2 nm)" in name and off == pytest.approx(0.05)
+    context.applyConstraints(1e-8)
+    assert worst_length(context)[1] < 1e-7
+
+
+def test_without_constraints_no_length_is_off():
+    system = openmm.System()
+    system.addParticle(1.0)
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    assert worst_length(context) == ("no constraint of the System", 0.0)
