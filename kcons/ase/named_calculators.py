@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from hashlib import sha256
 from importlib import import_module
 from importlib.util import find_spec
+from os import PathLike
+from os.path import isfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kcons.errors import InputError, UnsupportedError, did_you_mean
+
+#: Endings of files that say what a calculator computes, not what it writes.
+WEIGHTS = (".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz", ".xml", ".eam", ".alloy", ".yace")
 
 
 def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> Any:
@@ -60,8 +67,8 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
 def described(calculator: Any) -> list[Any]:
     """What tells a calculator from others: its kind, its parameters, and the calculators that it is made of.
 
-    Plain data, the same in each process. What a calculator does not give as parameters, such as the weights of a model,
-    is not in it.
+    Plain data, the same in each process; of parameters that are files of weights, the contents. What a calculator does
+    not give as parameters is not in it.
     """
     parts = getattr(getattr(calculator, "mixer", calculator), "calcs", ())
     kind = type(calculator)
@@ -77,6 +84,10 @@ def _plain(value: Any) -> Any:
         return [_plain(part) for part in value]
     if isinstance(value, np.ndarray | np.generic):
         return _plain(value.tolist())
-    if value is None or isinstance(value, str | int | float):
+    if isinstance(value, str | PathLike):
+        name = str(value)
+        weights = isfile(name) and name.endswith(WEIGHTS)
+        return [name, sha256(Path(name).read_bytes()).hexdigest()] if weights else name
+    if value is None or isinstance(value, int | float):
         return value
     return type(value).__qualname__

@@ -46,6 +46,9 @@ __all__ = [
 
 NM = 0.1
 
+#: Bonds that are longer than so many times the median may be bonds across a box.
+CUT = 3.0
+
 
 class FromMDEngine(NamedTuple):
     """A Universe, and what was held where it came from, in angstrom and radian."""
@@ -92,8 +95,15 @@ def to_ase(universe: Any, constraints: Iterable[Constraint] = ()) -> ase.Atoms:
     ------
     InputError, ConstraintError
         What does not fit the atoms.
+
+    Warns
+    -----
+    UserWarning
+        Molecules seem to be cut at the edge of a box, which the universe does not have.
     """
-    return _held_atoms(_with_bonds_of(snapshot_of(universe), constraints), _rows(constraints, 1.0))
+    snapshot = _with_bonds_of(snapshot_of(universe), constraints)
+    _warn_of_cut(snapshot)
+    return _held_atoms(snapshot, _rows(constraints, 1.0))
 
 
 def _held_atoms(snapshot: Snapshot, rows: Sequence[Constraint]) -> ase.Atoms:
@@ -292,6 +302,24 @@ def _rows(constraints: Iterable[Constraint], angstrom: float) -> list[Constraint
     return list(constraints)
 
 
+def _warn_of_cut(snapshot: Snapshot) -> None:
+    """Without a cell, bonds across the box are as long as it is, and nothing can make their molecules whole."""
+    bonds, x = snapshot.topology.bonds, snapshot.positions
+    if len(bonds) == 0 or (snapshot.cell is not None and snapshot.pbc.any()):
+        return
+    length = np.linalg.norm(x[bonds[:, 0]] - x[bonds[:, 1]], axis=1)
+    cut = (length > CUT * np.median(length)) & (length > 0.5 * np.ptp(x, axis=0).max())
+    if cut.any():
+        k = int(np.argmax(length))
+        warnings.warn(
+            f"{int(cut.sum())} bonds are as long as half of the system, that of atoms {bonds[k, 0]} and {bonds[k, 1]} "
+            f"{length[k] / snapshot.angstrom:.1f} angstrom: molecules seem to be cut at the edge of a box, and there "
+            "is none to make them whole. Give it (universe.dimensions = [a, b, c, 90, 90, 90]), or unwrap the file",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
 def _with_bonds_of(snapshot: Snapshot, constraints: Iterable[Constraint]) -> Snapshot:
     """Bonds that were guessed for the constraints are worth keeping."""
     if isinstance(constraints, HeldRows) and constraints.topology.n_atoms == snapshot.topology.n_atoms:
@@ -310,6 +338,7 @@ def _openmm(
     rows = all_rescaled(_rows(constraints, angstrom), NM / angstrom)
     sites = constraints.virtual_sites if isinstance(constraints, HeldRows) else None
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
+    _warn_of_cut(snapshot)
     links = np.concatenate([snapshot.topology.bonds, *(_chained(item) for item in rows if item.translation_invariant)])
     snapshot = whole_molecules(snapshot, links)
     x = snapshot.positions

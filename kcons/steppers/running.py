@@ -163,7 +163,10 @@ def run(
     if stepper is None:
         stepper = Rattle()
     if isinstance(stepper, type) or not hasattr(stepper, "step"):
-        raise InputError(f"stepper is {stepper!r}; give an object, such as kcons.Rattle()", item="stepper")
+        remedy = "give an object, such as kcons.Rattle()"
+        if hasattr(stepper, "states"):
+            remedy = "it chooses its own steps: iterate over its states(system, state, until)"
+        raise InputError(f"stepper is {stepper!r}; {remedy}", item="stepper")
     refuse_other(observers, Iterable, "observers", "a list of functions of a state")
     observers = list(observers)
     for observer in observers:

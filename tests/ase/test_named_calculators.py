@@ -47,3 +47,15 @@ def test_what_tells_calculators_from_each_other():
     other = LennardJones(epsilon=0.1)
     other.parameters["beside"] = {"a": [0, 1], "b": object}
     assert described(same) == described(other)
+
+
+def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
+    calculator, model, log = LennardJones(), tmp_path / "net.model", tmp_path / "out.txt"
+    model.write_bytes(b"weights")
+    log.write_text("one")
+    calculator.parameters.update(model=str(model), log=str(log))
+    before = described(calculator)
+    log.write_text("another")
+    assert described(calculator) == before
+    model.write_bytes(b"others!")
+    assert described(calculator) != before

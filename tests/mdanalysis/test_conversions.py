@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+
+import MDAnalysis as mda
 import numpy as np
 import openmm
 import pytest
@@ -198,3 +201,26 @@ def test_ase_constraints_come_along(villin):
     atoms.set_constraint([*atoms.constraints, FixAtoms([8])])
     _, rows = from_ase(atoms)
     assert [item.family for item in rows] == ["Distance", "FixedAtoms"]
+
+
+def ethane_cut(box):
+    """Two carbons with hydrogens, the second beyond the edge of a box of 10 angstrom."""
+    universe = mda.Universe.empty(4, trajectory=True)
+    universe.add_TopologyAttr("elements", ["H", "C", "C", "H"])
+    universe.add_TopologyAttr("masses", [1.0, 12.0, 12.0, 1.0])
+    universe.add_TopologyAttr("bonds", [(0, 1), (1, 2), (2, 3)])
+    universe.atoms.positions = [[8.6, 0.0, 0.0], [9.6, 0.0, 0.0], [1.1, 0.5, 0.0], [2.1, 0.5, 0.0]]
+    if box:
+        universe.dimensions = [10.0, 10.0, 10.0, 90.0, 90.0, 90.0]
+    return universe
+
+
+def test_molecules_cut_by_a_box_that_is_not_there_are_said():
+    with pytest.warns(UserWarning, match=r"1 bonds .* atoms 1 and 2 8\.5 angstrom.*universe\.dimensions = "):
+        to_ase(ethane_cut(box=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        to_ase(ethane_cut(box=True))
+        whole = ethane_cut(box=False)
+        whole.atoms[2:].positions += [10.0, 0.0, 0.0]
+        to_ase(whole)

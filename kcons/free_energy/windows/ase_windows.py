@@ -74,6 +74,13 @@ class AseWindows:
         self.held = [*from_ase_constraints(self.atoms), *held]
         self.atoms.set_constraint()
         self.names = tuple(self.coordinates)
+        self.angles = angles_of(self.coordinates)
+        self.scales = scales_of(self.coordinates, 1.0)
+
+    @property
+    def digest(self) -> str:
+        """What the windows in a folder belong to, of the calculator as it is made now."""
+        calculator = self.calculator
         made = (
             (calculator.func, calculator.args, calculator.keywords)
             if isinstance(calculator, partial)
@@ -83,9 +90,7 @@ class AseWindows:
         maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:], described(calculator())]
         frame = [self.atoms.numbers, self.atoms.positions, self.atoms.cell.array, self.atoms.pbc]
         frame.append(self.atoms.get_masses())
-        self.digest = digest_of(frame, maker, self.held, list(self.coordinates.values()))
-        self.angles = angles_of(self.coordinates)
-        self.scales = scales_of(self.coordinates, 1.0)
+        return digest_of(frame, maker, self.held, list(self.coordinates.values()))
 
     def _rows(self) -> Held:
         atoms = self.atoms

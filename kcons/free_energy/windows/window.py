@@ -114,11 +114,15 @@ class Sampler(Protocol):
         Of structure, forces and constraints: what a folder of windows belongs to.
     """
 
-    digest: str
     names: tuple[str, ...]
     kJ: float
     scales: FloatArray
     angles: tuple[bool, ...]
+
+    @property
+    def digest(self) -> str:
+        """See above."""
+        ...
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates at the initial structure, and their periods, shape (d,); raises where a window cannot be made."""

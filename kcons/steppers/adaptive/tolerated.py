@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from kcons.constraints.arguments import finite_number, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     ConvergenceError,
@@ -67,12 +68,10 @@ class ToTolerance:
     """
 
     def __init__(self, tolerance: float, length: float, speed: float | None) -> None:
-        if not (math.isfinite(tolerance) and tolerance >= 1e-14):
+        if finite_number(tolerance, "tolerance") < 1e-14:
             raise InputError(f"tolerance is {tolerance}; give a number of 1e-14 or more", item="tolerance")
-        for value, item in ((length, "length"), (speed, "speed")):
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(f"{item} is {value}; give a positive number", item=item)
-        self.tolerance, self.length, self.speed = float(tolerance), float(length), speed
+        self.tolerance, self.length = float(tolerance), positive(length, "length")
+        self.speed = None if speed is None else positive(speed, "speed")
 
     @property
     def first(self) -> float:
@@ -114,10 +113,8 @@ class ToTolerance:
             What a step raised, or an error above the tolerance, at steps too small to be made smaller. The last
             state that came is intact; the first two carry `step`.
         """
-        if not math.isfinite(until):
-            raise InputError(f"until is {until}; give a time", item="until")
-        if first_step is not None and not (math.isfinite(first_step) and first_step > 0):
-            raise InputError(f"first_step is {first_step}; give a positive number", item="first_step")
+        until = finite_number(until, "until")
+        first_step = None if first_step is None else positive(first_step, "first_step")
         if state.thermostat is not None:
             raise UnsupportedError(f"{type(self).__name__} knows no thermostats; use a stepper with equal steps")
         self.check(system)

@@ -97,6 +97,16 @@ def test_what_a_folder_belongs_to():
     assert len({sampler().digest, sampler(held=[]).digest, *(other.digest for other in others)}) == 5
 
 
+def test_a_calculator_that_was_changed_is_another_one():
+    calculator = LennardJones(epsilon=0.01)
+    windows = AseWindows(molecule("CH3OH"), lambda: calculator, {"turn": TURN}, [PIECES])
+    before = windows.digest
+    calculator.set(epsilon=0.02)
+    assert windows.digest != before
+    calculator.set(epsilon=0.01)
+    assert windows.digest == before
+
+
 def made(epsilon):
     """Functions of the same name, without arguments."""
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stepper_systems import spherical_pendulum
 
+from kcons import run
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Extrapolation, Multistep
 
@@ -30,11 +31,13 @@ def test_bad_numbers(scheme, options, item) -> None:
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_what_is_refused_before_any_step(scheme) -> None:
-    """Where `states` is called, not where its first state is asked for."""
+    """Where `states` is called, not where its first state is asked for; `run` says that it is to be called."""
     system, state = spherical_pendulum()
-    for until in (np.nan, np.inf):
+    for until in (np.nan, np.inf, "1", None):
         with pytest.raises(InputError, match="until is"):
             scheme().states(system, state, until)
+    with pytest.raises(InputError, match=r"it chooses its own steps: .* states\("):
+        run(system, state, 0.1, 3, stepper=scheme())
     for first in (0.0, -0.1, np.nan):
         with pytest.raises(InputError, match="first_step is"):
             scheme().states(system, state, 1.0, first_step=first)
