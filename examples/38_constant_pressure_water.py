@@ -202,14 +202,14 @@ def cost(molecules: int, turns: int) -> dict[str, Any]:
 
 
 #: The same length each, so that none weighs more than others.
-SEEDS = (3, 5, 11, 13, 17, 19, 23, 29)
+SEEDS = (3, 5, 11, 13)
 RUNS: dict[str, Any] = {
     **{
         f"water, {b}, seed {seed}": partial(run_water, b, "Langevin", steps, 10, seed=seed)
         for seed in SEEDS
         for b, steps in (("OpenMM", 600_000), ("Monte Carlo", 500_000))
     },
-    "water, rescaling": partial(run_water, "rescaling", "Langevin", 500_000),
+    "water, rescaling": partial(run_water, "rescaling", "Langevin", 200_000),
     "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 400_000),
     "water, Monte Carlo, every 100": partial(run_water, "Monte Carlo", "Langevin", 150_000, 100, seed=7),
     **{f"cost, Monte Carlo, {n}": partial(cost, n, turns) for n, turns in ((WATERS, 60), (216, 20))},

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure
@@ -52,7 +53,7 @@ class PressureReporter:
         if virial not in get_args(Virial):
             raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
         self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
-        self.thermal = None if temperature_K is None else units.kB * temperature_K
+        self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
         self._own = isinstance(file, str | Path)
         self._file = Path(file).open("w") if isinstance(file, str | Path) else file  # noqa: SIM115
         if self._file is not None:

@@ -87,10 +87,13 @@ class Run(ABC):
         Wall time of the constraints.
     divided : bool
         Whether that time can be told from the rest of a step.
+    grows : bool
+        Whether steps begin far shorter than they become, so that the first ones do not tell how long it will take.
     """
 
     steps: int = 1
     divided: bool = True
+    grows: bool = False
 
     def __init__(self) -> None:
         self.constraints = Stopwatch()

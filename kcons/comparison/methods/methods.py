@@ -26,6 +26,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, did_you_mean
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
+from kcons.steppers.adaptive.tolerated import ToTolerance
 
 #: The steppers of kcons by the names they have as methods, the plain one first, those for comparison last.
 STEPPERS: Mapping[str, type[Stepper]] = {
@@ -151,15 +152,16 @@ def _maker(item: Any) -> Callable[[float], Stepper]:
     return lambda dt: item()  # type: ignore[no-any-return]
 
 
-class _ExtrapolatedRun(OfStates):
-    def __init__(self, test_system: TestSystem, tolerance: float) -> None:
+class _AdaptiveRun(OfStates):
+    def __init__(self, test_system: TestSystem, scheme: ToTolerance) -> None:
         super().__init__()
         motion = Motion(test_system.constraint_set, test_system.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
         system = System(motion, test_system.potential.forces, friction=test_system.friction)
         self._state = State(test_system.positions, test_system.velocities)
         self._horizon = test_system.horizon
-        self._states = steppers.Extrapolation(tolerance).states(system, self._state, test_system.horizon)
+        self.grows = isinstance(scheme, steppers.Multistep)
+        self._states = scheme.states(system, self._state, test_system.horizon)
 
     def advance(self) -> None:
         self._state = next(self._states)
@@ -174,11 +176,19 @@ class _ExtrapolatedRun(OfStates):
         return self.time == self._horizon
 
 
-class Extrapolated(Method):
-    """`kcons.steppers.Extrapolation`, which chooses size and order of its steps; its settings are tolerances."""
+@dataclass(frozen=True)
+class Adaptive(Method):
+    """`kcons.steppers.Extrapolation` and `Multistep`, which choose size and order; their settings are tolerances.
+
+    Attributes
+    ----------
+    scheme : callable (tolerance) -> ToTolerance
+    """
+
+    scheme: Callable[[float], ToTolerance] = steppers.Extrapolation
 
     def start(self, test_system: TestSystem, setting: float) -> Run:
-        return _ExtrapolatedRun(test_system, setting)
+        return _AdaptiveRun(test_system, self.scheme(setting))
 
 
 # -- ASE --------------------------------------------------------------------------------------------
@@ -340,7 +350,8 @@ METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         *of_steppers(STEPPERS),
-        Extrapolated("extrapolation", "kcons Extrapolation", adaptive=True, damps=True),
+        Adaptive("extrapolation", "kcons Extrapolation", adaptive=True, damps=True),
+        Adaptive("multistep", "kcons Multistep", adaptive=True, damps=True, usual=False, scheme=steppers.Multistep),
         AseKcons("ase-kcons", "ASE Verlet + kcons", md_engine="ase"),
         AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", md_engine="ase"),
         AseInternals("ase-internals", "ASE Verlet + FixInternals", md_engine="ase"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 
 from kcons.comparison.methods.method import Method
-from kcons.comparison.methods.methods import METHODS, AseBonds, AseKcons, CoreStepper, Extrapolated, ProjectedOde
+from kcons.comparison.methods.methods import METHODS, Adaptive, AseBonds, AseKcons, CoreStepper, ProjectedOde
 from kcons.comparison.methods.openmm import TIGHT, BuiltIn, Compiled, Held, OnSurfaces, Projected, only_water
 from kcons.comparison.test_systems import TestSystem
 from kcons.errors import InputError
@@ -53,8 +53,8 @@ def code(test_system: TestSystem, method: str, setting: float, made_by: str) -> 
     elif isinstance(found, CoreStepper) and _plain(found):
         stepper = type(found.make(1.0)).__name__
         lines = _ase_stepper(dt, steps, stepper) if molecular else _arrays(dt, steps, stepper)
-    elif isinstance(found, Extrapolated):
-        lines = _extrapolated(setting)
+    elif isinstance(found, Adaptive):
+        lines = _adaptive(type(found.scheme(setting)).__name__, setting)
     elif isinstance(found, AseKcons):
         lines = _ase_kcons(dt, steps)
     elif isinstance(found, AseBonds):
@@ -104,14 +104,14 @@ def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
     ]
 
 
-def _extrapolated(tolerance: float) -> list[str]:
+def _adaptive(scheme: str, tolerance: float) -> list[str]:
     return [
         "from kcons import Motion, State, System",
         "from kcons.comparison import test_systems",
-        "from kcons.steppers import Extrapolation",
+        f"from kcons.steppers import {scheme}",
         "",
         *_ON_ARRAYS,
-        f"for end in Extrapolation({tolerance!r}).states(system, start, until=test_system.horizon):",
+        f"for end in {scheme}({tolerance!r}).states(system, start, until=test_system.horizon):",
         "    pass  # each state is the end of a step",
     ]
 

@@ -398,7 +398,8 @@ def _run_to_horizon(
         first = len(log.seconds) == 1
         to_go = run.steps * (test_system.horizon - run.time) / (run.time - log.times[-2])
         doubtful = first and log.seconds[0] < max(FIRST_STEP_DOUBT, FIRST_STEP_SHARE * budget)
-        if now + log.seconds[-1] * to_go > deadline and not doubtful and (len(log.seconds) <= 2 or now > deadline):
+        told = len(log.seconds) <= 2 and not run.grows
+        if now + log.seconds[-1] * to_go > deadline and not doubtful and (told or now > deadline):
             return _too_slow(log.seconds[-1], budget)
     return ""
 

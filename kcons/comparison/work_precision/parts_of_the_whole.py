@@ -65,7 +65,7 @@ def _molecule(structure: str, text: str, constrain: str, title: str, **more: Any
 
 
 #: Steps that choose their size are for few atoms and smooth forces.
-FEW = {"extrapolation": "meant for few atoms; smaller systems show it"}
+FEW = dict.fromkeys(("extrapolation", "multistep"), "meant for few atoms; smaller systems show it")
 TOO_LONG = {"ase-internals": "a step takes longer than the whole budget; smaller systems show it"}
 TOO_LARGE = FEW | dict.fromkeys(
     ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853"),

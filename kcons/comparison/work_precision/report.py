@@ -31,6 +31,7 @@ STYLES: dict[str, tuple[str, str | int]] = {
     "dop853": ("#009E73", "D"),
     "dop853-projected": ("#00593d", 8),
     "extrapolation": ("#1b7837", 9),
+    "multistep": ("#5aae61", 11),
     "verlet": ("#333333", 6),
     "ase-verlet": ("#999999", 6),
     # OpenMM: its own in reds, the darker the tighter; kcons in it in blues, its solver in greens.

@@ -9,7 +9,7 @@ import numpy as np
 
 from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 from kcons.thermostats.pressure.barostat import Place
@@ -77,6 +77,8 @@ def instantaneous_pressure(
         An unknown virial; a cell without a volume.
     UnsupportedError
         There is no stress, or a piece is held in space.
+    NonFiniteError
+        An energy or a stress is not finite.
     """
     if virial not in ("molecular", "atomic", "difference"):
         raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
@@ -115,6 +117,11 @@ def _slope(system: CellSystem, state: State, pieces: Pieces, cell: FloatArray) -
             energies.append(system.energy(y, state.time, state.step))
     finally:
         system.set_cell(cell, state.positions)
+    if not np.isfinite(energies).all():
+        raise NonFiniteError(
+            f"energies of a cell a little larger and smaller are {energies[0]} and {energies[1]}, which have no "
+            "difference: atoms overlap, or the force field returns what is no energy"
+        )
     return (energies[0] - energies[1]) / (2 * STRAIN)
 
 

@@ -77,6 +77,8 @@ def test_forces_of_ase_constraints_have_no_stress():
     for virial in ("molecular", "atomic"):
         with pytest.raises(UnsupportedError, match="no stress"):
             PressureReporter(dynamics, virial=virial)()
+    with pytest.raises(InputError, match="temperature_K is -1"):
+        PressureReporter(dynamics, temperature_K=-1)
     reporter = PressureReporter(dynamics, virial="difference")
     reporter()
     assert np.isfinite(reporter.mean)

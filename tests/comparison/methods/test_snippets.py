@@ -49,12 +49,13 @@ def test_lines_of_code_on_arrays():
     assert np.abs(space["end"].positions - system.reference().positions).max() < 1e-4
 
 
-def test_lines_of_code_of_adaptive_steps():
+@pytest.mark.parametrize("name", ["extrapolation", "multistep"])
+def test_lines_of_code_of_adaptive_steps(name):
     system = test_systems.build("dumbbells")
-    text = snippets.code(system, "extrapolation", 1e-8, 'test_systems.build("dumbbells")')
+    text = snippets.code(system, name, 1e-8, 'test_systems.build("dumbbells")')
     space = {}
-    exec(compile(text, "extrapolation", "exec"), space)
-    assert "Extrapolation(1e-08)" in text and space["end"].time == system.horizon
+    exec(compile(text, name, "exec"), space)
+    assert f"{name.capitalize()}(1e-08)" in text and space["end"].time == system.horizon
     assert 0 < np.abs(space["end"].positions - system.reference().positions).max() < 1e-5
 
 

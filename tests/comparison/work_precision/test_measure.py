@@ -316,3 +316,10 @@ def test_watcher_hears_of_everything(chain):
     assert "kernels" in listener.heard[0]
     assert listener.heard[1] == "reference solution"
     assert len(listener.heard) == 2 + len(chain.time_steps)
+
+
+def test_first_steps_that_grow_are_no_measure_of_the_time():
+    """Multistep begins with steps of 1e-6: at that length they would take ten times the budget."""
+    test_system = replace(test_systems.build("dumbbells"), tolerances=(1e-10,))
+    (found,) = measure.compare(test_system, methods=["multistep"], budget=10.0).of("multistep")
+    assert found.status == "ok" and found.error < 1e-8 and 300 < found.steps < 600

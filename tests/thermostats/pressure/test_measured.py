@@ -8,7 +8,7 @@ from pressure_systems import METHANE, TRIANGLE, gas
 
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import run
 from kcons.thermostats import Langevin, thermal_velocities
@@ -141,3 +141,7 @@ def test_what_is_refused():
         instantaneous_pressure(blind, blind.initial_state(x), thermal_energy=1.0)
     found = instantaneous_pressure(blind, blind.initial_state(x), "difference", thermal_energy=1.0)
     assert found == pytest.approx((len(x) - 1) / SIDE**3 * np.eye(3))
+    endless = CellSystem(Motion(held, x), lambda x, t, h: 0 * x, lambda x, t, h: np.inf)
+    with pytest.raises(NonFiniteError, match="inf and inf"):
+        instantaneous_pressure(endless, endless.initial_state(x), "difference", thermal_energy=1.0)
+    assert np.array_equal(endless.cell, SIDE * np.eye(3))
