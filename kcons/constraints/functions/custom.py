@@ -126,7 +126,7 @@ class FunctionRows(Constraint):
 
     def _differenced_row(self, k: int, r: FloatArray, time: float) -> FloatArray:
         """`_differenced_gradient` of one row, without arrays of rows, whose price would be that of the function."""
-        step = 1e-3 * (1.0 if self.length is None and self.width == 1 else float(self._length(r[None])[0]))
+        step = 1e-3 * float(self._length(r[None])[0])
         # Four places a coordinate, of which the function may keep what it sees.
         displaced = r + step * _along(self.width)
         displaced.setflags(False)  # type: ignore[call-arg]
@@ -190,6 +190,8 @@ class FunctionRows(Constraint):
         """Length over which the coordinate varies: as given, the spread of the atoms, or 1."""
         if self.length is not None:
             return np.full(self.n_rows, self.length)
+        if self.width == 1:
+            return np.ones(len(r))
         apart = r - r.mean(axis=1, keepdims=True)
         spread = np.sqrt(_contract(apart, apart) / max(self.width, 1))
         return np.where(spread > 0, spread, 1.0)
