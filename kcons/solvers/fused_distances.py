@@ -26,9 +26,10 @@ from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.chains.sweeps import project
 from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.aligned_memory import in_one_array
-from kcons.solvers.kernels.array_views import halves, integers, lattice_piece, octets, piece
+from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, none_of, octets, piece
 from kcons.solvers.kernels.eight_wide import WIDTH
 from kcons.solvers.kernels.groups_of_eight import NO_LATTICE, OPEN, lattice_kind, restore_points
+from kcons.solvers.kernels.two_and_four_wide import entry, number, put
 from kcons.solvers.rigid_triangles import RigidTriangles, project_triangles
 from kcons.solvers.sparse import distances
 from kcons.solvers.sparse.distances import SparseDistances
@@ -51,9 +52,10 @@ _POSITIONS = types.int64(_POINTS, _POINTS, _POINTS, types.float64, _NUMBERS)
 #: Of what makes vectors tangent, (x, v, tables).
 _TANGENTS = types.boolean(_POINTS, _POINTS, _NUMBERS)
 _call_positions, _call_tangents = caller_of(_POSITIONS), caller_of(_TANGENTS)
-#: Which function is where in the piece of their addresses; 0 stands for none.
-_OTHERS, _MOVE_OTHERS, _TRIANGLES, _BOUND = range(4)
-_KINDS = 4
+#: Which function is where in the piece of their addresses: for positions one of each solver, then what moves the atoms
+#: of the first; the same for velocities. 0 stands for none.
+_SOLVERS = 3
+_FIRST, _MOVE_FIRST, _TURN, _SLOW_FIRST = 0, _SOLVERS, _SOLVERS + 1, 2 * _SOLVERS + 1
 
 
 def packed(
@@ -111,7 +113,7 @@ def packed(
         pieces += triangles.tables()
     pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel()]
     pieces += [np.zeros(0)] * _CHAIN_PIECES if chains is None else chains.tables(numbers)
-    there = len(pairs) > 0, len(pairs) > 0, triangles is not None, chains is not None
+    there = len(pairs) > 0, triangles is not None, chains is not None, len(pairs) > 0
     functions = [address_of(each, _POSITIONS) if held else 0 for each, held in zip(_POSITION_PARTS, there, strict=True)]
     functions += [address_of(each, _TANGENTS) if held else 0 for each, held in zip(_TANGENT_PARTS, there, strict=True)]
     pieces += [words_of(called), np.array(functions, dtype=np.int64), *more]
@@ -152,7 +154,7 @@ def _place_triangles(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     t, h, u = tables, integers(tables), halves(tables)
     landed, _, iterations, _ = project_triangles(
         x, x_ref, v, inv_dt, None, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
-        piece(t, h, _SIDES), lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], t[:0], piece(t, h, _UNDO),
+        piece(t, h, _SIDES), lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], none_of(t), piece(t, h, _UNDO),
     )  # fmt: skip
     return iterations if landed else -1
 
@@ -175,7 +177,7 @@ def _place_chains(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
         landed, _, iterations, _ = project(
             x, x_ref, v, inv_dt, None, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1), piece(b, h, _CHAINS + 2),
             piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5), piece(t, h, _CHAINS + 6),
-            piece(h, h, _CHAINS + 7), piece(t, h, _CHAINS + 8), lattice, kind, t[:0], piece(t, h, _CHAINS + 10),
+            piece(h, h, _CHAINS + 7), piece(t, h, _CHAINS + 8), lattice, kind, none_of(t), piece(t, h, _CHAINS + 10),
             piece(t, h, _CHAINS + 11),
         )  # fmt: skip
         if again == 0:
@@ -214,8 +216,8 @@ def _slow_others(x, v, tables):  # type: ignore[no-untyped-def]
 def _turn_triangles(x, v, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     converged, _, _, _ = project_triangles(
-        v, x, t[:0].reshape(0, 3), 0.0, True, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
-        t[:0], lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], t[:0], piece(t, h, _UNDO),
+        v, x, none_of(t).reshape(0, 3), 0.0, True, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
+        none_of(t), lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], none_of(t), piece(t, h, _UNDO),
     )  # fmt: skip
     return converged
 
@@ -223,7 +225,7 @@ def _turn_triangles(x, v, tables):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True)
 def _turn_chains(x, v, tables):  # type: ignore[no-untyped-def]
     t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
-    none = t[:0]
+    none = none_of(t)
     converged, _, _, _ = project(
         v, x, none.reshape(0, 3), 0.0, True, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1), piece(b, h, _CHAINS + 2),
         piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5), piece(t, h, _CHAINS + 6),
@@ -235,8 +237,8 @@ def _turn_chains(x, v, tables):  # type: ignore[no-untyped-def]
     return converged
 
 
-_POSITION_PARTS = _place_others, _move_others, _place_triangles, _place_chains
-_TANGENT_PARTS = _turn_others, _slow_others, _turn_triangles, _turn_chains
+_POSITION_PARTS = _place_others, _place_triangles, _place_chains, _move_others
+_TANGENT_PARTS = _turn_others, _turn_triangles, _turn_chains, _slow_others
 
 
 @nb.njit(cache=True, nogil=True)
@@ -254,44 +256,34 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
         Iterations; -1 where there is no solution, with `x` and `v` as they were but for fixed atoms.
     """
     t, h, u = tables, integers(tables), halves(tables)
-    pinned, places = piece(u, h, _PINNED), piece(t, h, _PLACES)
-    for k in range(pinned.size):
-        for axis in range(3):
-            x[pinned[k], axis] = places[3 * k + axis]
-    functions, words = piece(h, h, _FUNCTIONS), piece(h, h, _CALLED)
+    pinned, places = at_piece(u, h, _PINNED), at_piece(t, h, _PLACES)
+    for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
+        put(x, 3 * entry(pinned, k // 3) + k % 3, number(places, k))
+    functions, words = at_piece(h, h, _FUNCTIONS), piece(h, h, _CALLED)
     given = x, x_ref, v, inv_dt, tables
     # Nothing is written before all is solved, except that triangles and chains undo what they wrote.
     most = 0
-    if functions[_OTHERS] != 0:
-        most = _call_positions(functions[_OTHERS], given)
-        if most < 0:
-            return -1
+    for k in range(_SOLVERS):
+        if functions[k] != 0:
+            iterations = _call_positions(functions[k], given)
+            if iterations < 0:
+                return -1
+            most = max(most, iterations)
     if words.size:
         lattice, periodic = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN
-        iterations = called_solvers.solve_positions(words, x, x_ref, v, inv_dt, t[:0], lattice, periodic)
+        iterations = called_solvers.solve_positions(words, x, x_ref, v, inv_dt, none_of(t), lattice, periodic)
         if iterations < 0:
             return -1
         most = max(most, iterations)
-    if functions[_TRIANGLES] != 0:
-        iterations = _call_positions(functions[_TRIANGLES], given)
-        if iterations < 0:
-            return -1
-        most = max(most, iterations)
-    if functions[_BOUND] != 0:
-        iterations = _call_positions(functions[_BOUND], given)
-        if iterations < 0:
-            return -1
-        most = max(most, iterations)
-    if functions[_OTHERS] != 0:
+    if functions[_FIRST] != 0:
         # Large multipliers have a rounding that shows in the positions; another round takes it away.
-        for _ in range(_MAX_ROUNDS):
-            if _call_positions(functions[_MOVE_OTHERS], given) == 0:
-                return most
-            iterations = _call_positions(functions[_OTHERS], given)
+        for again in range(_MAX_ROUNDS + 1):
+            if _call_positions(functions[_MOVE_FIRST], given) == 0 or again == _MAX_ROUNDS:
+                break
+            iterations = _call_positions(functions[_FIRST], given)
             if iterations < 0:
-                return most
+                break
             most = max(most, iterations)
-        _call_positions(functions[_MOVE_OTHERS], given)
     return most
 
 
@@ -299,22 +291,18 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
 def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
     t, h, u = tables, integers(tables), halves(tables)
-    pinned = piece(u, h, _PINNED)
-    for k in range(pinned.size):
-        for axis in range(3):
-            v[pinned[k], axis] = 0.0
-    functions, words = piece(h, h, _FUNCTIONS)[_KINDS:], piece(h, h, _CALLED)
+    pinned = at_piece(u, h, _PINNED)
+    for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
+        put(v, 3 * entry(pinned, k // 3) + k % 3, 0.0)
+    functions, words = at_piece(h, h, _FUNCTIONS), piece(h, h, _CALLED)
     given = x, v, tables
-    if functions[_OTHERS] != 0 and not _call_tangents(functions[_OTHERS], given):
-        return False
+    for k in range(_TURN, _SLOW_FIRST):
+        if functions[k] != 0 and not _call_tangents(functions[k], given):
+            return False
     if words.size:
         lattice, periodic = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN
-        if not called_solvers.solve_tangents(words, v, x, t[:0], lattice, periodic):
+        if not called_solvers.solve_tangents(words, v, x, none_of(t), lattice, periodic):
             return False
-    if functions[_TRIANGLES] != 0 and not _call_tangents(functions[_TRIANGLES], given):
-        return False
-    if functions[_BOUND] != 0 and not _call_tangents(functions[_BOUND], given):
-        return False
-    if functions[_OTHERS] != 0:
-        _call_tangents(functions[_MOVE_OTHERS], given)
+    if functions[_SLOW_FIRST] != 0:
+        _call_tangents(functions[_SLOW_FIRST], given)
     return True

@@ -9,7 +9,7 @@ from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
-from kcons.solvers.fused_distances import _BOUND, _FUNCTIONS, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.fused_distances import _FUNCTIONS, packed_positions, packed_tangents, set_lattice
 from kcons.steppers.stages.fused_stages import MOST_ROWS, packed_rows
 
 FAR_AWAY = np.array([5.0, -7.0, 3.0])
@@ -55,7 +55,7 @@ def engine(
 def by_chains(tables: np.ndarray) -> bool:
     """Whether the kernel of chains is called."""
     words = tables.view(np.int64)
-    return bool(words[words[2 * _FUNCTIONS] + _BOUND])
+    return bool(words[words[2 * _FUNCTIONS] + 2])
 
 
 SKEWED = np.array([[19.0, 0, 0], [2.0, 18.0, 0], [1.0, -3.0, 17.0]])

@@ -140,8 +140,9 @@ def shuffle(builder: Any, left: Any, right: Any, mask: list[int]) -> Any:
 
 
 def pointer(context: Any, builder: Any, array_type: Any, array: Any, start: Any, to: Any = None) -> Any:
-    """To an entry of an array; as one to a vector where `to` is its type."""
-    data = context.make_array(array_type)(context, builder, array).data
+    """To an entry of an array, or behind a pointer; as one to a vector where `to` is its type."""
+    is_array = isinstance(array_type, types.Array)
+    data = context.make_array(array_type)(context, builder, array).data if is_array else array
     found = builder.gep(data, [start], inbounds=True)
     return found if to is None else builder.bitcast(found, ir.PointerType(to))
 

@@ -10,7 +10,12 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic
+
+from kcons.solvers.kernels.any_width import pointer
+
+#: Types of pointers to doubles and to indices, as `at_piece` and `at_first` give them.
+NUMBERS, INDICES = types.CPointer(types.float64), types.CPointer(types.uint32)
 
 
 def view(context: Any, builder: Any, kind: Any, data: Any, *shape: Any) -> Any:
@@ -46,6 +51,45 @@ piece: Any = _piece
 
 
 @intrinsic
+def at_piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
+    """Pointer to ``room[header[2 k]]``, where a piece begins.
+
+    An array is handed on as seven values, and leaves code behind that counts its users: a kernel that knows the lengths
+    of two dozen pieces without them is compiled in two thirds of the time.
+    """
+    kind = types.CPointer(room.dtype)
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        at = builder.mul(args[2], ir.Constant(args[2].type, 2))
+        begin = builder.load(pointer(context, builder, sig.args[1], args[1], at))
+        return pointer(context, builder, sig.args[0], args[0], begin)
+
+    return kind(room, header, types.int64), codegen
+
+
+@intrinsic
+def at_first(typingctx, array):  # type: ignore[no-untyped-def]
+    """Pointer to the first number of a contiguous array."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return context.make_array(sig.args[0])(context, builder, args[0]).data
+
+    return types.CPointer(array.dtype)(array), codegen
+
+
+@intrinsic
+def none_of(typingctx, array):  # type: ignore[no-untyped-def]
+    """No numbers of a contiguous array: ``array[:0]``, in a tenth of the time to compile."""
+    kind = types.Array(array.dtype, 1, "C")
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return view(context, builder, kind, data, context.get_constant(types.intp, 0))
+
+    return kind(array), codegen
+
+
+@intrinsic
 def lattice_piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
     """The same as a lattice, shape (2, 3, 3)."""
     kind = types.Array(room.dtype, 3, "C")
@@ -62,12 +106,17 @@ def lattice_piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
     return kind(room, header, types.int64), codegen
 
 
-def _flat(dtype: Any) -> Any:
+def _flat(dtype: Any, copied: Any = None) -> Any:
+    """All memory of a contiguous array as numbers of a type; of others what the function `copied` gives."""
+
     @intrinsic
     def function(typingctx, array):  # type: ignore[no-untyped-def]
-        kind = types.Array(dtype or array.dtype, 1, "C", readonly=not array.mutable)
+        own = copied is None or array.layout == "C"
+        kind = types.Array(dtype or array.dtype, 1, "C", readonly=own and not array.mutable)
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            if not own:
+                return context.compile_internal(builder, copied, sig, args)
             source = context.make_array(sig.args[0])(context, builder, args[0])
             size = source.nitems
             if dtype is not None:
@@ -80,30 +129,8 @@ def _flat(dtype: Any) -> Any:
     return function
 
 
-_numbers = _flat(None)
+#: All numbers of an array of any shape, in a row; and the same as integers of eight bytes.
+flat: Any = _flat(None, lambda array: array.ravel())
+bits: Any = _flat(types.int64, lambda array: array.ravel().view(types.int64))
 # Memory of doubles as integers of eight, four and one bytes: what NumPy's `view` gives, which takes long to compile.
 integers, halves, octets = _flat(types.int64), _flat(types.uint32), _flat(types.uint8)
-
-
-def flat(array: Any) -> Any:
-    """All numbers of an array of any shape, in a row."""
-    return array.ravel()
-
-
-def bits(array: Any) -> Any:
-    """The same as integers of eight bytes."""
-    return array.ravel().view("int64")
-
-
-@overload(flat, inline="always")
-def _overload_flat(array):  # type: ignore[no-untyped-def]
-    if array.layout == "C":
-        return lambda array: _numbers(array)
-    return lambda array: array.ravel()
-
-
-@overload(bits, inline="always")
-def _overload_bits(array):  # type: ignore[no-untyped-def]
-    if array.layout == "C":
-        return lambda array: integers(array)
-    return lambda array: array.ravel().view(types.int64)

@@ -21,7 +21,7 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.called_solvers import CalledSolver, address_of, caller_of
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
-from kcons.solvers.kernels.array_views import halves, integers, piece
+from kcons.solvers.kernels.array_views import INDICES, NUMBERS, at_first, at_piece, halves, integers
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
@@ -45,7 +45,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
 from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
-from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, evaluate, miss
+from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, miss
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
@@ -57,16 +57,11 @@ _EPS = float(np.finfo(float).eps)
 #: Of the pieces of `SparseRows.tables`, those that are named.
 _PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS = 16, 20, 21, 26
 #: Signatures of what `_positions` and `_tangents` call by address, so that it is compiled once and not into both.
-_INDICES, _NUMBERS = types.uint32[::1], types.float64[::1]
 _RANGE = types.int64, types.int64
-_EVALUATE = types.none(
-    *(*_RANGE, _INDICES, _INDICES, _INDICES, _NUMBERS, _NUMBERS, _NUMBERS, _NUMBERS, types.float64[:, :, ::1]),
-    *(types.boolean, _NUMBERS, _NUMBERS, types.int64),
-)
-_FACTOR = types.none(*_RANGE, *(5 * (_INDICES,)), *(5 * (_NUMBERS,)))
-_FORWARD = types.none(*_RANGE, _INDICES, _INDICES, _NUMBERS, _NUMBERS)
-_BACKWARD = types.none(*_RANGE, _INDICES, _INDICES, _INDICES, *(6 * (_NUMBERS,)))
-_call_evaluate, _call_factor, _call_forward, _call_backward = map(caller_of, (_EVALUATE, _FACTOR, _FORWARD, _BACKWARD))
+_FACTOR = types.none(*_RANGE, *(5 * (INDICES,)), *(5 * (NUMBERS,)))
+_FORWARD = types.none(*_RANGE, *(2 * (INDICES,)), *(2 * (NUMBERS,)))
+_BACKWARD = types.none(*_RANGE, *(3 * (INDICES,)), *(6 * (NUMBERS,)))
+_call_factor, _call_forward, _call_backward = map(caller_of, (_FACTOR, _FORWARD, _BACKWARD))
 
 
 class SparseRows(CalledSolver):
@@ -128,7 +123,7 @@ class SparseRows(CalledSolver):
                 *(room(2 * n), room(4 * len(pattern.columns))),
                 *(room(n), room(n), room(n), room(numbers), room(numbers), room(n)),
                 *(room(numbers), room(n), room(numbers), room(numbers)),
-                _addresses(),
+                _addresses(self._given.kinds),
             )
         )
         self._pivots, self._solution = part_of(self.tables, _PIVOTS), part_of(self.tables, _SOLUTION)
@@ -148,9 +143,9 @@ class SparseRows(CalledSolver):
         return int(np.count_nonzero(self._pivots))
 
 
-def _addresses() -> IntArray:
-    kernels = (evaluate, _EVALUATE), (_factor, _FACTOR), (_forward, _FORWARD), (_backward, _BACKWARD)
-    return np.array([address_of(*each) for each in kernels], dtype=np.int64)
+def _addresses(kinds: NDArray[np.uint32]) -> IntArray:
+    kernels = (_factor, _FACTOR), (_forward, _FORWARD), (_backward, _BACKWARD)
+    return np.array([*addresses_for(kinds), *(address_of(*each) for each in kernels)], dtype=np.int64)
 
 
 @nb.njit(cache=True)
@@ -271,9 +266,9 @@ def _begin(  # type: ignore[no-untyped-def]
     for a in range(first_atom, last_atom):
         store_quad(origin, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
         store_quad(moves, 4 * a, zero)
-    _call_evaluate(functions[0], (
-        first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, lattice, periodic, values, lines,
-        REFERENCE,
+    call_evaluate(functions[0], (
+        functions[1], first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, lattice, periodic,
+        values, lines, REFERENCE,
     ))  # fmt: skip
     for a in range(first_atom, last_atom):
         point = load_point(x_new, 3 * entry(atoms, a))
@@ -326,29 +321,28 @@ def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, fastmath=FAST)
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
-    header = integers(tables)
-    atoms, moves = piece(halves(tables), header, 1), piece(tables, header, _MOVES)
-    for a in range(len(atoms)):
+    h = integers(tables)
+    atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
+    for a in range(h[3] - h[2]):
         add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, parameters
+    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers
 ):
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
-    clusters, atom_start, atoms, slot_atoms = piece(h, h, 0), piece(h, h, 2), piece(u, h, 1), piece(u, h, 3)
-    kinds, links, columns, targets = piece(u, h, 4), piece(u, h, 5), piece(u, h, 6), piece(u, h, 7)
-    triple, sides, masses, scale = piece(u, h, 8), piece(u, h, 9), piece(t, h, 10), piece(t, h, 11)
-    lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
-    values, inverse_rounding, base, moves = piece(t, h, 17), piece(t, h, 18), piece(t, h, 19), piece(t, h, _MOVES)
-    solution, kept_moves, kept_solution = piece(t, h, _SOLUTION), piece(t, h, 22), piece(t, h, 23)
-    origin, functions = piece(t, h, 25), piece(h, h, _FUNCTIONS)
-    if not wanted.size:
-        wanted = piece(t, h, 12)
+    clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
+    kinds, links, columns, targets = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(u, h, 7)
+    triple, sides, masses, scale = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 11)
+    lines, state, entries, pivots = at_piece(t, h, 13), at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS)
+    values, inverse_rounding, base = at_piece(t, h, 17), at_piece(t, h, 18), at_piece(t, h, 19)
+    moves, solution, kept_moves = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION), at_piece(t, h, 22)
+    kept_solution, origin, functions = at_piece(t, h, 23), at_piece(t, h, 25), at_piece(h, h, _FUNCTIONS)
+    goals, parameters = at_first(wanted) if wanted.size else at_piece(t, h, 12), at_first(numbers)
     worst, worst_row, most = 0.0, -1, 0
-    for c in range(len(clusters) - 1):
+    for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         _begin(
             first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
@@ -362,12 +356,12 @@ def _positions(  # type: ignore[no-untyped-def]
         halvings = 0
         while True:
             previous = error
-            _call_evaluate(functions[0], (
-                first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values,
-                lines, NOW,
+            call_evaluate(functions[0], (
+                functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic,
+                values, lines, NOW,
             ))  # fmt: skip
             error, total, excess, bad = _measure(
-                first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state
+                first, last, kinds, parameters, links, goals, scale, inverse_rounding, values, state
             )
             if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
@@ -390,12 +384,12 @@ def _positions(  # type: ignore[no-untyped-def]
                 keep(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
                 keep(first, last, solution, kept_solution)
             if factor_serves(factored, error, previous):
-                _call_forward(functions[2], (first, last, links, columns, state, entries))
+                _call_forward(functions[3], (first, last, links, columns, state, entries))
             else:
-                _call_factor(functions[1], matrix)
+                _call_factor(functions[2], matrix)
                 factored = True
             _call_backward(
-                functions[3], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
+                functions[4], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
             )
             iteration += 1
         for k in range(first, last):
@@ -417,31 +411,31 @@ def _positions(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # type: ignore[no-untyped-def]
+def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
-    clusters, atom_start, atoms, slot_atoms = piece(h, h, 0), piece(h, h, 2), piece(u, h, 1), piece(u, h, 3)
-    kinds, links, columns, targets = piece(u, h, 4), piece(u, h, 5), piece(u, h, 6), piece(u, h, 7)
-    triple, sides, masses = piece(u, h, 8), piece(u, h, 9), piece(t, h, 10)
-    lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
-    values, base, moves = piece(t, h, 17), piece(t, h, 19), piece(t, h, _MOVES)
-    solution, speeds, functions = piece(t, h, _SOLUTION), piece(t, h, 24), piece(h, h, _FUNCTIONS)
-    driven = wanted.size > 0
+    clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
+    kinds, links, columns, targets = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(u, h, 7)
+    triple, sides, masses, lines = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 13)
+    state, entries, pivots, values = at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS), at_piece(t, h, 17)
+    base, moves, solution = at_piece(t, h, 19), at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
+    speeds, functions = at_piece(t, h, 24), at_piece(h, h, _FUNCTIONS)
+    driven, goals, parameters = wanted.size > 0, at_first(wanted), at_first(numbers)
     worst, worst_row, most = 0.0, -1, 0
-    for c in range(len(clusters) - 1):
+    for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         for a in range(atom_start[c], atom_start[c + 1]):
             g = 3 * entry(atoms, a)
             store_quad(base, 4 * a, load_point(x, g))
             store_quad(speeds, 4 * a, load_point(y, g))
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
-        _call_evaluate(functions[0], (
-            first, last, kinds, links, slot_atoms, parameters, base, moves, base, lattice, periodic, values, lines,
-            REFERENCE,
+        call_evaluate(functions[0], (
+            functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, base, lattice, periodic,
+            values, lines, REFERENCE,
         ))  # fmt: skip
         largest, total = 0.0, 0.0
         for k in range(first, last):
-            goal = wanted[k] if driven else 0.0
+            goal = number(goals, k) if driven else 0.0
             off, size = goal, abs(goal)
             for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
                 rolled()
@@ -456,23 +450,23 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
             put(state, 2 * k + 1, off)
             largest = max(largest, size)
             total += size
-            solution[k] = 0.0
+            put(solution, k, 0.0)
         if not (total < np.inf):
             return False, np.inf, 0, _first_not_finite(first, last, state)
         matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
-        _call_factor(functions[1], matrix)
+        _call_factor(functions[2], matrix)
         allowed = SPEED_TOLERANCE * largest
         previous = np.inf
         iteration = 0
         while True:
             _call_backward(
-                functions[3], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
+                functions[4], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
             )
             iteration += 1
             error, total = 0.0, 0.0
             bad = first
             for k in range(first, last):
-                off = wanted[k] if driven else 0.0
+                off = number(goals, k) if driven else 0.0
                 for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
                     rolled()
                     a = 4 * entry(slot_atoms, p)
@@ -487,7 +481,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
             if not refines(iteration, error, previous, allowed):
                 break
             previous = error
-            _call_forward(functions[2], (first, last, links, columns, state, entries))
+            _call_forward(functions[3], (first, last, links, columns, state, entries))
         if error > 1e3 * allowed:
             return False, error, iteration, bad
         if error >= worst:

@@ -34,6 +34,7 @@ from kcons.constraints.functions.custom import FunctionRows
 from kcons.constraints.functions.formula import Formula
 from kcons.constraints.target import FloatArray
 from kcons.constraints.velocity import CustomVelocity
+from kcons.solvers.kernels.any_width import pointer
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.rows_at_once import FEWEST, rows_at_once
 
@@ -54,13 +55,12 @@ def call_row(typingctx, numbers, function, r, p, time, out):
     """Call the function whose address is number `function`; r, p and out are places among the same numbers."""
 
     def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        places = [builder.gep(data, [args[k]], inbounds=True) for k in (1, 2, 3, 5)]
+        places = [pointer(context, builder, sig.args[0], args[0], args[k]) for k in (1, 2, 3, 5)]
         integer = ir.IntType(64)
         address = builder.load(builder.bitcast(places[0], ir.PointerType(integer)), align=8)
         double = ir.DoubleType()
-        pointer = ir.PointerType(double)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, pointer, double, pointer])
+        there = ir.PointerType(double)
+        kind = ir.FunctionType(ir.VoidType(), [there, there, double, there])
         function = builder.inttoptr(address, ir.PointerType(kind))
         builder.call(function, [places[1], places[2], args[4], places[3]])
         return context.get_dummy_value()

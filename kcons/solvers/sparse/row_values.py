@@ -13,8 +13,12 @@ import math
 
 import numba as nb
 import numpy as np
+from numba import types
+from numpy.typing import NDArray
 
 from kcons.constraints.constraint import RowKind
+from kcons.solvers.called_solvers import address_of, caller_of
+from kcons.solvers.kernels.array_views import INDICES, NUMBERS
 from kcons.solvers.kernels.two_and_four_wide import dot, entry, lane, load_quad, number, put, quad, rolled
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, call_row
@@ -22,6 +26,13 @@ from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
 LINEAR = int(RowKind.LINEAR)
+
+_PLACE, _CELL = types.int64, (types.float64[:, :, ::1], types.boolean)
+# `evaluate` is called by address: it is compiled once, and not into each of its callers. So are functions: where there
+# are none, nothing is compiled for them.
+_EVALUATE = types.none(*(3 * (_PLACE,)), *(3 * (INDICES,)), *(4 * (NUMBERS,)), *_CELL, NUMBERS, NUMBERS, _PLACE)
+_FUNCTION = types.float64(*(3 * (_PLACE,)), INDICES, NUMBERS, _PLACE, *(3 * (NUMBERS,)), *_CELL, NUMBERS, _PLACE)
+call_evaluate, _call_function = caller_of(_EVALUATE), caller_of(_FUNCTION)
 
 #: Which of the two gradients in a slot's line: as numbers of NumPy, for which `evaluate` is compiled once.
 NOW, REFERENCE = np.int64(0), np.int64(1)
@@ -94,14 +105,15 @@ def angle(u, w):  # type: ignore[no-untyped-def]
     return value, (fu * ax, fu * ay, fu * az), (fw * bx, fw * by, fw * bz)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _function(  # type: ignore[no-untyped-def]
-    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, cell, inverse, periodic, lines, which
+    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, lattice, periodic, lines, which
 ):
     """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots.
 
     A row of velocities is taken at the middle of the way from `origin`, and is zero throughout where it does not count.
     """
+    cell, inverse = cell_of(lattice)
     size = 3 * (end - slot)
     rolls = kind >= VELOCITY
     at, out = ROOM, ROOM + 2 * size
@@ -148,11 +160,13 @@ def _function(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
-    first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values, lines, which
-):
+    function, first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values, lines,
+    which,
+):  # fmt: skip
     """Values and gradients of rows first to last; those of velocities for the way from `origin`.
 
-    ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its first parameter.
+    `function` is from `addresses_for`. ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its
+    first parameter.
     """
     cell, inverse = cell_of(lattice)
     for k in range(first, last):
@@ -188,11 +202,16 @@ def evaluate(  # type: ignore[no-untyped-def]
                 offset += 3
             value = whole + change
         else:
-            value = _function(
-                kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, cell, inverse,
+            value = _call_function(function, (
+                kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, lattice,
                 periodic, lines, which,
-            )  # fmt: skip
+            ))  # fmt: skip
         put(values, k, value)
+
+
+def addresses_for(kinds: NDArray[np.uint32]) -> tuple[int, int]:
+    """Of `evaluate`, and of the function that it takes for rows of such kinds: 0 where none is a function."""
+    return address_of(evaluate, _EVALUATE), address_of(_function, _FUNCTION) if (kinds >= FUNCTION).any() else 0
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")

@@ -211,9 +211,10 @@ def fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def
 @numba.njit(cache=True, nogil=True)
 def beyond(x, atoms, anchor, ratio):  # type: ignore[no-untyped-def]
     """Whether the anchor is farther from the origin than `ratio` times any atom is from the anchor."""
-    far = max(abs(x[anchor, 0]), abs(x[anchor, 1]), abs(x[anchor, 2])) / ratio
-    for i in atoms:
-        for k in range(3):
-            if not abs(x[i, k] - x[anchor, k]) < far:
-                return False
+    a, b = flat(x), 3 * anchor
+    far = max(abs(a[b]), abs(a[b + 1]), abs(a[b + 2])) / ratio
+    for n in range(3 * atoms.size):
+        k = n % 3
+        if not abs(a[3 * atoms[n // 3] + k] - a[b + k]) < far:
+            return False
     return True

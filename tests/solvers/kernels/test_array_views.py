@@ -1,9 +1,23 @@
 """Views of arrays that kernels do not count: the same numbers, at the same place."""
 
 import numpy as np
+import pytest
 from numba import njit
+from numba.core.errors import TypingError
 
-from kcons.solvers.kernels.array_views import bits, flat, halves, integers, lattice_piece, octets, piece
+from kcons.solvers.kernels.array_views import (
+    at_first,
+    at_piece,
+    bits,
+    flat,
+    halves,
+    integers,
+    lattice_piece,
+    none_of,
+    octets,
+    piece,
+)
+from kcons.solvers.kernels.two_and_four_wide import number, put
 
 
 @njit
@@ -17,6 +31,11 @@ def write(room, header, k, value):
 def numbers_and_bits(array):
     flat(array)[0] = 2.0
     return flat(array).sum(), bits(array)[0], len(bits(array))
+
+
+@njit
+def total_of(array):
+    return flat(array).sum()
 
 
 def test_pieces_of_a_room_are_written_in_place():
@@ -33,10 +52,33 @@ def test_all_numbers_of_an_array_of_any_shape():
     assert numbers_and_bits(np.ones((2, 3, 2)))[0] == 13.0
 
 
-def test_without_a_compiler_they_are_numpys():
-    array = np.arange(6.0).reshape(2, 3)
-    assert np.array_equal(flat(array), array.ravel())
-    assert np.array_equal(bits(array), array.ravel().view(np.int64))
+@njit
+def beginnings(room, header, k):
+    piece_of_room = at_piece(room, header, k)
+    put(piece_of_room, 1, -1.0)
+    return at_first(room)[0], piece_of_room[0], number(piece_of_room, 2), none_of(room).size
+
+
+def test_where_arrays_and_their_pieces_begin():
+    room, header = np.arange(10.0), np.array([1, 4, 4, 4, 6, 9])
+    assert beginnings(room, header, 2) == (0.0, 6.0, 8.0, 0)
+    assert room[7] == -1.0
+
+
+@pytest.mark.parametrize("array", [np.arange(12.0).reshape(3, 4).T, np.arange(12.0).reshape(4, 3)[::2]])
+def test_numbers_that_are_not_one_after_the_other_are_copied(array):
+    before = array.copy()
+    total, first, count = numbers_and_bits(array)
+    assert total == before.sum() and count == array.size
+    assert first == before[0, 0].view(np.int64) and np.array_equal(array, before)
+
+
+def test_what_must_not_be_written_to_is_read():
+    array = np.arange(3.0)
+    array.flags.writeable = False
+    assert total_of(array) == 3.0
+    with pytest.raises(TypingError, match="readonly"):
+        numbers_and_bits(array)
 
 
 @njit

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from numba import njit
 
 from kcons.constraints import Angle, CenterDistance, Cylinder, Dihedral, Distance, LinearCombination, Plane, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.solvers.kernels.aligned_memory import part_of
+from kcons.solvers.kernels.array_views import at_first
 from kcons.solvers.sparse.mixed_rows import SparseRows
-from kcons.solvers.sparse.row_values import evaluate, miss
+from kcons.solvers.sparse.row_values import addresses_for, evaluate, miss
 
 KINDS = {
     RowKind.DISTANCE: Distance([[3, 1], [7, 2]]),
@@ -17,6 +19,15 @@ KINDS = {
     "functions": Cylinder([2, 8], [0.1, 0.2, 0.3], [1.0, 2.0, -0.5]),
     "functions of differences": CenterDistance([[3, 4], [0, 1]], [[7], [5]]),
 }
+
+
+@njit
+def of_arrays(functions, n, kinds, links, slot_atoms, numbers, base, moves, lattice, periodic, values, lines, which):
+    """`evaluate`, which takes pointers, for the rows of arrays."""
+    evaluate(
+        functions, 0, n, at_first(kinds), at_first(links), at_first(slot_atoms), at_first(numbers), at_first(base),
+        at_first(moves), at_first(base), lattice, periodic, at_first(values), at_first(lines), which,
+    )  # fmt: skip
 
 
 def evaluated(constraints, x, cell=None, moves=0.0):
@@ -30,9 +41,9 @@ def evaluated(constraints, x, cell=None, moves=0.0):
     lattice = np.zeros((2, 3, 3)) if cell is None else constraint_set.lattice
     values, lines = np.zeros(n), np.zeros(8 * len(slot_atoms))
     for which in range(2):
-        evaluate(
-            0, n, kinds, links, slot_atoms, solver.numbers, base.ravel(), change.ravel(), base.ravel(), lattice,
-            cell is not None, values, lines, which,
+        of_arrays(
+            addresses_for(kinds)[1], n, kinds, links, slot_atoms, solver.numbers, base.ravel(), change.ravel(),
+            lattice, cell is not None, values, lines, which,
         )  # fmt: skip
     slots = links.reshape(-1, 4)[:, 2]
     lines = lines.reshape(-1, 8)
