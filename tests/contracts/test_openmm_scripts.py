@@ -45,10 +45,10 @@ CASES = [
     *(pytest.param(name, swap, "CPU") for name, swaps in SCRIPT_SWAPS.items() for swap in swaps),
     *(pytest.param(name, SCRIPT_SWAPS[name][0], "Reference") for name in ("simulate_implicit", "simulate_tip4pew")),
 ]
-#: In mixed precision, in which GPUs are used, and one in single precision: with sites, a barostat (in a long run), and
-#: without a box.
+#: In single precision without a box, and, in a long run, in mixed precision with sites and with a barostat: of these
+#: there are cases on GPUs in test_openmm_site_motion and test_openmm_barostats.
 ON_GPUS = [
-    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, LONG] if name == "simulate_npt" else p.marks)
+    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=p.marks if name == "simulate_implicit" else [*p.marks, LONG])
     for p in GPUS
     for name in ("simulate_implicit", "simulate_tip4pew", "simulate_npt")
     if "none" in p.id or ("single" if name == "simulate_implicit" else "mixed") in p.id
