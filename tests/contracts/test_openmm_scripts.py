@@ -48,7 +48,9 @@ CASES = [
 #: In single precision without a box, and, in a long run, in mixed precision with sites and with a barostat: of these
 #: there are cases on GPUs in test_openmm_site_motion and test_openmm_barostats.
 ON_GPUS = [
-    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=p.marks if name == "simulate_implicit" else [*p.marks, LONG])
+    pytest.param(
+        name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, *([LONG] if name != "simulate_implicit" else [])]
+    )
     for p in GPUS
     for name in ("simulate_implicit", "simulate_tip4pew", "simulate_npt")
     if "none" in p.id or ("single" if name == "simulate_implicit" else "mixed") in p.id
