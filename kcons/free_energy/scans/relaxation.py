@@ -11,6 +11,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError
 from kcons.free_energy.scans.model_hessian import Internals
+from kcons.free_energy.scans.one_thread import one_thread
 from kcons.motion.motion import Motion
 
 #: Energy in eV and forces in eV/angstrom at positions, shape (n_atoms, 3).
@@ -57,6 +58,7 @@ class Relaxed:
 class _Place:
     """Positions, energy, and what follows from the rows there."""
 
+    @one_thread()
     def __init__(self, descent: Descent, x: FloatArray, energy: float, forces: FloatArray) -> None:
         self.x, self.energy = x, energy
         columns, internals = descent.columns, descent.internals
@@ -92,9 +94,8 @@ class Descent:
 
     def __init__(self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: FloatArray | None) -> None:
         self.motion, self.evaluate, self.internals = motion, evaluate, internals
-        n = len(internals.constants)
-        #: Second derivatives along the internal coordinates beyond the model.
-        self._learned = np.zeros((n, n))
+        #: What was learned, move by move: vectors u and w of internal coordinates and numbers c, see `_learned`.
+        self._updates: list[tuple[FloatArray, FloatArray, float]] = []
         self._memory: list[FloatArray] = []
         for pair in [] if memory is None else memory:
             self._learn(pair)
@@ -153,10 +154,11 @@ class Descent:
         error.positions = here.x
         return error
 
+    @one_thread()
     def _step(self, here: _Place, radius: float) -> tuple[FloatArray, float]:
         """Along the rows, the longest move of an atom at most `radius`, shape (columns,); what it is to gain."""
         table = here.table[:, self.columns] @ here.along
-        hessian = table.T @ (self.internals.constants[:, None] * table + self._learned @ table)
+        hessian = table.T @ (self.internals.constants[:, None] * table + self._learned(table))
         curvature, modes = np.linalg.eigh(hessian)
         size = np.maximum(np.abs(curvature), FLAT)
         slopes = modes.T @ here.left
@@ -176,6 +178,7 @@ class Descent:
             step = at(high)
         return here.along @ (modes @ step), float(slopes @ step + 0.5 * step @ (curvature * step))
 
+    @one_thread()
     def _moved(self, here: _Place, step: FloatArray) -> FloatArray:
         """Positions after a step, on the rows: internal coordinates change as they do at its beginning."""
         internals, columns = self.internals, self.columns
@@ -190,18 +193,25 @@ class Descent:
             x.flat[columns] += here.along @ np.linalg.solve(normal, weighed @ missing)
         return self.motion.project_positions(x, here.x)
 
+    @one_thread()
     def _learn(self, pair: FloatArray) -> None:
         """The nearest symmetric matrix that maps a move to the change of the slopes, of any signature (TS-BFGS)."""
         move, change = pair
         size = self.internals.constants * move
-        missing = change - size - self._learned @ move
+        missing = change - size - self._learned(move)
         weight = change * (change @ move) + size * (size @ move)
         scale = float(weight @ move)
         if scale > 0:
-            weight /= scale
-            both = np.outer(missing, weight)
-            self._learned += both + both.T - (missing @ move) * np.outer(weight, weight)
+            self._updates.append((missing, weight / scale, float(missing @ move)))
             self._memory.append(pair)
+
+    def _learned(self, move: FloatArray) -> FloatArray:
+        """Second derivatives beyond the model, the sum of u w^T + w u^T - c w w^T, times one or several moves."""
+        if not self._updates:
+            return np.zeros_like(move)
+        u, w, c = (np.array(part) for part in zip(*self._updates, strict=True))
+        along = w @ move
+        return np.asarray(u.T @ along + w.T @ (u @ move - (c * along.T).T))
 
 
 def _longest(move: FloatArray) -> float:

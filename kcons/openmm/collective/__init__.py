@@ -8,6 +8,7 @@
 - `plain_rows`: rows that are internal coordinates, as constraints of kcons
 - `measured_rows`, `context_rows`: the rows in a Context, and what can be done to them
 - `row_program`: the part of the program that holds them
+- `reported_rows`: what they report, and why a step failed
 - `collective_rows`: `CollectiveRows`, what users make
 """
 

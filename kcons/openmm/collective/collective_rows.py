@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints import Formula
 from kcons.constraints.arguments import positive, whole_number
-from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
-    ConvergenceError,
     InputError,
-    KconsError,
-    NonFiniteError,
-    SingularGeometryError,
     UnsupportedError,
 )
-from kcons.openmm.collective.context_rows import ContextRows
 from kcons.openmm.collective.formula_rows import as_rows
 from kcons.openmm.collective.measured_rows import TOLERANCE, variables_of
+from kcons.openmm.collective.reported_rows import ReportedRows
 from kcons.openmm.collective.row_forces import (
     Rigid,
     Row,
@@ -37,20 +30,16 @@ from kcons.openmm.collective.row_forces import (
     place,
     unit_of,
 )
-from kcons.openmm.collective.row_program import GroupRows
 from kcons.openmm.collective.small_algebra import PIVOT, blocks
-from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import virtual_sites
-from kcons.steppers.compositions import Composition
-from kcons.steppers.rattle import Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 
-class CollectiveRows(GroupRows):
+class CollectiveRows(ReportedRows):
     """Any OpenMM Forces, each held as one row sigma = q - target = 0.
 
     The energy of a Force is its coordinate q, its forces are the gradient; each has a force group of its own, which
@@ -187,11 +176,7 @@ class CollectiveRows(GroupRows):
                     "the end of a step only; build the coordinate from the particles that define the site"
                 )
 
-    # -- reading --------------------------------------------------------------------------------
-
-    def at(self, context: openmm.Context) -> ContextRows:
-        """The rows at the state of a context: gradients, Gram matrix, projections."""
-        return ContextRows(self, context)
+    # -- told by an integrator ------------------------------------------------------------------
 
     @property
     def driven(self) -> bool:
@@ -203,18 +188,6 @@ class CollectiveRows(GroupRows):
         """Whether a target is a context parameter, which others may set for the step to come."""
         return any(isinstance(target, str) for target in self._targets)
 
-    def values(self, context: openmm.Context) -> FloatArray:
-        """q of each row, shape (n_rows,)."""
-        return self.at(context).values()
-
-    def residuals(self, context: openmm.Context) -> FloatArray:
-        """sigma = q - target of each row, shape (n_rows,), to the nearest image."""
-        return self.at(context).sigma()
-
-    def rates(self, context: openmm.Context) -> FloatArray:
-        """A v less the rate of the targets, shape (n_rows,), per ps."""
-        return self.at(context).slopes()
-
     def take_precision(self, program: Program, precision: Precision) -> None:
         """What counts as small is what Forces of the platform can tell."""
         program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
@@ -225,55 +198,6 @@ class CollectiveRows(GroupRows):
         if self.asked_tolerance is None:
             self.tolerance = self.at(context).finest
             program.set(f"tolerance{self.code}", self.tolerance)
-
-    def rank(self, context: openmm.Context) -> int:
-        """How many degrees of freedom the rows take, beyond the constraints of the System."""
-        return self.at(context).rank()
-
-    def multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
-        """lambda at the positions where the last step began, to second order in the step; shape (n_rows,).
-
-        In kJ/mol per unit of q, z = A^T lambda. It is the mean of 2 L/h^2 of the first drift and 2 mu/h of the
-        velocity projection before it, at the same positions; after a start, or when somebody moved x, only the former,
-        to first order.
-
-        Raises
-        ------
-        UnsupportedError
-            Schemes in which these are not impulses of the same force; see `mean_multipliers`, `multipliers_at`.
-        """
-        scheme = getattr(integrator, "scheme", None)
-        if getattr(integrator, "thermostatted", False):
-            raise UnsupportedError(
-                "with a thermostat the impulses of a step are not those of the forces alone; read "
-                "multipliers_at(context)"
-            )
-        if scheme is not None and not isinstance(scheme, Rattle | Composition):
-            raise UnsupportedError(
-                f"{scheme!r} has no multipliers at a single point of the step; read mean_multipliers(integrator), the "
-                "mean over the last step, or multipliers_at(context), those at the state of a context"
-            )
-        return self._read(integrator, "lambda")
-
-    def mean_multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
-        """Impulses of the last step over its length, shape (n_rows,): lambda averaged over the step, every scheme."""
-        return self._read(integrator, "mean")
-
-    def multipliers_at(self, context: openmm.Context) -> FloatArray:
-        """lambda at the positions and velocities of the context, as accurate as these; shape (n_rows,).
-
-        (A M_par^+ A^T) lambda = target'' - d(A v)/dt - A M_par^+ f (notes, eq. 104), M_par^+ that of the System's
-        constraints. d(A v)/dt along their free flight by central differences; needs nine evaluations of every row.
-        """
-        return self.at(context).multipliers()
-
-    def work(self, integrator: openmm.CustomIntegrator) -> FloatArray:
-        """What moving each target has added to the energy, in kJ/mol, shape (n_rows,): sum of lambda rate dt."""
-        return self._read(integrator, "work")
-
-    def targets(self, context: openmm.Context) -> FloatArray:
-        """Where each target is now, shape (n_rows,)."""
-        return self.at(context).targets()
 
     def set_target(
         self, integrator: ProjectedIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
@@ -301,9 +225,6 @@ class CollectiveRows(GroupRows):
             slope = integrator.getGlobalVariableByName(self._of("rate", row))
             value -= slope * self._clock(variables)
         integrator.program.set(self._of("target", row), value)
-
-    def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
-        return np.array([integrator.getGlobalVariableByName(self._of(name, k)) for k in range(self.n_rows)])
 
     # -- restoring and checking -----------------------------------------------------------------
 
@@ -379,56 +300,6 @@ class CollectiveRows(GroupRows):
             Positions or velocities are not on the rows; `restore` brings them there.
         """
         self.at(context).check(velocities)
-
-    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
-        """sigma and A v from the Forces themselves, at the state of the context."""
-        return self.at(context).worst_miss(velocities)
-
-    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
-        """The error for a step in which the rows failed."""
-        c = self.code
-        singular = int(integrator.getGlobalVariableByName(f"singular{c}"))
-        if singular:
-            row = singular - 1
-            return SingularGeometryError(
-                f"step {step}: row {row} ({self.names[row]}) vanishes, or depends on the rows before it or on the "
-                "constraints of the System. Leave out a row that others imply; a dihedral over a straight angle or an "
-                "RMSD of 0 has no direction",
-                rows=[row],
-            )
-        off = np.abs(self._read(integrator, "sigma")) / np.array(self.scales)
-        residual = integrator.getGlobalVariableByName(f"residual{c}")
-        row = int(np.argmax(np.where(np.isfinite(off), off, math.inf)))
-        if not math.isfinite(residual):
-            return NonFiniteError(
-                f"step {step}: row {row} ({self.names[row]}) is not a number; forces or time step too large",
-                item="position",
-                step=step,
-            )
-        if residual <= self.tolerance:
-            return NonFiniteError(
-                f"step {step}: forces or velocities are not finite; the time step is too large",
-                item="velocity",
-                step=step,
-            )
-        iterations = int(integrator.getGlobalVariableByName(f"iterations{c}"))
-        return ConvergenceError(
-            f"step {step}: row {row} ({self.names[row]}) is off by {off[row] * self.scales[row]:.3g} after "
-            f"{iterations} iterations (tolerance {self.tolerance:.3g}){self._digits(integrator.context)}; time step "
-            f"too large (dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
-            residual=float(residual),
-            tolerance=self.tolerance,
-            iterations=iterations,
-            row=row,
-            step=step,
-        )
-
-    def _digits(self, context: openmm.Context) -> str:
-        """What to do where the tolerance asks for more digits than Forces have."""
-        here = self.at(context)
-        if not self.tolerance < here.finest:
-            return ""
-        return f", but Forces tell no more than {here.finest:.0e} here in {here.precision}: leave the tolerance open"
 
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"

@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from copy import deepcopy
-from typing import Any
 
-import numpy as np
 import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
-from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.integrator.guard import Guard, find_context
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.states.calls import Calls
-from kcons.openmm.integrator.states.copies import as_projected, remade, settings_of
+from kcons.openmm.integrator.states.copies import Copies
 from kcons.openmm.integrator.states.hearing import listen
-from kcons.openmm.integrator.states.serialization import ensemble_in, note_in, note_of, note_of_ensemble, read_plain
+from kcons.openmm.integrator.states.outside_of_steps import OutsideOfSteps
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
-from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 
-class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
+class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -239,200 +235,6 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
         guard.check()
         for part in self.parts:
             part.check(guard.context, velocities=not guard.late)
-
-    # -- constraints outside of steps -----------------------------------------------------------
-
-    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
-        """Bring positions onto all constraints, those of the parts as well.
-
-        Raises
-        ------
-        KconsError
-            They cannot be reached from here; positions are unchanged.
-        """
-        guard = self._watch(context)
-        context = guard.context
-        start, velocities = positions_of(context), velocities_of(context)
-        tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
-        try:
-            guard.constraints.hold_positions(tolerance)
-            if not all(part.solves_alone for part in self.parts):
-                for part in self.parts:
-                    part.apply_positions(context)
-            elif self.parts:
-                context.setVelocities(np.zeros_like(velocities))
-                self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
-            guard.constraints.check(positions_of(context), None)
-            for part in self.parts:
-                guard.certify(part.worst_miss(context, velocities=False))
-        except KconsError:
-            context.setPositions(start)
-            raise
-        finally:
-            context.setVelocities(velocities)
-
-    def applyVelocityConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
-        """Make velocities tangent to all constraints, those of the parts as well.
-
-        Raises
-        ------
-        KconsError
-            A part cannot do it; velocities are unchanged.
-        """
-        guard = self._watch(context)
-        context = guard.context
-        velocities = velocities_of(context)
-        by_program = bool(self.parts) and all(part.solves_alone for part in self.parts)
-        try:
-            if not by_program:
-                context.applyVelocityConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
-                for part in self.parts:
-                    part.apply_velocities(context)
-                return
-            self._run_alone(guard, self._plan.alone, self._plan.alone)
-        except KconsError:
-            context.setVelocities(velocities)
-            raise
-
-    def _run_alone(self, guard: Guard, first: int, end: int) -> None:
-        """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
-        context = guard.context
-        time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
-        self.refresh()
-        program = self.program
-        program.write("first_stage", first)
-        program.write("end_stage", end)
-        try:
-            openmm.CustomIntegrator.step(self, 1)
-        finally:
-            for name in ("first_stage", "end_stage"):
-                program.write(name, (program.settings | program.idle)[name])
-            program.write("good_steps", good)
-            self.refresh()
-            context.setTime(time)
-            context.setStepCount(count)
-        code = int(self.getGlobalVariableByName("failed"))
-        if code:
-            raise self._failure(code, count)
-
-    # -- temperature that is found --------------------------------------------------------------
-
-    def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
-        """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
-        guard = self._watch(context)
-        if self.scheme is None:
-            state = guard.context.getState(energy=True, groups=self.getIntegrationForceGroups())
-            return state.getKineticEnergy()
-        v = velocities_of(guard.context)
-        return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
-
-    def computeSystemTemperature(self) -> unit.Quantity:
-        """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it.
-
-        With `Isokinetic`, whose K does not fluctuate, the temperature of the configurations.
-
-        Raises
-        ------
-        InputError
-            No degree of freedom is left.
-        """
-        freedom = self.degrees_of_freedom()
-        if freedom <= 0:
-            raise InputError("the constraints leave no degree of freedom: there is no temperature", item="constraints")
-        warmth = self.ensemble.warmth(self)
-        return (2 * warmth * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
-
-    # -- settings -------------------------------------------------------------------------------
-
-    def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
-        """Choose the force groups that act; groups that carry rows never do.
-
-        Parameters
-        ----------
-        groups : int or iterable of int
-            A bit mask or group numbers. -1 and all 32 groups mean: all but the groups of rows.
-
-        Raises
-        ------
-        InputError
-            Groups that carry rows are among those given.
-        UnsupportedError
-            The Context exists; it has read the groups and would ignore the change.
-        """
-        if getattr(self, "_guard", None) is not None or (getattr(self, "program", None) and find_context(self)):
-            raise UnsupportedError("the Context has read the force groups already; set them before it is created")
-        wanted = {g for g in range(32) if (groups >> g) & 1} if isinstance(groups, int) else set(groups)
-        rows = self.row_groups
-        if len(wanted) == 32:
-            wanted -= rows
-        if wanted & rows:
-            raise InputError(
-                f"force groups {sorted(wanted & rows)} carry constraint rows, their forces are gradients and must not "
-                "act; leave them out",
-                item="groups",
-            )
-        super().setIntegrationForceGroups(wanted)
-
-    # -- copies and files -----------------------------------------------------------------------
-
-    @classmethod
-    def from_xml(cls, xml: str, **arguments: Any) -> ProjectedIntegrator:
-        """The integrator that XmlSerializer wrote, with its parts.
-
-        Without parts XmlSerializer.deserialize does the same.
-
-        Parameters
-        ----------
-        xml : str
-            The text of the file.
-        **arguments
-            `parts`, which the file does not contain; `check_every` and `ensemble` where they are to be others.
-
-        Raises
-        ------
-        InputError
-            The file has no program of this class with these parts.
-        """
-        return cls._of_note(read_plain(xml), note_in(xml) or {}, **arguments)
-
-    def _note(self) -> dict[str, Any]:
-        return note_of(self, ensemble=note_of_ensemble(self.ensemble), parts=len(self.parts))
-
-    @classmethod
-    def _of_note(cls, plain: openmm.CustomIntegrator, note: dict[str, Any], **arguments: Any) -> ProjectedIntegrator:
-        if not note:
-            return as_projected(cls, plain, **arguments)
-        if note["parts"] and not arguments.get("parts"):
-            raise InputError(
-                f"the integrator in the file holds {note['parts']} parts, which no file contains; read it by "
-                "ProjectedIntegrator.from_xml(text, parts=[...]) with the same parts as when it was made",
-                item="parts",
-            )
-        made = as_projected(
-            cls, plain, **{"check_every": note["check_every"], "ensemble": ensemble_in(note), **arguments}
-        )
-        made.asked_tolerance = note["tolerance"]
-        return made
-
-    @classmethod
-    def as_projected(cls, integrator: openmm.CustomIntegrator, **arguments: Any) -> ProjectedIntegrator:
-        """A plain CustomIntegrator that was one of these once, see `from_xml`."""
-        return as_projected(cls, integrator, **arguments)
-
-    def _making(self) -> tuple[Any, ...]:
-        scheme = LEAPFROG if self.scheme is None else self.scheme
-        every = None if self.spare else self.check_every
-        return self._dt, scheme, self.parts, self.asked_tolerance, every, self.ensemble
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return remade, (type(self), self._making(), settings_of(self))
-
-    def __copy__(self) -> ProjectedIntegrator:
-        """Without the Context, and with copies of the parts: an integrator and its parts serve one Context."""
-        return remade(type(self), deepcopy(self._making()), settings_of(self))
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedIntegrator:
-        return self.__copy__()
 
 
 def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:

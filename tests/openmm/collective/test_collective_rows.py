@@ -202,22 +202,6 @@ def test_row_without_gradient_is_named():
         integrator.step(1)
 
 
-def test_rows_that_become_singular_within_a_step_are_named_by_the_program():
-    # The gradient of (r - 0.3)^2 vanishes as r goes to 0.3.
-    system = openmm.System()
-    system.addParticle(1.0)
-    system.addParticle(1.0)
-    force = openmm.CustomBondForce("(r-0.3)^2")
-    force.addBond(0, 1)
-    part = CollectiveRows(system, [Row(force, 0.01, rate=-0.5)])
-    integrator = ProjectedIntegrator(0.001, parts=[part])
-    context = context_of(system, integrator, [[0, 0, 0], [0.4, 0, 0]], np.zeros((2, 3)))
-    part.restore(context)
-    with pytest.raises((SingularGeometryError, ConvergenceError), match="row 0"):
-        integrator.step(40)
-    assert np.isfinite(state_of(context)[0]).all()
-
-
 def test_velocities_that_are_no_numbers_are_refused():
     context, integrator, _ = held_chain([bond(0, 3)])
     integrator.step(1)
@@ -405,18 +389,6 @@ def test_degrees_of_freedom_and_force_groups():
     assert set(part.groups) == {1, 2}
     groups = integrator.getIntegrationForceGroups()
     assert {g for g in range(32) if groups >> g & 1} == set(range(32)) - {1, 2}
-
-
-def test_constraints_applied_by_the_integrator():
-    context, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True)
-    rng = np.random.default_rng(4)
-    context.setPositions(state_of(context)[0] + 0.002 * rng.normal(size=CHAIN.shape))
-    context.setVelocities(rng.normal(size=CHAIN.shape))
-    integrator.applyConstraints(context)
-    integrator.applyVelocityConstraints(context)
-    assert np.abs(part.residuals(context)).max() <= 1e-12
-    assert np.abs(part.rates(context)).max() <= 1e-12
-    part.check(context)
 
 
 def test_a_barostat_that_moves_the_ends_of_a_row_apart_is_refused():

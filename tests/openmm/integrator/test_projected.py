@@ -349,14 +349,3 @@ def test_degrees_of_freedom_count_the_rank():
     context = context_of(system, integrator)
     context.setPositions([*corners, [1, 1, 1]])
     assert integrator.degrees_of_freedom(context) == 6
-
-
-def test_no_degree_of_freedom_no_temperature():
-    system = openmm.System()
-    system.addParticle(0.0)
-    integrator = ProjectedIntegrator(1e-3)
-    context = context_of(system, integrator)
-    context.setPositions([[0, 0, 0]])
-    assert integrator.degrees_of_freedom(context) == 0
-    with pytest.raises(InputError, match="no degree of freedom"):
-        integrator.computeSystemTemperature()

@@ -6,4 +6,5 @@
 - `copies`, `serialization`: copies and pickles; XML and CompoundIntegrators
 - `minimization`: the energy minimised on the constraints
 - `states_on_constraints`: states on the constraints, with velocities of a temperature
+- `outside_of_steps`: constraints applied outside of steps
 """

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from copy import deepcopy
+from typing import Any, Self, TypeVar
 
 import openmm
 
@@ -12,9 +13,11 @@ from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.schemes import LEAPFROG, SCHEMES
+from kcons.openmm.integrator.states.serialization import ensemble_in, note_in, note_of, note_of_ensemble, read_plain
 from kcons.openmm.integrator.step_variables import VARIABLES
 from kcons.steppers.splitting import Splitting
 
+_Kind = TypeVar("_Kind", bound=Integrator)
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
 RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"lost"}
 
@@ -43,7 +46,7 @@ def apply_settings(integrator: Integrator, settings: dict[str, Any]) -> None:
         program.set(name, value)
 
 
-def remade(kind: type[Integrator], making: tuple[Any, ...], settings: dict[str, Any]) -> Integrator:
+def remade(kind: type[_Kind], making: tuple[Any, ...], settings: dict[str, Any]) -> _Kind:
     """The integrator of these arguments and settings; what pickles call."""
     dt, scheme, parts, tolerance, check_every, ensemble = making
     made = kind(dt, scheme, parts=parts, tolerance=tolerance, check_every=check_every, ensemble=ensemble)
@@ -52,12 +55,12 @@ def remade(kind: type[Integrator], making: tuple[Any, ...], settings: dict[str, 
 
 
 def as_projected(
-    kind: type[Integrator],
+    kind: type[_Kind],
     integrator: openmm.CustomIntegrator,
     parts: Sequence[Part] = (),
     check_every: int | None = None,
     ensemble: Ensemble | None = None,
-) -> Integrator:
+) -> _Kind:
     """The integrator of this class that has the program of `integrator`.
 
     Raises
@@ -110,3 +113,74 @@ def _candidates(integrator: openmm.CustomIntegrator, parts: bool) -> Iterable[st
         if kicks[0]:
             yield Splitting(kicks, drifts)
         yield Splitting(kicks[1:-1], drifts)
+
+
+class Copies(Integrator):
+    """An integrator that is copied, pickled and written to XML with what it was made with."""
+
+    check_every: int
+    asked_tolerance: float | None
+    ensemble: Ensemble
+
+    @property
+    def _dt(self) -> float:
+        raise NotImplementedError
+
+    @classmethod
+    def from_xml(cls, xml: str, **arguments: Any) -> Self:
+        """The integrator that XmlSerializer wrote, with its parts.
+
+        Without parts XmlSerializer.deserialize does the same.
+
+        Parameters
+        ----------
+        xml : str
+            The text of the file.
+        **arguments
+            `parts`, which the file does not contain; `check_every` and `ensemble` where they are to be others.
+
+        Raises
+        ------
+        InputError
+            The file has no program of this class with these parts.
+        """
+        return cls._of_note(read_plain(xml), note_in(xml) or {}, **arguments)
+
+    def _note(self) -> dict[str, Any]:
+        return note_of(self, ensemble=note_of_ensemble(self.ensemble), parts=len(self.parts))
+
+    @classmethod
+    def _of_note(cls, plain: openmm.CustomIntegrator, note: dict[str, Any], **arguments: Any) -> Self:
+        if not note:
+            return as_projected(cls, plain, **arguments)
+        if note["parts"] and not arguments.get("parts"):
+            raise InputError(
+                f"the integrator in the file holds {note['parts']} parts, which no file contains; read it by "
+                "ProjectedIntegrator.from_xml(text, parts=[...]) with the same parts as when it was made",
+                item="parts",
+            )
+        made = as_projected(
+            cls, plain, **{"check_every": note["check_every"], "ensemble": ensemble_in(note), **arguments}
+        )
+        made.asked_tolerance = note["tolerance"]
+        return made
+
+    @classmethod
+    def as_projected(cls, integrator: openmm.CustomIntegrator, **arguments: Any) -> Self:
+        """A plain CustomIntegrator that was one of these once, see `from_xml`."""
+        return as_projected(cls, integrator, **arguments)
+
+    def _making(self) -> tuple[Any, ...]:
+        scheme = LEAPFROG if self.scheme is None else self.scheme
+        every = None if self.spare else self.check_every
+        return self._dt, scheme, self.parts, self.asked_tolerance, every, self.ensemble
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return remade, (type(self), self._making(), settings_of(self))
+
+    def __copy__(self) -> Self:
+        """Without the Context, and with copies of the parts: an integrator and its parts serve one Context."""
+        return remade(type(self), deepcopy(self._making()), settings_of(self))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.__copy__()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import kelvins
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
-from kcons.openmm.integrator.guard import Guard
+from kcons.openmm.integrator.guard import Guard, find_context
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
@@ -115,7 +116,7 @@ class Settings(Integrator):
             self.program.set(name, value)
         ensemble.follow(self)
 
-    # -- steps, tolerance, variables ------------------------------------------------------------
+    # -- steps, tolerance, variables, force groups ------------------------------------------------------------
 
     @property
     def _dt(self) -> float:
@@ -168,6 +169,35 @@ class Settings(Integrator):
     def setGlobalVariable(self, index: int, value: float) -> None:
         """As `setGlobalVariableByName`."""
         self.setGlobalVariableByName(self.getGlobalVariableName(index), value)
+
+    def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
+        """Choose the force groups that act; groups that carry rows never do.
+
+        Parameters
+        ----------
+        groups : int or iterable of int
+            A bit mask or group numbers. -1 and all 32 groups mean: all but the groups of rows.
+
+        Raises
+        ------
+        InputError
+            Groups that carry rows are among those given.
+        UnsupportedError
+            The Context exists; it has read the groups and would ignore the change.
+        """
+        if getattr(self, "_guard", None) is not None or (getattr(self, "program", None) and find_context(self)):
+            raise UnsupportedError("the Context has read the force groups already; set them before it is created")
+        wanted = {g for g in range(32) if (groups >> g) & 1} if isinstance(groups, int) else set(groups)
+        rows = self.row_groups
+        if len(wanted) == 32:
+            wanted -= rows
+        if wanted & rows:
+            raise InputError(
+                f"force groups {sorted(wanted & rows)} carry constraint rows, their forces are gradients and must not "
+                "act; leave them out",
+                item="groups",
+            )
+        super().setIntegrationForceGroups(wanted)
 
     # -- what the Context is told, see kcons.openmm.integrator.states.hearing -------------------------------------
 
