@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import seed_number, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, OccupiedError
+from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
@@ -103,8 +103,8 @@ class FreeEnergy:
         """
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
-        x, f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("value", "force", "error"))
-        period = float(self.periods[0]) or None
+        f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
+        x, period = self._places()[:, 0], float(self.periods[0]) or None
         spread = np.ptp(x) if len(x) else 0.0
         whole = period is not None and spread + np.diff(np.sort(x)).max(initial=0.0) >= period * (1 - 1e-6)
         return integrate(x, f, e, period=period if whole else None)
@@ -118,9 +118,17 @@ class FreeEnergy:
         InputError
             Too few windows.
         """
-        x, f = (np.array([getattr(w, name) for w in self.windows]) for name in ("value", "force"))
+        x, f = self._places(), np.array([w.force for w in self.windows])
         covariances = np.array([w.covariance for w in self.windows])
         return fit_surface(x, f, covariances, periods=[period or None for period in self.periods.tolist()])
+
+    def _places(self) -> FloatArray:
+        """Where the windows are, within one period where they are further apart, shape (n, d)."""
+        x = np.array([w.value for w in self.windows]).reshape(-1, len(self.names))
+        for column, period in zip(x.T, self.periods.tolist(), strict=True):
+            if period and len(column) and np.ptp(column) > period:
+                column[:] = column.min() + (column - column.min()) % period
+        return x
 
     def numbers(self) -> dict[str, Any]:
         """All of it as plain data."""
@@ -198,7 +206,12 @@ class Windows:
         mine |= {"both sides": self.both_sides, "approach": self.approach.tolist(), "start": self.start.tolist()}
         known = self.folder / "settings.json"
         if known.exists():
-            theirs = json.loads(known.read_text(encoding="utf-8"))
+            try:
+                theirs = dict(json.loads(known.read_text(encoding="utf-8")))
+            except (ValueError, TypeError) as error:
+                raise UnreadableError(
+                    f"{known} cannot be read ({error}); choose another folder", item="folder"
+                ) from error
             differ = [key for key in mine if theirs.get(key) != json.loads(text(mine))[key]]
             if differ:
                 raise OccupiedError(
@@ -329,7 +342,10 @@ class Windows:
         whole_number(count, "count", FEWEST)
         if not self.settings.pull:
             raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
-        ends = np.array([np.atleast_1d(start), np.atleast_1d(end)], dtype=np.float64) / self.sampler.scales
+        ends = np.vstack([places_of([np.atleast_1d(end)], self.sampler.names) for end in (start, end)])
+        if np.array_equal(*ends):
+            raise InputError("start and end of the pulls are the same; give two places", item="end")
+        ends = ends / self.sampler.scales
         jobs: dict[str, list[Window]] = {}
         for k, direction in enumerate(DIRECTIONS[: 1 + both_ways]):
             begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
@@ -337,7 +353,13 @@ class Windows:
             jobs[direction] = [Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)]
         every = [job for each in jobs.values() for job in each]
         missing = [job for job in every if not self.file(job).exists()]
-        self._sample(missing, executor, workers, progress, len(every))
+        failed = self._sample(missing, executor, workers, progress, len(every))
+        if failed:
+            name, problem = next(iter(failed.items()))
+            said = f"{len(failed)} of {len(every)} pulls failed; {name}: {problem}"
+            if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs.values()):
+                raise InputError(f"{said}. A difference needs {FEWEST} each way", item="pull")
+            warnings.warn(f"{said}. They are left out, which makes the result doubtful", UserWarning, stacklevel=2)
         kT, works, log_weights = BOLTZMANN * self.settings.temperature, [], []
         for each in jobs.values():
             series = [Series.load(self.file(job)) for job in each if self.file(job).exists()]
