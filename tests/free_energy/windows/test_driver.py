@@ -191,13 +191,6 @@ def test_pulls_that_fail_are_told_of(tmp_path):
             Windows(many, tmp_path / "many", SETTINGS).pull(-0.5, 0.5, 7, executor=executor)
 
 
-def test_a_torsion_may_be_given_beyond_its_period(tmp_path):
-    _, around = run(tmp_path, np.radians([0, 90, 180, 270, 405, 480, 580, 660]))
-    x = around.profile.windows
-    np.testing.assert_allclose(np.degrees(x), [0, 45, 90, 120, 180, 220, 270, 300], atol=1e-9)
-    assert around.profile.closure is not None
-
-
 def test_bad_input(tmp_path):
     with pytest.raises(InputError, match="folder is 3; give a path"):
         Windows(Fake(str(tmp_path / "diary")), 3, SETTINGS)

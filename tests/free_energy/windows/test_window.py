@@ -32,7 +32,7 @@ def test_settings_say_what_is_wrong():
         with pytest.raises(InputError, match=f"{name} is"):
             Settings(**{name: value})
     assert Settings(production=np.int64(6400), temperature=np.float32(310)) == Settings(
-        production=640, temperature=310.0
+        production=6400, temperature=310.0
     )
     with pytest.raises(InputError, match="no thermostat 'andersen'"):
         Settings(thermostat="andersen")
