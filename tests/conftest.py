@@ -25,6 +25,11 @@ hypothesis.settings.load_profile("kcons")
 
 HERE = Path(__file__).parent
 LOCALE = locale.setlocale(locale.LC_ALL)
+#: How long comparisons run what is to be timed, less than usual: no test looks at a time. What else they do stays.
+LITTLE = {
+    "kcons.comparison.methods.openmm": {"BLOCKS": 1, "BLOCK_STEPS": (10, 20)},
+    "kcons.comparison.solvers_alone.bare_solvers": {"SAMPLING": 0.01},
+}
 #: Modules of the package and of its tests, as they are called when they are imported.
 FILES = list(HERE.rglob("*.py"))
 OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
@@ -38,6 +43,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    gc.disable()  # during collection: nothing of it is garbage, and searches were two fifths of its time
     # What other packages warn of in their own modules, a newer Python or NumPy in most cases, is for them to mend.
     for kind in ("DeprecationWarning", "PendingDeprecationWarning", "FutureWarning", "SyntaxWarning"):
         config.addinivalue_line("filterwarnings", f"default::{kind}")
@@ -46,6 +52,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """What was collected stays to the end: no search through all objects has to see it, and searches are few."""
+    gc.enable()
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
@@ -56,6 +63,9 @@ def pytest_runtest_setup() -> None:
     locale.setlocale(locale.LC_ALL, LOCALE)
     if "openmm.app" in sys.modules:
         read_force_fields_once(sys.modules["openmm.app"])
+    for name, amounts in LITTLE.items():
+        if name in sys.modules:
+            vars(sys.modules[name]).update(amounts)
 
 
 def read_force_fields_once(app: ModuleType) -> None:

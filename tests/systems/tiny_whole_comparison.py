@@ -10,6 +10,7 @@ import pytest
 from kcons.comparison.study import machine
 from kcons.comparison.work_precision import parts_of_the_whole, whole
 from kcons.comparison.work_precision.parts_of_the_whole import Item
+from kcons.comparison.work_precision.timing_rounds import Rounds
 
 TINY = (
     Item("chain-3", "Chain of 3 bonds", "chain", 3, budget=5, seconds=1, quick_seconds=1),
@@ -18,12 +19,15 @@ TINY = (
     Item("later", "A part of the future", module="kcons.no_such_module", seconds=1),
 )
 METHODS = ["rattle", "blanes-moan4", "dop853", "verlet"]
+#: No test looks at its times, but two are needed to say how well they repeat.
+TWICE = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
 
 
 def plan_tiny(patch):
     """Let the whole comparison be the tiny one."""
     for module in (parts_of_the_whole, whole):
         patch.setattr(module, "PLAN", TINY)
+    patch.setattr(whole, "FULL_ROUNDS", TWICE)
     patch.setattr(whole, "methods_of", lambda item, system, quick: (METHODS, {}))
     patch.setattr(machine, "code_digest", lambda: "digest")
 

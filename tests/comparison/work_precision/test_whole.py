@@ -7,14 +7,14 @@ from unittest.mock import Mock
 
 import pytest
 from matplotlib.figure import Figure
-from tiny_whole_comparison import METHODS, TINY, Page, measured_once, plan_tiny
+from tiny_whole_comparison import METHODS, TINY, TWICE, Page, measured_once, plan_tiny
 
 from kcons.cli import main
 from kcons.comparison import test_systems
 from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
 from kcons.comparison.study import machine
 from kcons.comparison.study.study import Watcher
-from kcons.comparison.work_precision import timing_rounds, whole, whole_page
+from kcons.comparison.work_precision import whole, whole_page
 from kcons.comparison.work_precision.measurement import Comparison
 from kcons.comparison.work_precision.parts_of_the_whole import Item
 from kcons.errors import InputError
@@ -87,7 +87,7 @@ def test_numbers_come_back_as_they_were(finished):
     data = whole.read(finished, "chain-3")
     found = Comparison.from_dict(data["comparison"])
     assert list(dict.fromkeys(m.method for m in found.measurements)) == METHODS
-    assert found.timing["repeats"] == timing_rounds.FULL_ROUNDS.least and found.timing["margin"] is not None
+    assert found.timing["repeats"] == TWICE.least and found.timing["margin"] is not None
     for m in found.of("rattle"):
         assert m.title == "kcons RATTLE" and m.error > 0 and m.steps == round(80 / m.setting)
     assert found.observed_order("rattle") == pytest.approx(2.0, abs=0.1)
