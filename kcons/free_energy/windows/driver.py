@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED as FIRST
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict
+from itertools import chain
 from multiprocessing import get_context
 from os import PathLike
 from pathlib import Path
@@ -233,7 +234,7 @@ class Windows:
             begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
             seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
             jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
-        every = sum(jobs, [])
+        every = list(chain(*jobs))
         missing = [job for job in every if not self.file(job).exists()]
         failed = self._sample(missing, executor, workers, progress, len(every))
         if failed:
