@@ -19,6 +19,9 @@ import pytest
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENMM_CPU_THREADS"):
     os.environ.setdefault(threads, "1")
 
+# Processes that tests start, which are many, need not translate kcons from its text again, each of them.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # No test is timed: machines differ. The same examples in every run; `--hypothesis-profile default` tries others.
 hypothesis.settings.register_profile("kcons", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("kcons")

@@ -883,8 +883,8 @@ MUTANTS = [
     ),
     (
         "free_energy/scans/relaxation.py",
-        "missing = change - size - self._learned @ move",
-        "missing = change - size + self._learned @ move",
+        "missing = change - size - self._learned(move)",
+        "missing = change - size + self._learned(move)",
         "tests/free_energy/scans/test_relaxation.py::test_what_was_learned_goes_along",
     ),
     (

@@ -28,14 +28,14 @@ MADE = {
 }
 AT_CONSTANT_ENERGY = ("RattleIntegrator", "rattle")
 made = pytest.mark.parametrize("name", MADE)
-#: On GPUs in mixed precision, which is what they are used in: without a thermostat, and two that scale velocities.
+#: On GPUs in mixed precision, which is what they are used in: without a thermostat, and one that scales velocities.
 ON_GPUS = [p for p in GPUS if "mixed" in p.id or "none" in p.id]
 HERE_AND_THERE = [
     *(pytest.param(name, place, id=f"{place}-{name}") for place in PLATFORMS for name in MADE),
     *(
         pytest.param(name, *p.values, id=f"{p.id}-{name}", marks=p.marks)
         for p in ON_GPUS
-        for name in ("RattleIntegrator", "Isokinetic", "NoseHoover")
+        for name in ("RattleIntegrator", "NoseHoover")
     ),
 ]
 

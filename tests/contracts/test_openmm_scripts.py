@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import DATA, GPUS, residuals, started, state_of
+from openmm_systems import DATA, GPUS, LONG, residuals, started, state_of
 
 from kcons.openmm import Langevin, ProjectedIntegrator, RattleIntegrator
 
@@ -45,9 +45,12 @@ CASES = [
     *(pytest.param(name, swap, "CPU") for name, swaps in SCRIPT_SWAPS.items() for swap in swaps),
     *(pytest.param(name, SCRIPT_SWAPS[name][0], "Reference") for name in ("simulate_implicit", "simulate_tip4pew")),
 ]
-#: In mixed precision, in which GPUs are used, and one in single precision: with sites, a barostat, and without a box.
+#: In single precision without a box, and, in a long run, in mixed precision with sites and with a barostat: of these
+#: there are cases on GPUs in test_openmm_site_motion and test_openmm_barostats.
 ON_GPUS = [
-    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=p.marks)
+    pytest.param(
+        name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, *([LONG] if name != "simulate_implicit" else [])]
+    )
     for p in GPUS
     for name in ("simulate_implicit", "simulate_tip4pew", "simulate_npt")
     if "none" in p.id or ("single" if name == "simulate_implicit" else "mixed") in p.id
