@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ase import Atoms
 
 from kcons.errors import InputError, UnsupportedError, did_you_mean
 
@@ -64,16 +65,27 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
         ) from error
 
 
-def described(calculator: Any) -> list[Any]:
+def described(calculator: Any, atoms: Atoms) -> list[Any]:
     """What tells a calculator from others: its kind, its parameters, and the calculators that it is made of.
 
-    Plain data, the same in each process; of parameters that are files of weights, the contents. What a calculator does
-    not give as parameters is not in it.
+    Initial charges and magnetic moments of the atoms, which it may take for the charge and the spin, are in it where
+    there are any. Plain data, the same in each process; of parameters that are files of weights, the contents. What a
+    calculator does not give as parameters is not in it.
     """
+    initial = {
+        name: atoms.arrays[name].tolist()
+        for name in ("initial_charges", "initial_magmoms")
+        if name in atoms.arrays and atoms.arrays[name].any()
+    }
+    return [*_kind(calculator), *([initial] if initial else [])]
+
+
+def _kind(calculator: Any) -> list[Any]:
+    """Its class, its parameters, and those of what it is made of."""
     parts = getattr(getattr(calculator, "mixer", calculator), "calcs", ())
     kind = type(calculator)
     parameters = _plain(getattr(calculator, "parameters", {}))
-    return [f"{kind.__module__}.{kind.__qualname__}", parameters, [described(part) for part in parts]]
+    return [f"{kind.__module__}.{kind.__qualname__}", parameters, [_kind(part) for part in parts]]
 
 
 def _plain(value: Any) -> Any:

@@ -214,7 +214,7 @@ def positive(value: float, item: str) -> float:
         Not a number above zero, or infinite.
     """
     try:
-        number = float(value)
+        number = math.nan if np.ndim(value) or isinstance(value, str | bytes | bool) else float(value)
     except (TypeError, ValueError):
         number = math.nan
     if not (math.isfinite(number) and number > 0):

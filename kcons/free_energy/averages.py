@@ -114,8 +114,10 @@ def weighted_mean(
         Fewer than 10 independent samples; a quantity that never changes, whose error is then 0.
     """
     series, factors = _checked(values, weights, log_weights)
+    _refuse_one_sample(factors)
     start = _equilibrated(_linearised(series, factors)) if equilibration else 0
     series, factors = series[start:], factors[start:]
+    _refuse_one_sample(factors)
     n = len(series)
     fluctuation = _linearised(series, factors)
     scale = np.maximum(np.abs(series).max(axis=0), np.finfo(float).tiny)
@@ -188,6 +190,8 @@ def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_cov
         raise InputError(f"two means of {d} quantities need covariances of shape {(d, d)}", item="covariance")
     if not all(np.isfinite(each).all() for each in (*arrays, *spreads)):
         raise InputError("a mean or a covariance is not finite", item="covariance")
+    if any((np.diagonal(c.reshape(d, d)) < 0).any() for c in spreads):
+        raise InputError("a variance is negative; give covariances of the means", item="covariance")
     away = arrays[0].ravel() - arrays[1].ravel()
     sizes, directions = np.linalg.eigh(sum(c.reshape(d, d) for c in spreads))
     known = sizes > 1e-12 * max(float(sizes[-1]), 0.0)
@@ -225,7 +229,16 @@ def _checked(
         factors = np.exp(factors - factors.max())
     if (factors < 0).any() or not factors.any():
         raise InputError("weights must not be negative, and one of them must be positive", item="weights")
+    factors = factors / factors.max()
     return series, factors / factors.mean()
+
+
+def _refuse_one_sample(factors: FloatArray) -> None:
+    if factors.sum() <= (1 + 1e-12) * factors.max():
+        raise InputError(
+            f"sample {int(np.argmax(factors))} has all of the weight, and one sample has no error; sample longer",
+            item="weights",
+        )
 
 
 def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:

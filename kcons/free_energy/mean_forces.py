@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.arguments import positive, refuse_other, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.free_energy.averages import weighted_mean
@@ -108,6 +108,7 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
     Sprik and Ciccotti, J. Chem. Phys. 109, 7737 (1998), for one coordinate; den Otter and Briels, Mol. Phys. 98, 773
     (2000), for several; the page on free energies has the derivation with other constraints.
     """
+    refuse_other(series, Series, "series", "a kcons.free_energy.Series")
     if not 0 <= whole_number(discard, "discard", 0) < len(series):
         raise InputError(f"{discard} of {len(series)} samples are to be discarded; keep some", item="discard")
     kept = series[discard:]
@@ -116,6 +117,9 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
     turns = kept.periods > 0
     moved[:, turns] -= kept.periods[turns] * np.round(moved[:, turns] / kept.periods[turns])
     allowed = 1e-5 * np.maximum(np.abs(value[0]), 1.0)
+    if not np.all(np.isfinite(moved)):
+        name = kept.names[int(np.argmin(np.isfinite(moved).all(axis=0)))]
+        raise InputError(f"values of {name} are not finite; leave these samples out", item=name)
     if np.any(np.abs(moved) > allowed):
         name = kept.names[int(np.argmax((np.abs(moved) > allowed).any(axis=0)))]
         raise InputError(

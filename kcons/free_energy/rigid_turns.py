@@ -30,7 +30,7 @@ class RigidTurn(NamedTuple):
     group : ndarray of int, shape (n,)
         The atoms that move.
     bonds : ndarray of int, shape (b, 2)
-        Those of the group and to the axis.
+        Those of the group, to the axis and of the axis.
     lengths : ndarray, shape (b,)
     """
 
@@ -78,7 +78,7 @@ def rigid_turn(coordinate: Constraint, bonds: IntArray, x: FloatArray) -> RigidT
         return None
     beyond = [(np.flatnonzero(part == part[near]), far, near) for near, far in ((k, j), (j, k))]
     atoms, far, near = min(beyond, key=lambda side: len(side[0]))
-    own = bonds[~middle & (part[bonds[:, 0]] == part[near])]
+    own = bonds[middle | (part[bonds[:, 0]] == part[near])]
     lengths = np.linalg.norm(x[own[:, 0]] - x[own[:, 1]], axis=1)
     return RigidTurn(np.array([far, near]), atoms[atoms != near], own, lengths)
 

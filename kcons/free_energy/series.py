@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from os import PathLike
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -79,8 +79,16 @@ class Series:
     def __iter__(self) -> Iterator[Sample]:
         return iter(self._samples)
 
-    def __getitem__(self, samples: slice) -> Series:
-        """Some of the samples."""
+    @overload
+    def __getitem__(self, samples: int) -> Sample: ...
+
+    @overload
+    def __getitem__(self, samples: slice) -> Series: ...
+
+    def __getitem__(self, samples: int | slice) -> Sample | Series:
+        """One of the samples, or a series of some."""
+        if not isinstance(samples, slice):
+            return self._samples[samples]
         part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom, self.seconds)
         part._samples = self._samples[samples]
         return part

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from ase import Atoms
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from ase.calculators.mixing import SumCalculator
@@ -40,13 +41,13 @@ def test_what_tells_calculators_from_each_other():
         SumCalculator([EMT(), LennardJones(epsilon=0.1)]),
         SumCalculator([EMT(), LennardJones(epsilon=0.2)]),
     ]
-    texts = [json.dumps(described(calculator)) for calculator in made]
+    texts = [json.dumps(described(calculator, Atoms())) for calculator in made]
     assert len(set(texts)) == len(made)
     same = LennardJones(epsilon=np.float64(0.1))
     same.parameters["beside"] = {"b": object, "a": np.arange(2)}
     other = LennardJones(epsilon=0.1)
     other.parameters["beside"] = {"a": [0, 1], "b": object}
-    assert described(same) == described(other)
+    assert described(same, Atoms()) == described(other, Atoms())
 
 
 def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
@@ -54,8 +55,15 @@ def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
     model.write_bytes(b"weights")
     log.write_text("one")
     calculator.parameters.update(model=str(model), log=str(log))
-    before = described(calculator)
+    before = described(calculator, Atoms())
     log.write_text("another")
-    assert described(calculator) == before
+    assert described(calculator, Atoms()) == before
     model.write_bytes(b"others!")
-    assert described(calculator) != before
+    assert described(calculator, Atoms()) != before
+
+
+def test_charges_and_moments_that_calculators_read_belong_to_them():
+    plain, spins = Atoms("H2"), Atoms("H2", magmoms=[1.0, 0.0])
+    found = [json.dumps(described(EMT(), atoms)) for atoms in (plain, spins, Atoms("H2", charges=[1.0, 0.0]))]
+    assert len(set(found)) == 3
+    assert described(EMT(), Atoms("H2", charges=[0.0, 0.0])) == described(EMT(), plain)

@@ -88,12 +88,19 @@ def test_the_beginning_can_be_left_out():
         (np.arange(20.0), np.full(20, np.inf), "weights", "sample 0"),
         (np.arange(20.0), -np.ones(20), "weights", "negative"),
         (np.arange(20.0), np.zeros(20), "weights", "positive"),
+        (np.arange(20.0), np.eye(20)[3], "weights", "sample 3 has all of the weight"),
     ],
 )
 def test_bad_input_is_refused(values, weights, item, message):
     with pytest.raises(InputError, match=message) as caught:
         weighted_mean(values, weights)
     assert caught.value.item == item
+
+
+def test_a_common_factor_of_weights_does_not_matter():
+    values = np.random.default_rng(3).standard_normal(64)
+    small, large = weighted_mean(values, np.full(64, 1e-300)), weighted_mean(values, np.full(64, 1e308))
+    assert small.value == large.value and small.error == large.error and np.isfinite(large.value).all()
 
 
 def test_both_kinds_of_weights_are_refused():
@@ -142,6 +149,11 @@ def test_agreement_of_single_numbers_and_of_exact_ones():
     assert agreement(1.0, 0.0, 1.1, 0.0).p_value == 0.0
     one = np.diag([1.0, 0.0])
     assert agreement([0.0, 2.0], one, [1.0, 2.0], one).degrees_of_freedom == 1
-    for wrong in (([0.0, 1.0], one, [0.0], [[1.0]]), ([0.0], one, [0.0], one), ([np.nan], [[1.0]], [0.0], [[1.0]])):
+    for wrong in (
+        ([0.0, 1.0], one, [0.0], [[1.0]]),
+        ([0.0], one, [0.0], one),
+        ([np.nan], [[1.0]], [0.0], [[1.0]]),
+        (1.0, -1.0, 2.0, 2.0),
+    ):
         with pytest.raises(InputError):
             agreement(*wrong)

@@ -189,6 +189,13 @@ def test_bad_input():
     series.isokinetic_degrees_of_freedom = 0
     with pytest.raises(InputError, match="20 of 20 samples are to be discarded"):
         mean_force(series, KT, discard=20)
+    with pytest.raises(InputError, match="series is None"):
+        mean_force(None, KT)
+    broken = Series(["r"])
+    for k, sample in enumerate(series):
+        broken.append(sample._replace(value=np.array([np.nan])) if k == 7 else sample)
+    with pytest.raises(InputError, match="values of r are not finite"):
+        mean_force(broken, KT)
     pulled = Series(["r"])
     for k, sample in enumerate(series):
         pulled.append(sample._replace(value=sample.value + 0.1 * (k > 9)))

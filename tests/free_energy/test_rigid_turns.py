@@ -101,4 +101,9 @@ def test_a_molecule_across_a_box_is_not_turned():
     there = X.copy()
     there[0] += 10.0
     assert np.isnan(held.sample(there, np.zeros((6, 3)), np.ones((6, 3))).turned[0])
+    turn = rigid_turn(PHI, BONDS, X)
+    assert np.isfinite(turn.force(X, np.ones((6, 3))))
+    there = X.copy()
+    there[turn.axis[0]] += 10.0  # cut in the middle: the axis is none
+    assert np.isnan(turn.force(there, np.ones((6, 3))))
     assert np.isnan(HeldCoordinates(ConstraintSet([PHI], X, MASSES), {"phi": PHI}, X).sample(X, X, X).turned[0])

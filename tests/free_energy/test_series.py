@@ -93,6 +93,7 @@ def test_damaged_files_are_refused(tmp_path):
         Series.load(file)
     with pytest.raises(FileNotFoundError):
         Series.load(tmp_path / "nothing.npz")
+    assert isinstance(series[0], Sample) and series[-1].time == series.time[-1] and len(series[:3]) == 3
     with pytest.raises(InputError, match="no coordinate 'angle'; there are bond"):
         series.of("angle")
 

@@ -65,6 +65,8 @@ class Fake:
         """Normal works that fulfil Crooks' theorem, 4 kJ/mol up; Z is four times as large at the upper end."""
         with Path(self.diary).open("a") as diary:
             diary.write(f"{window.name}\n")
+        if window.name in self.fails:
+            raise RuntimeError("the calculator did not converge")
         up = window.target[0] > window.start[0]
         work = np.random.default_rng(window.seed).normal((4.0 if up else -4.0) + 4 / (2 * KT), 2.0)
         series = Series(self.names)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from kcons.constraints.arguments import FloatArray, numbers
+from kcons.constraints.arguments import FloatArray, numbers, positive
 from kcons.errors import InputError
 from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, learn
 from kcons.thermostats import Estimate
@@ -98,7 +98,10 @@ class Surface:
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        return difference(*self._process.posterior((self._places(np.stack([numbers(a, "a"), numbers(b, "b")])), [-1])))
+        ends = [numbers(place, item) for place, item in ((a, "a"), (b, "b"))]
+        if any(end.shape != self.low.shape for end in ends):
+            raise InputError(f"a and b must be places of {len(self.low)} coordinates", item="a")
+        return difference(*self._process.posterior((self._places(np.stack(ends)), [-1])))
 
     def minima(self) -> list[Minimum]:
         """Minima inside of the range, lowest first; each is what a search from some window comes to."""
@@ -267,8 +270,9 @@ def _checked(
     if len(bad):
         raise InputError(f"the covariance of window {bad[0]} is not symmetric and positive", item="errors")
     turns = (None,) * d if periods is None else tuple(periods)
-    if len(turns) != d or any(p is not None and not p > 0 for p in turns):
+    if len(turns) != d:
         raise InputError(f"periods must be {d} positive numbers or None", item="periods")
+    turns = tuple(None if p is None else positive(p, "periods") for p in turns)
     for j, period in enumerate(turns):
         spread = float(np.ptp(places[:, j]))
         if not spread > 0 or (period is not None and spread > period * (1 + 1e-9)):

@@ -11,7 +11,6 @@ differences is known and not only errors at points:
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from kcons.constraints.arguments import FloatArray, numbers
+from kcons.constraints.arguments import FloatArray, numbers, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
 from kcons.thermostats import Estimate
@@ -184,8 +183,7 @@ class Profile:
         """
         if self._added is not None:
             raise InputError("the Jacobian has been taken out of this profile already", item="jacobian")
-        if not (thermal_energy > 0 and math.isfinite(thermal_energy)):
-            raise InputError(f"kT is {thermal_energy}; give a positive number", item="thermal_energy")
+        kT = positive(thermal_energy, "thermal_energy")
         known = {"distance": np.square, "angle": np.sin}
         J = known.get(jacobian) if isinstance(jacobian, str) else jacobian
         if J is None:
@@ -196,8 +194,12 @@ class Profile:
             if not (np.isfinite(factor) & (factor > 0)).all():
                 worst = x[np.argmin(np.where(np.isfinite(factor), factor, -np.inf))]
                 raise InputError(f"the Jacobian is not positive at {worst:g}", item="jacobian")
-            return thermal_energy * np.log(factor)
+            return kT * np.log(factor)
 
+        if jacobian == "distance" and self.x.min() <= 0:
+            raise InputError(
+                f"there is no distance of {self.x.min():g}; give the J(x) of this coordinate", item="jacobian"
+            )
         shift = added(np.append(self.x, self.zero))
         return replace(self, F=self.F + shift[:-1] - shift[-1], _added=added)
 
@@ -241,7 +243,7 @@ class Profile:
         noise = np.interp(grid, known.x, known.e**2, period=known.period)
         m = len(aims)
         chosen = []
-        for _ in range(count):
+        for _ in range(whole_number(count, "count")):
             shared = covariance[:m, m:]
             variance = np.maximum(np.diag(covariance)[m:], 0.0) + noise
             gain = ((shared - shared.mean(axis=0)) ** 2).sum(axis=0) / np.maximum(variance, np.finfo(float).tiny)
@@ -334,8 +336,7 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
     if (error < 0).any():
         raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
     if period is not None:
-        if not (period > 0 and math.isfinite(period)):
-            raise InputError(f"the period is {period}; give a positive number", item="period")
+        positive(period, "period")
         if len(place) and np.ptp(place) > period * (1 + 1e-9):
             raise InputError(
                 f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
@@ -346,6 +347,14 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
     places, which = np.unique(place, return_inverse=True)
     if len(places) < 3:
         raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
+    for k in np.flatnonzero(np.bincount(which[error == 0], minlength=len(places)) > 1):
+        exact = force[(which == k) & (error == 0)]
+        if np.ptp(exact) > 1e-9 * np.abs(exact).max():
+            raise InputError(
+                f"windows at {places[k]:g} have mean forces from {exact.min():g} to {exact.max():g}, all with an error "
+                "of 0; give their errors",
+                item="e",
+            )
     # Errors of 0 among others: exact values count alone.
     weights = (
         1.0 / np.maximum(error, 1e-12 * max(float(error.max()), np.finfo(float).tiny)) ** 2

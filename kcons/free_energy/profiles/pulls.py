@@ -105,12 +105,13 @@ def pull_free_energy(
     UserWarning
         Fewer than 10 forward pulls count and there are none back, or pulls both ways overlap by less than 3 percent.
     """
-    ahead = _works(forward, "forward", thermal_energy)
+    kT = positive(thermal_energy, "thermal_energy")
+    ahead = _works(forward, "forward", kT)
     rng = generator_of(seed, "seed")
     drawn = ahead[rng.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
     jarzynski, cumulant = _both(ahead, drawn)
     effective = _effective(ahead)
-    kT, bias = thermal_energy, _bias(ahead)
+    bias = _bias(ahead)
     if backward is None:
         if effective < FEW_INDEPENDENT:
             warnings.warn(
@@ -126,7 +127,7 @@ def pull_free_energy(
             effective,
             kT * (float(ahead.mean()) - jarzynski.value),
         )
-    back = _works(backward, "backward", thermal_energy)
+    back = _works(backward, "backward", kT)
     drawn_back = back[rng.integers(len(back), size=(_SAMPLES, len(back)))]
     jarzynski_back, cumulant_back = _both(back, drawn_back)
     found = pymbar().bar(ahead, back)

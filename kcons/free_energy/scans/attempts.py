@@ -90,7 +90,7 @@ class Attempts:
             "positions": atoms.positions.tolist(),
             "cell": atoms.cell.array.tolist(),
             "pbc": atoms.pbc.tolist(),
-            "calculator": described(atoms.calc),
+            "calculator": described(atoms.calc, atoms),
             "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
             "values": [axis.tolist() for axis in grid.values],
             "held": [item.todict() for item in held],

@@ -2,6 +2,7 @@
 
 - `window`: one window and its settings
 - `ase_windows`, `openmm_windows`: who samples it
+- `window_results`: what windows have found
 - `driver`: many of them, by any executor
 - `plan_file`: windows as a file describes them
 - `windows_report`: what is shown of them

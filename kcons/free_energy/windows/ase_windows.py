@@ -87,7 +87,8 @@ class AseWindows:
             else (calculator,)
         )
         # Not all that makes a calculator what it is need be among its parameters, nor among these arguments.
-        maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:], described(calculator())]
+        maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:]]
+        maker.append(described(calculator(), self.atoms))
         frame = [self.atoms.numbers, self.atoms.positions, self.atoms.cell.array, self.atoms.pbc]
         frame.append(self.atoms.get_masses())
         return digest_of(frame, maker, self.held, list(self.coordinates.values()))

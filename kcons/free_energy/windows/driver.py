@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 import traceback
@@ -11,137 +10,29 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED as FIRST
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import asdict
+from itertools import chain
 from multiprocessing import get_context
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import seed_number, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, OccupiedError
-from kcons.free_energy.averages import agreement
+from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 from kcons.free_energy.mean_forces import MeanForce, mean_force
-from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
-from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
+from kcons.free_energy.windows.window_results import FreeEnergy, together
 from kcons.steppers.files import as_path, in_one_piece, text
 
 #: Boltzmann's constant in kJ/mol/K.
 BOLTZMANN = 0.00831446261815324
 #: How often a window is begun again whose process was killed.
 RETRIES = 3
-
-
-@dataclass(frozen=True)
-class WindowResult:
-    """The mean force where one or several coordinates were held, in kJ/mol, angstrom and radian.
-
-    Attributes
-    ----------
-    number : int
-    value, force, error : ndarray, shape (d,)
-        The coordinates, dF/dq and its standard error.
-    covariance : ndarray, shape (d, d)
-    sides : dict of str to MeanForce
-        From below and from above.
-    hysteresis : float
-        Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
-    raw : ndarray, shape (d,)
-        The plain mean of the multipliers, for comparison.
-    seconds : float
-        Processor time that its runs took, whichever call made them.
-    """
-
-    number: int
-    value: FloatArray
-    force: FloatArray
-    covariance: FloatArray
-    sides: dict[str, MeanForce]
-    hysteresis: float
-    raw: FloatArray
-    seconds: float
-
-    @property
-    def error(self) -> FloatArray:
-        return np.sqrt(np.diagonal(self.covariance))
-
-
-@dataclass
-class FreeEnergy:
-    """What became of the windows.
-
-    Attributes
-    ----------
-    names : tuple of str
-    periods : ndarray, shape (d,)
-    windows : list of WindowResult
-        Those that are finished, in the order of their coordinates.
-    failed : dict of str to str
-        Windows that failed, and why.
-    """
-
-    names: tuple[str, ...]
-    periods: FloatArray
-    windows: list[WindowResult]
-    failed: dict[str, str] = field(default_factory=dict)
-
-    @cached_property
-    def profile(self) -> Profile:
-        """Free energy along the only coordinate, kJ/mol.
-
-        Raises
-        ------
-        InputError
-            There are several coordinates, or too few windows.
-        """
-        if len(self.names) != 1:
-            raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
-        x, f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("value", "force", "error"))
-        period = float(self.periods[0]) or None
-        spread = np.ptp(x) if len(x) else 0.0
-        whole = period is not None and spread + np.diff(np.sort(x)).max(initial=0.0) >= period * (1 - 1e-6)
-        return integrate(x, f, e, period=period if whole else None)
-
-    @cached_property
-    def surface(self) -> Surface:
-        """Free energy in all coordinates, kJ/mol.
-
-        Raises
-        ------
-        InputError
-            Too few windows.
-        """
-        x, f = (np.array([getattr(w, name) for w in self.windows]) for name in ("value", "force"))
-        covariances = np.array([w.covariance for w in self.windows])
-        return fit_surface(x, f, covariances, periods=[period or None for period in self.periods.tolist()])
-
-    def numbers(self) -> dict[str, Any]:
-        """All of it as plain data."""
-        return {
-            "names": list(self.names),
-            "units": "kJ/mol, angstrom, radian",
-            "windows": [
-                {
-                    "number": w.number,
-                    "value": w.value.tolist(),
-                    "mean force": w.force.tolist(),
-                    "covariance": w.covariance.tolist(),
-                    "raw multiplier": w.raw.tolist(),
-                    "hysteresis": w.hysteresis,
-                    "samples": sum(side.n for side in w.sides.values()),
-                    "independent samples": sum(side.n_effective for side in w.sides.values()),
-                }
-                for w in self.windows
-            ],
-            "failed": self.failed,
-        }
 
 
 class Windows:
@@ -198,7 +89,12 @@ class Windows:
         mine |= {"both sides": self.both_sides, "approach": self.approach.tolist(), "start": self.start.tolist()}
         known = self.folder / "settings.json"
         if known.exists():
-            theirs = json.loads(known.read_text(encoding="utf-8"))
+            try:
+                theirs = dict(json.loads(known.read_text(encoding="utf-8")))
+            except (ValueError, TypeError) as error:
+                raise UnreadableError(
+                    f"{known} cannot be read ({error}); choose another folder", item="folder"
+                ) from error
             differ = [key for key in mine if theirs.get(key) != json.loads(text(mine))[key]]
             if differ:
                 raise OccupiedError(
@@ -329,29 +225,25 @@ class Windows:
         whole_number(count, "count", FEWEST)
         if not self.settings.pull:
             raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
-        ends = np.array([np.atleast_1d(start), np.atleast_1d(end)], dtype=np.float64) / self.sampler.scales
-        jobs: dict[str, list[Window]] = {}
+        ends = np.vstack([places_of([np.atleast_1d(end)], self.sampler.names) for end in (start, end)])
+        if np.array_equal(*ends):
+            raise InputError("start and end of the pulls are the same; give two places", item="end")
+        ends = ends / self.sampler.scales
+        jobs: list[list[Window]] = []
         for k, direction in enumerate(DIRECTIONS[: 1 + both_ways]):
             begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
             seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
-            jobs[direction] = [Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)]
-        every = [job for each in jobs.values() for job in each]
+            jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
+        every = list(chain(*jobs))
         missing = [job for job in every if not self.file(job).exists()]
-        self._sample(missing, executor, workers, progress, len(every))
-        kT, works, log_weights = BOLTZMANN * self.settings.temperature, [], []
-        for each in jobs.values():
-            series = [Series.load(self.file(job)) for job in each if self.file(job).exists()]
-            works.append(np.array([s.work[-1] * self.sampler.kJ for s in series]))
-            log_weights.append(np.array([-0.5 * s.log_det_z[[0, -1]] for s in series]).reshape(-1, 2))
-        # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
-        if both_ways:
-            shift = kT * (_log_mean(log_weights[0][:, 0]) - _log_mean(log_weights[1][:, 0]))
-        else:
-            counts = -works[0] / kT  # what was pulled here counts as in equilibrium with these weights
-            at_end = _log_mean(log_weights[0][:, 1] + counts) - _log_mean(counts)
-            shift = kT * (_log_mean(log_weights[0][:, 0]) - at_end)
-        backward = works[1] - shift if both_ways else None
-        return pull_free_energy(works[0] + shift, backward, thermal_energy=kT)
+        failed = self._sample(missing, executor, workers, progress, len(every))
+        if failed:
+            said = f"{len(failed)} of {len(every)} pulls failed; {': '.join(next(iter(failed.items())))}"
+            if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs):
+                raise InputError(f"{said}. A difference needs {FEWEST} each way", item="pull")
+            warnings.warn(f"{said}. They are left out, which makes the result doubtful", UserWarning, stacklevel=2)
+        found = [[Series.load(self.file(job)) for job in each if job.name not in failed] for each in jobs]
+        return _pulled(found, self.sampler.kJ, BOLTZMANN * self.settings.temperature)
 
     def _finished(self, window: Window) -> bool:
         """Whether a window is there; raises where its file is one of other values."""
@@ -440,25 +332,9 @@ class Windows:
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
-                found.append(_together(number, np.array(target), sides, self.sampler, seconds))
+                found.append(together(number, np.array(target), sides, self.sampler, seconds))
         found.sort(key=lambda w: w.value.tolist())
         return FreeEnergy(self.sampler.names, self.periods, found, problems)
-
-
-def _together(
-    number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler, seconds: float
-) -> WindowResult:
-    """The mean of both sides, and how probable their difference is."""
-    per = sampler.kJ / sampler.scales
-    forces = np.array([side.force * per for side in sides.values()])
-    covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
-    chance = math.nan
-    if len(sides) == 2:
-        chance = agreement(forces[0], covariances[0], forces[1], covariances[1]).p_value
-    raw = np.mean([side.raw * per for side in sides.values()], axis=0)
-    return WindowResult(
-        number, target, forces.mean(axis=0), covariances.sum(axis=0) / len(sides) ** 2, sides, chance, raw, seconds
-    )
 
 
 #: What is said of a window whose process was killed, or whose worker was lost.
@@ -479,6 +355,20 @@ def _sampled(sampler: Sampler, window: Window, settings: Settings, file: Path) -
     """In a worker: one window, unless another run has finished it meanwhile."""
     if not file.exists():
         (sampler.sample if window.side in SIDES else sampler.pull)(window, settings, file)
+
+
+def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
+    """What the pulls of one or both directions say, with kT in kJ/mol."""
+    works = [np.array([series.work[-1] * kJ for series in each]) for each in pulls]
+    log_weights = [np.array([-0.5 * series.log_det_z[[0, -1]] for series in each]).reshape(-1, 2) for each in pulls]
+    # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
+    if len(pulls) == 2:
+        shift = kT * (_log_mean(log_weights[0][:, 0]) - _log_mean(log_weights[1][:, 0]))
+        return pull_free_energy(works[0] + shift, works[1] - shift, thermal_energy=kT)
+    counts = -works[0] / kT  # what was pulled here counts as in equilibrium with these weights
+    at_end = _log_mean(log_weights[0][:, 1] + counts) - _log_mean(counts)
+    shift = kT * (_log_mean(log_weights[0][:, 0]) - at_end)
+    return pull_free_energy(works[0] + shift, thermal_energy=kT)
 
 
 def _log_mean(logarithms: FloatArray) -> float:

@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError, did_you_mean
 from kcons.free_energy.windows.window import Sampler, Settings
+from kcons.steppers.files import as_path
 
 #: Tables of a plan, and what the values of their keys are.
 TABLES: dict[str, dict[str, str]] = {
@@ -124,11 +126,13 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
     InputError
         No TOML, unknown or missing keys, files that are not there, coordinates without values.
     """
-    path = Path(file)
+    path = as_path(file, "plan")
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"there is no file {path}", item="plan") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error}", item="plan") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no TOML: {error}", item="plan") from error
     _refuse_unknown(data)
@@ -145,6 +149,12 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
     options = {key: settings.pop(key) for key in ("both_sides", "approach", "seed") if key in settings}
     workers = data.get("workers", {})
     targets = np.array(list(product(*values)))
+    if "improve" in data and (len(coordinates) > 1 or len(targets) < 3):
+        raise InputError(
+            f"[improve] adds windows to a profile along one coordinate; the plan has {len(coordinates)}, with "
+            f"{len(targets)} windows: leave it out, or begin with 3 windows or more along one",
+            item="improve",
+        )
     pulls = _pulls(data["pulls"], coordinates, targets) if "pulls" in data else None
     return PlanFile(
         _sampler(data, path.parent, coordinates),
@@ -210,6 +220,9 @@ def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, 
         )
     (family,) = families
     item = FAMILIES[family]([[atom - first for atom in entry[family]]])
+    both = [key for key in ("from", "to", "windows") if key in entry and "values" in entry]
+    if both:
+        raise InputError(f"coordinate {name} has values and {both[0]}; give one of them", item="coordinate")
     if "values" in entry:
         places = np.array(entry["values"], dtype=np.float64)
     elif {"from", "to", "windows"} <= set(entry):
@@ -219,6 +232,9 @@ def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, 
         raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")
     if places.ndim != 1 or not len(places):
         raise InputError(f"coordinate {name} has no values", item="coordinate")
+    low, high = {"distance": (0.0, math.inf), "angle": (0.0, 180.0), "dihedral": (-math.inf, math.inf)}[family]
+    for place in places[(places <= low) | (places >= high)].tolist():
+        raise InputError(f"there is no {family} of {place:g} to hold {name} at; leave it out", item="coordinate")
     return name, item, places if family == "distance" else np.radians(places)
 
 
@@ -236,9 +252,9 @@ def _pulls(entry: Mapping[str, Any], coordinates: Mapping[str, Constraint], targ
             place = np.where(lengths, given, np.radians(given))
         found[argument] = place
     for key, low in (("count", 5), ("steps", 1)):
-        value = entry.get(key, low)
-        if not isinstance(value, int) or value < low:
-            raise InputError(f"{key} of [pulls] is {value}; give a whole number, {low} or more", item=key)
+        whole_number(entry.get(key, low), f"{key} of [pulls]", low)
+    if np.array_equal(found["start"], found["end"]):
+        raise InputError("[pulls] begin where they end; give from and to", item="pulls")
     return found
 
 
@@ -254,6 +270,9 @@ def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Co
             "give calculator or system in [forces]: a calculator of ASE, or the XML file of a System of OpenMM",
             item="forces",
         )
+    for key, other in (("settings", "system"), ("platform", "calculator"), ("properties", "calculator")):
+        if key in forces and other in forces:
+            raise InputError(f"{key} of [forces] says nothing to a {other}; leave it out", item=key)
     if "system" in forces:
         if held:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")

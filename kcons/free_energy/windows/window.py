@@ -82,9 +82,10 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in ("temperature", "timestep", "friction"):
-            positive(getattr(self, name), name)
+            object.__setattr__(self, name, positive(getattr(self, name), name))
         for name in ("relax", "pull", "equilibration", "production", "every"):
-            whole_number(getattr(self, name), name, int(name in ("production", "every")))
+            least = int(name in ("production", "every"))
+            object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
         if self.thermostat not in ("langevin", "nose-hoover", "isokinetic"):
             raise InputError(
                 f"no thermostat {self.thermostat!r}; there are langevin, nose-hoover, isokinetic", item="thermostat"

@@ -12,7 +12,7 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.free_energy.averages import FEW_INDEPENDENT
 from kcons.free_energy.profiles.pulls import Pulled
-from kcons.free_energy.windows.driver import FreeEnergy, WindowResult
+from kcons.free_energy.windows.window_results import FreeEnergy, WindowResult
 from kcons.steppers.files import in_one_piece, text
 
 if TYPE_CHECKING:

@@ -167,6 +167,7 @@ def test_three_coordinates():
         ({"errors": -np.ones((9, 2))}, "errors", "negative"),
         ({"errors": np.tile([[1.0, 2.0], [2.0, 1.0]], (9, 1, 1))}, "errors", "window 0 is not symmetric and positive"),
         ({"periods": (1.0,)}, "periods", "2 positive"),
+        ({"periods": ("a", None)}, "periods", "positive"),
         ({"periods": (0.5, None)}, "x", "further apart than the period in coordinate 0"),
         ({"zero": [0.0]}, "zero", "2 finite"),
         ({"zero": [9.0, 0.0]}, "x", "beyond the windows"),
@@ -178,3 +179,11 @@ def test_bad_input_is_refused(change, item, message):
     with pytest.raises(InputError, match=message) as caught:
         fit_surface(**{**good, **change})
     assert caught.value.item == item
+
+
+def test_differences_between_places_of_other_shapes_are_refused():
+    x = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+    surface = fit_surface(x, x, np.ones((9, 2)))
+    for other in ([0.5], 0.5, [0.5, 0.5, 0.5]):
+        with pytest.raises(InputError, match="a and b must be places of 2 coordinates"):
+            surface.difference([0.0, 0.0], other)

@@ -312,6 +312,8 @@ def test_windows_that_help_what_is_low():
         ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"zero": 3.0}, "zero", "beyond the windows"),
         ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"at": [-1.0]}, "at", "beyond the windows"),
         ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"period": -1.0}, "period", "positive"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"period": "360"}, "period", "positive"),
+        ([0.0, 1.0, 1.0, 2.0], [0.0, 1.0, 2.0, 2.0], [0.0] * 4, {}, "e", "windows at 1 have mean forces from 1 to 2"),
         ([0.0, 90.0, 180.0], [0.0, 1.0, 2.0], [1.0] * 3, {"period": 2 * math.pi}, "period", "units"),
     ],
 )
@@ -319,6 +321,17 @@ def test_bad_input_is_refused(x, f, e, options, item, message):
     with pytest.raises(InputError, match=message) as caught:
         integrate(x, f, e, **options)
     assert caught.value.item == item
+
+
+def test_what_is_asked_of_a_profile_is_checked():
+    profile = integrate([-1.0, 0.5, 1.0, 2.0], [0.0, 1.0, 0.0, 0.0], [0.1] * 4)
+    for count in (-1, 0, 1.5):
+        with pytest.raises(InputError, match="count is"):
+            profile.next_windows(count)
+    with pytest.raises(InputError, match="no distance of -1"):
+        profile.without_jacobian("distance", 1.0)
+    with pytest.raises(InputError, match="thermal_energy is '1'"):
+        profile.without_jacobian(np.cosh, "1")
 
 
 def test_a_profile_prints_its_windows_and_not_its_arrays():

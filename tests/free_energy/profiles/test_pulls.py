@@ -150,6 +150,7 @@ def test_pulls_that_do_not_overlap_are_warned_of():
         (lambda: pull_free_energy([1.0] * 5 + [np.inf], thermal_energy=1.0), "forward", "work 5"),
         (lambda: pull_free_energy([1.0] * 5, thermal_energy=-1.0), "thermal_energy", "positive"),
         (lambda: pull_free_energy([1.0] * 5, thermal_energy="x"), "thermal_energy", "positive"),
+        (lambda: pull_free_energy([1.0] * 5, thermal_energy="1"), "thermal_energy", "positive"),
         (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, seed="x"), "seed", "seed is 'x'"),
         (lambda: work_along([0.0, 1.0], [0.0, 1.0, 2.0]), "force", "do not go"),
         (lambda: work_along([0.0, 1.0], [0.0, np.nan]), "force", "finite"),

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from window_samplers import KT, Fake, slope
 
-from kcons.errors import InputError, OccupiedError
+from kcons.errors import InputError, OccupiedError, UnreadableError
 from kcons.free_energy import Settings, Windows
 
 SETTINGS = Settings(production=640, every=10)
@@ -174,8 +174,21 @@ def test_pulls_give_the_free_energy_of_the_coordinate(tmp_path, both_ways):
     assert abs(found.best.value - exact) < 3 * found.best.error < 2
     assert (found.bar is None) == (not both_ways) and again.best == found.best
     assert len(diary(tmp_path)) == 60 * (1 + both_ways)
+    for same in ((0.5, 0.5), ([0.5, 1.0], [0.5, 2.0]), (np.nan, 1.0)):
+        with pytest.raises(InputError, match=r"are the same|targets must be finite"):
+            windows.pull(*same)
     with pytest.raises(InputError, match=r"settings\.pull is 0"):
         Windows(Fake(str(tmp_path / "diary")), tmp_path / "no", Settings(pull=0)).pull(0, 1)
+
+
+def test_pulls_that_fail_are_told_of(tmp_path):
+    names = [f"pull--0.5-to-0.5-{k:04d}" for k in range(3)]
+    one, many = (Fake(str(tmp_path / "diary"), fails=tuple(names[:n])) for n in (1, 3))
+    with ThreadPoolExecutor(1) as executor:
+        with pytest.warns(UserWarning, match=r"1 of 14 pulls failed; pull--0.5-to-0.5-0000: RuntimeError.*left out"):
+            assert Windows(one, tmp_path / "one", SETTINGS).pull(-0.5, 0.5, 7, executor=executor).best.error > 0
+        with pytest.raises(InputError, match=r"3 of 14 pulls failed;.*did not converge.*needs 5 each way"):
+            Windows(many, tmp_path / "many", SETTINGS).pull(-0.5, 0.5, 7, executor=executor)
 
 
 def test_bad_input(tmp_path):
@@ -189,6 +202,10 @@ def test_bad_input(tmp_path):
     with pytest.raises(OccupiedError, match=r"window-0001-up.npz was sampled elsewhere than at -1\.5708"):
         run(tmp_path, PLACES[::2])
     assert len(diary(tmp_path)) == 16
+    for text in ('{"seed', "[1]"):
+        (tmp_path / "out/settings.json").write_text(text)
+        with pytest.raises(UnreadableError, match=r"settings\.json cannot be read"):
+            Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
     windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
     for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1))):
         with pytest.raises(InputError, match="targets must be finite"):

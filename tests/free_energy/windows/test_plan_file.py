@@ -48,6 +48,7 @@ below = 40
 [workers]
 processes = 3
 """
+IMPROVE = PLAN[PLAN.index("[improve]") : PLAN.index("[workers]")]
 
 
 @pytest.fixture
@@ -80,7 +81,7 @@ def test_atoms_from_one_and_two_coordinates(folder):
         "dihedral = [2, 0, 1, 3]", "dihedral = [3, 1, 2, 4]"
     )
     text += "\n[[coordinate]]\ndistance = [1, 2]\nvalues = [1.4, 1.5]\n"
-    plan = read(folder, text)
+    plan = read(folder, text.replace(IMPROVE, ""))
     assert plan.sampler.coordinates["turn"].atoms.tolist() == [[2, 0, 1, 3]]
     assert plan.sampler.names == ("turn", "distance-1-2") and plan.targets.shape == (24, 2)
     assert plan.targets[1] == pytest.approx([-np.pi, 1.5])
@@ -92,7 +93,7 @@ def test_pulls(folder):
     assert plan.pulls["start"] == pytest.approx([-np.pi / 3]) and plan.pulls["end"] == pytest.approx(plan.targets[-1])
     assert plan.pulls["count"] == 8 and plan.pulls["both_ways"] is False and plan.pull_steps == 300
     text = PLAN + "\n[[coordinate]]\ndistance = [0, 1]\nvalues = [1.4, 1.5]\n[pulls]\nto = [90.0, 1.6]\n"
-    plan = read(folder, text)
+    plan = read(folder, text.replace(IMPROVE, ""))
     assert plan.pulls["end"] == pytest.approx([np.pi / 2, 1.6]) and plan.pull_steps == 20000
 
 
@@ -141,6 +142,18 @@ def test_a_plan_for_openmm(folder):
         ("[workers]", "[pulls]\nfrom = [1.0, 2.0]\n[workers]", r"from of \[pulls\] has 2 values.*turn"),
         ("[workers]", "[pulls]\ncount = 4\n[workers]", r"count of \[pulls\] is 4.*5 or more"),
         ("[workers]", "[pulls]\nsteps = 0.5\n[workers]", r"steps of \[pulls\] is 0.5"),
+        ("[workers]", "[pulls]\nsteps = true\n[workers]", r"steps of \[pulls\] is True"),
+        ("[workers]", "[pulls]\nfrom = 3\nto = 3\n[workers]", "begin where they end"),
+        ("windows = 12", "windows = 12\nvalues = [1, 2, 3]", "turn has values and from"),
+        ("windows = 12", "windows = 2", r"\[improve\] adds windows.*has 1, with 2 windows"),
+        ("[workers]", "[[coordinate]]\nangle = [2, 0, 1]\nvalues = [100, 110]\n[workers]", "has 2, with 24 windows"),
+        ("[workers]", "[[coordinate]]\nangle = [2, 0, 1]\nvalues = [100, 180]\n[workers]", "no angle of 180 to hold"),
+        ("[workers]", "[[coordinate]]\ndistance = [0, 1]\nvalues = [1.4, -1]\n[workers]", "no distance of -1 to hold"),
+        (
+            'calculator = "lj"',
+            'calculator = "lj"\nplatform = "CPU"',
+            "platform of .forces. says nothing to a calculator",
+        ),
         ("windows = 12", 'windows = "x"', r"windows of \[coordinate\] is 'x'; give a whole number above 0"),
         ("windows = 12", "windows = -2", r"windows of \[coordinate\] is -2"),
         ("dihedral = [2, 0, 1, 3]", "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
@@ -165,6 +178,10 @@ def test_wrong_plans(folder, old, new, match):
 
 
 def test_an_unknown_scheduler(folder):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_plan(folder)
+    with pytest.raises(InputError, match="give a path"):
+        read_plan(None)
     with pytest.raises(InputError, match="no file"):
         read_plan(folder / "nothing.toml")
     plan = read(folder, PLAN.replace("processes = 3", 'scheduler = "tcp://127.0.0.1:9"'))

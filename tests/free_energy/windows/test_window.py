@@ -21,9 +21,19 @@ def held(coordinates=None, others=()):
 
 def test_settings_say_what_is_wrong():
     wrong = [("temperature", -1.0), ("timestep", 0.0), ("every", 0), ("relax", -1), ("pull", 0.5)]
-    for name, value in (*wrong, ("temperature", "x"), ("friction", [1, 2]), ("every", None)):
+    for name, value in (
+        *wrong,
+        ("temperature", "x"),
+        ("friction", [1, 2]),
+        ("every", None),
+        ("temperature", "300"),
+        ("friction", True),
+    ):
         with pytest.raises(InputError, match=f"{name} is"):
             Settings(**{name: value})
+    assert Settings(production=np.int64(6400), temperature=np.float32(310)) == Settings(
+        production=6400, temperature=310.0
+    )
     with pytest.raises(InputError, match="no thermostat 'andersen'"):
         Settings(thermostat="andersen")
     with pytest.raises(InputError, match="fewer than 32 samples"):

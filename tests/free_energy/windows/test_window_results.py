@@ -1,0 +1,51 @@
+"""What windows have found, put together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.errors import InputError
+from kcons.free_energy import FreeEnergy, WindowResult
+
+PERIOD = 2 * np.pi
+
+
+def result(place, slope, d=1):
+    return WindowResult(
+        0, np.full(d, place), np.full(d, slope), 1e-4 * np.eye(d), {}, float("nan"), np.full(d, slope), 0.0
+    )
+
+
+def found(degrees, names=("torsion",), periods=(PERIOD,)):
+    windows = [result(q, -2 * np.sin(2 * q), len(names)) for q in np.radians(degrees)]
+    return FreeEnergy(names, np.array(periods), windows)
+
+
+def test_a_torsion_may_be_given_beyond_its_period():
+    beyond = found([0, 90, 180, 270, 405, 495, 585, 675]).profile
+    within = found([0, 45, 90, 135, 180, 225, 270, 315]).profile
+    np.testing.assert_allclose(np.degrees(beyond.windows), np.arange(0, 360, 45), atol=1e-9)
+    assert beyond.closure is not None
+    np.testing.assert_allclose(beyond.F, within.F, atol=1e-6)
+    with pytest.raises(InputError, match="1 different windows"):
+        _ = found([10, 370, 730]).profile
+    with pytest.raises(InputError, match="0 different windows"):
+        _ = found([]).profile
+
+
+def test_half_a_turn_is_not_closed():
+    profile = found(range(0, 100, 10)).profile
+    assert profile.closure is None and profile.difference(0, np.pi / 2).value == pytest.approx(-2.0, abs=0.02)
+
+
+def test_surfaces_of_torsions_beyond_their_period():
+    pairs = [(a, b) for a in (0, 120, 600) for b in (-60, 60, 180)]
+    windows = [
+        WindowResult(k, np.radians(p), -np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2), 0.0)
+        for k, p in enumerate(pairs)
+    ]
+    both = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows)
+    assert np.degrees(both.surface.windows[:, 0].max()) == pytest.approx(240.0)
+    with pytest.raises(InputError, match="2 coordinates; see surface"):
+        _ = both.profile
