@@ -33,6 +33,8 @@ LITTLE = {
     "kcons.comparison.methods.openmm": {"BLOCKS": 1, "BLOCK_STEPS": (10, 20)},
     "kcons.comparison.solvers_alone.bare_solvers": {"SAMPLING": 0.01},
 }
+#: The same of the package, of modules that were imported.
+USUAL: dict[str, dict[str, object]] = {}
 #: Modules of the package and of its tests, as they are called when they are imported.
 FILES = list(HERE.rglob("*.py"))
 OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
@@ -67,8 +69,18 @@ def pytest_runtest_setup() -> None:
     if "openmm.app" in sys.modules:
         read_force_fields_once(sys.modules["openmm.app"])
     for name, amounts in LITTLE.items():
-        if name in sys.modules:
-            vars(sys.modules[name]).update(amounts)
+        if name in sys.modules and name not in USUAL:
+            module = vars(sys.modules[name])
+            USUAL[name] = {amount: module[amount] for amount in amounts}
+            module.update(amounts)
+
+
+@pytest.fixture
+def usual_amounts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `LITTLE` changes is as the package has it."""
+    for name, amounts in USUAL.items():
+        for amount, value in amounts.items():
+            monkeypatch.setattr(sys.modules[name], amount, value)
 
 
 def read_force_fields_once(app: ModuleType) -> None:

@@ -399,6 +399,7 @@ def test_quick_rounds_are_fewer_and_shorter():
 
 
 @pytest.mark.skipif(find_spec("openmm") is None, reason="OpenMM is not installed")
+@pytest.mark.usefixtures("usual_amounts")
 def test_openmm_makes_many_steps_at_a_stretch(chain):
     run = methods.METHODS["openmm-rattle"].start(chain, min(chain.time_steps))
     assert [run.stretch(each, 0.01) for each in (1e-6, 1.3e-5, 1e-3, 0.007, 1.0)] == [2000, 769, 500, 85, 10]
