@@ -229,7 +229,7 @@ class HamiltonianMonteCarlo:
             raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
         held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
         held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
-        if math.isnan(held[POTENTIAL]):
+        if state.forces is None or math.isnan(held[POTENTIAL]):  # positions without forces may be new ones
             held[POTENTIAL] = energy_at(system, state)
             if not math.isfinite(held[POTENTIAL]):
                 raise NonFiniteError(
@@ -319,12 +319,24 @@ class HamiltonianMonteCarlo:
 
 
 def energy_at(system: System, state: State) -> float:
-    """The potential energy; 0 without forces."""
+    """The potential energy; 0 without forces.
+
+    Raises
+    ------
+    InputError
+        It is not one real number.
+    """
     if system.potential is None:
         return 0.0
     x = state.positions.view()
     x.setflags(write=False)
-    return float(system.potential(x, state.time))
+    found = system.potential(x, state.time)
+    if np.ndim(found) or not np.issubdtype(np.asarray(found).dtype, np.number) or np.iscomplexobj(found):
+        raise InputError(
+            f"the potential returned {found!r}; it must return one real number, the energy of all atoms",
+            item="potential",
+        )
+    return float(found)
 
 
 def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from kcons.constraints import Distance, FixedAtoms, Formula, MovingTarget, Plane
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, ReversibilityCheck, State, Suzuki4, System, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL, PROPOSAL, stream
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import CHANGE, POTENTIAL, PROPOSAL, stream
 
 
 def started(n=2):
@@ -246,6 +246,27 @@ def test_errors_of_the_force_function_pass_through():
 
     with pytest.raises(ZeroDivisionError, match="mine"):
         HamiltonianMonteCarlo(0.5, 3, 1).step(System(held.motion, broken, potential=waves_potential), state, 0.1)
+
+
+def test_positions_put_into_a_state_have_their_own_energy():
+    """What the state knew of the energy is that of the positions it had."""
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 3, 1)
+    moved = sampler.step(held, state, 0.1)
+    back = {"positions": state.positions, "velocities": state.velocities, "forces": None}
+    placed = sampler.step(held, replace(moved, **back), 0.1)
+    fresh = sampler.step(held, replace(moved, **back, thermostat=None), 0.1)
+    assert np.abs(moved.positions - state.positions).max() > 0.01
+    assert placed.thermostat[CHANGE] == fresh.thermostat[CHANGE]
+    assert Counts.of(placed).proposals == 2
+
+
+@pytest.mark.parametrize("value", ["1.0", None, 1.0 + 0j, np.ones(2), True])
+def test_a_potential_is_one_number(value):
+    held, state = started()
+    with pytest.raises(InputError, match="must return one real number") as caught:
+        HamiltonianMonteCarlo(0.5, 3, 1).step(System(held.motion, waves, potential=lambda x, t: value), state, 0.1)
+    assert caught.value.item == "potential"
 
 
 def test_a_step_of_zero_stands_still():
