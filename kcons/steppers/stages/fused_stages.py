@@ -3,7 +3,7 @@
 A call from Python to a kernel costs as much as the kernel's work on ten molecules of water or more. A stage - a kick,
 then flights that are each brought back onto the constraints - is therefore one call here, and so is the end of a step.
 The kernels are those of `Point` and of the engine, with all of their residual checks; what they cannot solve is left
-as it was for the engine, which has more means and names the row.
+as it was for the engine, which has more means and names the row. Their tables are those of `solvers.fused_distances`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 A step of a few molecules spends its time in calls from Python to kernels. The kick and the flight before the forces
 are therefore one call, and the two projections and the kick after them another. The kernels are those of the engine
-and of the closed form, with all of their checks; what they cannot do is left to these, as it was.
+and of the closed form, with all of their checks, on the tables of `solvers.fused_distances`; what they cannot do is
+left to these, as it was.
 """
 
 from __future__ import annotations
