@@ -5,6 +5,8 @@ processor has results of its own in the same folder, and several processes may u
 
 - Where the folder of kcons cannot be written to, Numba keeps results below the user's home; where that cannot be
   written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
+- A kernel is compiled anew when its own source has changed or that of any kernel it may call: Numba by itself looks at
+  its own file only, and what was kept would call others as they were.
 - Compiling that has taken a second is announced, once in a process, by the logger ``kcons`` (on standard error unless
   logging is set up otherwise).
 - Garbage is not collected while a kernel is compiled: almost nothing of what the compiler makes is garbage before it
@@ -15,12 +17,17 @@ processor has results of its own in the same folder, and several processes may u
 from __future__ import annotations
 
 import atexit
+import functools
 import gc
+import hashlib
 import logging
+import os
+import re
 import shutil
 import tempfile
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 from kcons.errors import UnsupportedError
@@ -30,7 +37,7 @@ _collected = gc.isenabled()
 gc.disable()
 try:
     import numba
-    from numba.core import event
+    from numba.core import caching, event
 finally:
     if _collected:
         gc.enable()
@@ -72,6 +79,56 @@ def plain_if_small(kernel: Any, size: int) -> Any:
         return kernel
     _in_python[kernel] = _in_python.get(kernel, 0) + size
     return kernel.py_func
+
+
+_PACKAGE = Path(__file__).parents[1]
+_IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+
+
+@functools.cache
+def _kernels_in(path: Path) -> tuple[bytes, frozenset[Path]]:
+    """The source of a module with kernels, and the files that it imports from; nothing for other modules."""
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    if not re.search("^(import|from) numba", text, re.MULTILINE):
+        return b"", frozenset()
+    files = set()
+    for module, names in _IMPORTS.findall(text):  # a name is a module of that package, or defined in that module
+        at = _PACKAGE.parent / module.replace(".", os.sep)
+        files |= {at.with_suffix(".py"), *(at / f"{name}.py" for name in re.findall(r"\w+", names))}
+    return text.encode(), frozenset(files)
+
+
+@functools.cache
+def kernel_sources(path: Path) -> tuple[frozenset[Path], str]:
+    """Files of a module with kernels and of those that it imports, or these again; and a digest of what is in them."""
+    found: dict[Path, bytes] = {}
+    left = [path]
+    while left:
+        file = left.pop()
+        source, imported = _kernels_in(file)
+        if source:
+            found[file] = source
+            left.extend(imported - found.keys())
+    digest = hashlib.sha256(b"".join(found[file] for file in sorted(found)))
+    return frozenset(found), digest.hexdigest()
+
+
+class _Locator:
+    """Numba keeps kernels of this package where it would, and they are fresh until one of their sources changes."""
+
+    @staticmethod
+    def from_function(function: Any, file: str) -> Any:
+        others = (kind.from_function(function, file) for kind in _locators if kind is not _Locator)
+        locator = next((one for one in others if one is not None), None)
+        if locator is not None and Path(file).is_relative_to(_PACKAGE):
+            sources, digest = kernel_sources(Path(file))
+            if len(sources) > 1:
+                locator.get_source_stamp = lambda: digest
+        return locator
+
+
+_locators: list[Any] = caching.CacheImpl._locator_classes
+_locators.insert(0, _Locator)
 
 
 def _nothing() -> None:

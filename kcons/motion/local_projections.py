@@ -12,9 +12,7 @@ from kcons.motion import failures
 from kcons.motion.restoring.nearest_point import FarStart, Rescuers, Work
 from kcons.plan.plan import Plan
 from kcons.solvers.cluster_solver import Request, go_on
-
-#: More Newton iterations than a time step of any use takes: the start was far off.
-MANY_ITERATIONS = 6
+from kcons.solvers.sparse.step_control import MANY_ITERATIONS
 
 
 class LocalProjections:

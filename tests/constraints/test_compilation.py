@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import logging
 import os
 import shutil
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import CodeType, ModuleType, SimpleNamespace
 
 import numba
 import numpy as np
@@ -32,6 +34,24 @@ assert np.allclose(y[1], [-0.1, 0, 0]), y
 stats = follow_parents.stats
 print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 """
+
+#: A kernel that calls another one, of another module: what it moves, and whether it was compiled.
+MOVES = """
+import numpy as np
+from kcons.thermostats.pressure.centre_moves import displacements
+d = np.zeros((2, 3))
+displacements(
+    np.array([[0.1, 0, 0], [2.9, 0, 0]]), np.array([0, 0]), np.array([0.5, 0.5]), np.ones((1, 3), dtype=bool),
+    np.array([1]), np.array([0]), np.array([3 * np.eye(3), np.eye(3) / 3]), 0.1 * np.eye(3), d,
+)
+print(abs(d[0, 0]).round(6), sum(displacements.stats.cache_misses.values()))
+"""
+PACKAGE = Path(kcons.__file__).parent
+
+
+def copy_of_the_package(folder: Path) -> Path:
+    copied = shutil.copytree(PACKAGE, folder / "kcons", ignore=shutil.ignore_patterns("__pycache__"))
+    return Path(copied)
 
 
 def started(code: str, **environment: str) -> subprocess.Popen[str]:
@@ -70,8 +90,7 @@ def test_processors_that_share_a_folder(tmp_path):
 
 def test_nothing_can_be_written_to(tmp_path):
     """Neither the package's folder nor the home: kernels are kept for one process, and that is said."""
-    package = tmp_path / "kcons"
-    shutil.copytree(Path(kcons.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    package = copy_of_the_package(tmp_path)
     for folder in [package, *(path for path in package.rglob("*") if path.is_dir())]:
         (folder / "__pycache__").touch()  # where a folder would have to be: this stops root, too
     nowhere = str(tmp_path / "kcons" / "__init__.py" / "home")
@@ -80,6 +99,56 @@ def test_nothing_can_be_written_to(tmp_path):
     assert out == "0 1"
     assert "Set NUMBA_CACHE_DIR to a folder of yours" in err
     assert not list(tmp_path.glob("kcons-*")), "the folder of the process is removed"
+
+
+def test_compiled_anew_when_a_kernel_that_it_calls_has_changed(tmp_path):
+    called = copy_of_the_package(tmp_path) / "constraints" / "periodic" / "one_piece.py"
+    given = {"PYTHONPATH": str(tmp_path)}
+    assert [ended(started(MOVES, **given))[0] for _ in range(2)] == ["0.0 1", "0.0 0"]
+    text = called.read_text()
+    called.write_text(text.replace("        if na != 0.0 or nb_ != 0.0 or nc != 0.0:", "        if False:"))
+    assert called.read_text() != text
+    assert ended(started(MOVES, **given))[0] == "0.15 1"  # the second atom is where it is stored
+
+
+def names_defined_by(source: Path) -> set[str]:
+    found = set()
+    for node in ast.parse(source.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif not isinstance(node, ast.Import | ast.ImportFrom):
+            found |= {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+    return found
+
+
+def names_in(code: CodeType) -> set[str]:
+    return set(code.co_names).union(*(names_in(part) for part in code.co_consts if isinstance(part, CodeType)))
+
+
+def test_all_that_kernels_take_from_other_modules_is_known():
+    """Functions and constants: each is defined in a module whose source the kernel is kept with."""
+    kernels = 0
+    for path in sorted(PACKAGE.rglob("*.py")):
+        sources, _ = compilation.kernel_sources(path)
+        if path not in sources:
+            continue
+        module = import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
+        defined = set().union(*(names_defined_by(source) for source in sources))
+        for made in vars(module).values():
+            function = getattr(made, "py_func", getattr(made, "_defn", None))
+            if function is None or function.__module__ != module.__name__:
+                continue
+            kernels += 1
+            for name in names_in(function.__code__) & function.__globals__.keys():
+                used = function.__globals__[name]
+                if isinstance(used, ModuleType):
+                    of_kcons = used.__name__.startswith("kcons.")
+                    assert not of_kcons or Path(str(used.__file__)) in sources, f"{module.__name__}: {name}"
+                elif not str(getattr(used, "__module__", "kcons.")).startswith(
+                    ("numba", "numpy", "llvmlite", "builtins")
+                ):
+                    assert name in defined, f"{module.__name__}.{function.__name__} takes {name} from elsewhere"
+    assert kernels > 150
 
 
 def test_without_compiling_there_is_a_word():

@@ -15,6 +15,8 @@ from kcons.solvers.sparse.elimination import FAST
 #: Newton stops at this relative error in relative coordinates (a few roundings).
 NEWTON_TOLERANCE = 4e-15
 MAX_ITERATIONS = 50
+#: More Newton iterations than a time step of any use takes: the start was far off.
+MANY_ITERATIONS = 6
 #: Halvings of one Newton step by the step control.
 MAX_HALVINGS = 30
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.motion.local_projections import MANY_ITERATIONS
 from kcons.motion.motion import Motion
 from kcons.solvers.called_solvers import CalledSolver
 from kcons.solvers.chains.open_chains import Chains
@@ -29,6 +28,7 @@ from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
 from kcons.solvers.sparse.row_functions import COUNT
+from kcons.solvers.sparse.step_control import MANY_ITERATIONS
 from kcons.steppers.stages.compensated_steps import (
     Point,
     add_kick,

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.motion.local_projections import MANY_ITERATIONS
 from kcons.solvers.fused_distances import MORE, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import integers, piece
+from kcons.solvers.sparse.step_control import MANY_ITERATIONS
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import all_finite
 from kcons.steppers.stages.fused_stages import PackedRows, Tables, packed_rows
