@@ -107,7 +107,7 @@ def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> Converg
     with np.errstate(all="ignore"):
         miss = np.abs(held.value(x, time))
         # Rows between fixed atoms are as good as the places given.
-        allowed = np.maximum(held.tolerance(x, time), np.where(plan.labels < 0, 1e-10 * held.scale, 0.0))
+        allowed = np.maximum(4 * held.tolerance(x, time), np.where(plan.labels < 0, 1e-10 * held.scale, 0.0))
     bad = ~(miss <= allowed)
     if not bad.any():
         return None

@@ -251,6 +251,26 @@ def test_without_bonds_the_nearest_point_as_asked() -> None:
     assert set(np.flatnonzero(away > 1e-12).tolist()) == {0, 1}
 
 
+def test_what_rounding_leaves_is_no_reason_to_look_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows that depend on each other, and far images: residuals of some roundings, in the point that is nearest."""
+    ring = molecule("C6H6")
+    motion = engine(ring, [held.Distance([[0, 1]])])
+    left = 3 * float(motion.constraint_set.tolerance(ring.positions)[0])
+    seen = []
+    honest = type(motion.constraint_set).value
+
+    def rounded(rows: ConstraintSet, x: np.ndarray, time: float = 0.0) -> np.ndarray:
+        seen.append(x)
+        return honest(rows, x, time) + left
+
+    monkeypatch.setattr(ConstraintSet, "value", rounded)
+    x = motion.restore_positions(ring.positions, bonds=[])
+    assert seen and abs(x - ring.positions).max() < 1e-13
+    left *= 10
+    with pytest.raises(InfeasibleError, match="miss row"):
+        motion.restore_positions(ring.positions, bonds=[])
+
+
 @pytest.mark.parametrize(
     "bonds",
     [[[0, 9]], [[0, 0]], [[-1, 2]], [[0.5, 1]], [[0, 1, 2]]],
