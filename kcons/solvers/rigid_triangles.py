@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.solvers.distance_clusters import EightAtATime
+from kcons.solvers.kernels.array_views import at_first
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -46,6 +47,88 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 """Order of the three rows of a triangle, in local atoms."""
 
 
+# Spliced into the loop as they stand: what is compiled apart is rounded otherwise, and takes longer.
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _small(e0, e1, e2, l0, l1, l2, factor):
+    return all_within(e0, l0 * factor) and all_within(e1, l1 * factor) and all_within(e2, l2 * factor)
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _length_errors(l0, l1, l2, px, py, pz, qx, qy, qz):
+    ux, uy, uz = qx - px, qy - py, qz - pz
+    e0, e1 = l0 - dot(px, py, pz, px, py, pz), l1 - dot(qx, qy, qz, qx, qy, qz)
+    return e0, e1, l2 - dot(ux, uy, uz, ux, uy, uz)
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _products(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz):
+    """Of the three bonds with their references."""
+    us = dot(qx - px, qy - py, qz - pz, tx - sx, ty - sy, tz - sz)
+    return dot(px, py, pz, sx, sy, sz), dot(qx, qy, qz, tx, ty, tz), us
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _tangent_factor(l0, l1, l2, st, w0, w1, w2, w01, w02, w12):
+    """Rows of the adjugate of the matrix for velocities, and what scales it."""
+    a00, a01, a02 = w01 * l0, w0 * st, w1 * (l0 - st)
+    a11, a12, a22 = w02 * l1, w2 * (l1 - st), w12 * l2
+    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+    c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
+    return c00, c01, c02, c01, c11, c12, c02, c12, c22, 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _position_factor(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz, w0, w1, w2, w01, w02, w12):
+    """The same of Newton's matrix for positions."""
+    ps, pt = dot(px, py, pz, sx, sy, sz), dot(px, py, pz, tx, ty, tz)
+    qs, qt = dot(qx, qy, qz, sx, sy, sz), dot(qx, qy, qz, tx, ty, tz)
+    us, ut = qs - ps, qt - pt
+    a00, a01, a02 = w01 * ps, w0 * pt, w1 * (ps - pt)
+    a10, a11, a12 = w0 * qs, w02 * qt, w2 * (qt - qs)
+    a20, a21, a22 = w1 * us, w2 * ut, w12 * (ut - us)
+    c00, c01, c02 = a11 * a22 - a12 * a21, a02 * a21 - a01 * a22, a01 * a12 - a02 * a11
+    c10, c11, c12 = -(a12 * a20 + a10 * a22), a00 * a22 + a02 * a20, a02 * a10 - a00 * a12
+    c20, c21, c22 = a10 * a21 + a11 * a20, -(a01 * a20 + a00 * a21), a00 * a11 - a01 * a10
+    return c00, c01, c02, c10, c11, c12, c20, c21, c22, 0.5 / (a00 * c00 + a01 * c10 + a02 * c20)
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _product(c00, c01, c02, c10, c11, c12, c20, c21, c22, f0, f1, f2):
+    d0 = c00 * f0 + c01 * f1 + c02 * f2
+    d1 = c10 * f0 + c11 * f1 + c12 * f2
+    d2 = c20 * f0 + c21 * f1 + c22 * f2
+    return d0, d1, d2
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _pulled(px, py, pz, f, g, sx, sy, sz, tx, ty, tz):
+    return px + f * sx + g * tx, py + f * sy + g * ty, pz + f * sz + g * tz
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _move(points, velocities, inverse_dt, atoms, at, k, ax, ay, az, f, g, sx, sy, sz, tx, ty, tz, move, undo, saved):
+    """Move corner k of each triangle from a by f s + g t, and change its velocity."""
+    corner = at + k * WIDTH
+    x, y, z = f * sx + g * tx, f * sy + g * ty, f * sz + g * tz
+    scatter_points(points, atoms, corner, ax + x, ay + y, az + z)
+    if move:
+        ax, ay, az = keep_points(velocities, atoms, corner, undo, saved + (3 + k) * SAVED)
+        x, y, z = ax + x * inverse_dt, ay + y * inverse_dt, az + z * inverse_dt
+        scatter_points(velocities, atoms, corner, x, y, z)
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _report(multipliers, slots, place, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz):
+    """Multipliers of unit gradients."""
+    ux, uy, uz = tx - sx, ty - sy, tz - sz
+    m0 = sign * m0 * square_root(dot(sx, sy, sz, sx, sy, sz))
+    m1 = sign * m1 * square_root(dot(tx, ty, tz, tx, ty, tz))
+    m2 = sign * m2 * square_root(dot(ux, uy, uz, ux, uy, uz))
+    scatter_points(multipliers, slots, place, m0, m1, m2)
+
+
 @njit(cache=True, fastmath=FASTMATH)
 def project_triangles(
     points, references, velocities, inverse_dt, tangent, atoms, slots, inv_mass, given, lattice, kind, multipliers, undo
@@ -56,23 +139,22 @@ def project_triangles(
     they are velocities, to be brought to these rates: a kernel is compiled for each.
     """
     move, report, driven = velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
+    n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
+    # Arrays that are handed on inside the loop would cost reference counting.
+    changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
     w0, w1, w2 = inv_mass[0], inv_mass[1], inv_mass[2]
     w01, w02, w12 = w0 + w1, w0 + w2, w1 + w2
-    cell = lattice_numbers(lattice)
-    errors, sizes = np.empty(3 * WIDTH), np.empty(3 * WIDTH)
-    worst, worst_at, most = 0.0, -1, 0
-    # Points kept of a triangle, and what residuals are counted in.
-    kept_points, unit = (6, 2.0) if tangent is None else (3, 1.0)
-    for group in range(slots.shape[0] // WIDTH):
-        at = group * 3 * WIDTH
-        bt, ct = at + WIDTH, at + 2 * WIDTH
+    errors, sizes, worst, worst_at, most = np.empty(3 * WIDTH), np.empty(3 * WIDTH), 0.0, -1, 0
+    # Points kept of a triangle, what residuals are counted in, and the sign of multipliers.
+    kept_points, unit, sign = (6, 2.0, 1.0) if tangent is None else (3, 1.0, -1.0)
+    for group in range(n_groups):
+        at, saved = group * 3 * WIDTH, kept_points * group * SAVED
         # Reference bonds s, t; present bonds p, q; from atom 0 to 1 and to 2.
-        sx, sy, sz = gather_differences(references, atoms, at, bt)
-        tx, ty, tz = gather_differences(references, atoms, at, ct)
-        saved = kept_points * group * SAVED
+        sx, sy, sz = gather_differences(references, atoms, at, at + WIDTH)
+        tx, ty, tz = gather_differences(references, atoms, at, at + 2 * WIDTH)
         ax, ay, az = keep_points(points, atoms, at, undo, saved)
-        bx, by, bz = keep_points(points, atoms, bt, undo, saved + SAVED)
-        cx, cy, cz = keep_points(points, atoms, ct, undo, saved + 2 * SAVED)
+        bx, by, bz = keep_points(points, atoms, at + WIDTH, undo, saved + SAVED)
+        cx, cy, cz = keep_points(points, atoms, at + 2 * WIDTH, undo, saved + 2 * SAVED)
         px, py, pz = ax - bx, ay - by, az - bz
         qx, qy, qz = ax - cx, ay - cy, az - cz
         if kind != OPEN:
@@ -81,91 +163,54 @@ def project_triangles(
             if tangent is None:
                 px, py, pz = minimum_image(px, py, pz, cell, kind)
                 qx, qy, qz = minimum_image(qx, qy, qz, cell, kind)
-        m0 = m1 = m2 = r0 = r1 = r2 = splat(0.0)
-        c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = scale = m0
+        m0 = m1 = m2 = r0 = r1 = r2 = c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = scale = splat(0.0)
         # l: what the errors of the three rows are compared with.
         if tangent is None:
             l0, l1, l2 = gather_points(given, slots, group * WIDTH)
             l0, l1, l2 = l0 * l0, l1 * l1, l2 * l2
         else:
-            vx, vy, vz = tx - sx, ty - sy, tz - sz
-            l0, st = dot(sx, sy, sz, sx, sy, sz), dot(sx, sy, sz, tx, ty, tz)
-            l1, l2 = dot(tx, ty, tz, tx, ty, tz), dot(vx, vy, vz, vx, vy, vz)
+            l0, l1, l2 = _products(sx, sy, sz, tx, ty, tz, sx, sy, sz, tx, ty, tz)
+            st = dot(sx, sy, sz, tx, ty, tz)
             size = dot(px, py, pz, px, py, pz) + dot(qx, qy, qz, qx, qy, qz)
             if driven:
                 r0, r1, r2 = gather_points(given, slots, group * WIDTH)
                 size = size + (r0 * r0 + r1 * r1 + r2 * r2)
                 r0, r1, r2 = r0 * square_root(l0), r1 * square_root(l1), r2 * square_root(l2)
             size = size * (TANGENT_TOLERANCE * TANGENT_TOLERANCE)
-            a00, a01, a02 = w01 * l0, w0 * st, w1 * (l0 - st)
-            a11, a12, a22 = w02 * l1, w2 * (l1 - st), w12 * l2
-            c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
-            c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
-            c10, c20, c21 = c01, c02, c12
-            scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
-        iteration = 0
-        ok = False
+            factor = _tangent_factor(l0, l1, l2, st, w0, w1, w2, w01, w02, w12)
+            c00, c01, c02, c10, c11, c12, c20, c21, c22, scale = factor
+        iteration, ok = 0, False
         while True:
-            ux, uy, uz = qx - px, qy - py, qz - pz
             if tangent is None:
-                e0 = l0 - dot(px, py, pz, px, py, pz)
-                e1 = l1 - dot(qx, qy, qz, qx, qy, qz)
-                e2 = l2 - dot(ux, uy, uz, ux, uy, uz)
+                e0, e1, e2 = _length_errors(l0, l1, l2, px, py, pz, qx, qy, qz)
                 if iteration >= 3:
-                    ok = (
-                        all_within(absolute(e0), l0 * (2.0 * POSITION_TOLERANCE))
-                        and all_within(absolute(e1), l1 * (2.0 * POSITION_TOLERANCE))
-                        and all_within(absolute(e2), l2 * (2.0 * POSITION_TOLERANCE))
-                    )
+                    ok = _small(absolute(e0), absolute(e1), absolute(e2), l0, l1, l2, 2.0 * POSITION_TOLERANCE)
                     if ok or iteration == MAX_ITERATIONS:
                         break
                 # A factor serves two steps: Newton, then chord; order three for both.
                 if iteration % 2 == 0:
-                    ps, pt = dot(px, py, pz, sx, sy, sz), dot(px, py, pz, tx, ty, tz)
-                    qs, qt = dot(qx, qy, qz, sx, sy, sz), dot(qx, qy, qz, tx, ty, tz)
-                    us, ut = qs - ps, qt - pt
-                    a00, a01, a02 = w01 * ps, w0 * pt, w1 * (ps - pt)
-                    a10, a11, a12 = w0 * qs, w02 * qt, w2 * (qt - qs)
-                    a20, a21, a22 = w1 * us, w2 * ut, w12 * (ut - us)
-                    c00, c01, c02 = a11 * a22 - a12 * a21, a02 * a21 - a01 * a22, a01 * a12 - a02 * a11
-                    c10, c11, c12 = -(a12 * a20 + a10 * a22), a00 * a22 + a02 * a20, a02 * a10 - a00 * a12
-                    c20, c21, c22 = a10 * a21 + a11 * a20, -(a01 * a20 + a00 * a21), a00 * a11 - a01 * a10
-                    scale = 0.5 / (a00 * c00 + a01 * c10 + a02 * c20)
+                    factor = _position_factor(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz, w0, w1, w2, w01, w02, w12)
+                    c00, c01, c02, c10, c11, c12, c20, c21, c22, scale = factor
             else:
-                e0, e1 = r0 - dot(px, py, pz, sx, sy, sz), r1 - dot(qx, qy, qz, tx, ty, tz)
-                e2 = r2 - dot(ux, uy, uz, vx, vy, vz)
+                ps, qt, us = _products(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz)
+                e0, e1, e2 = r0 - ps, r1 - qt, r2 - us
                 if iteration > 0:
-                    ok = (
-                        all_within(e0 * e0, size * l0)
-                        and all_within(e1 * e1, size * l1)
-                        and all_within(e2 * e2, size * l2)
-                    )
+                    ok = _small(e0 * e0, e1 * e1, e2 * e2, l0, l1, l2, size)
                     if ok or iteration == MAX_ITERATIONS:
                         break
-            f0, f1, f2 = e0 * scale, e1 * scale, e2 * scale
-            d0 = c00 * f0 + c01 * f1 + c02 * f2
-            d1 = c10 * f0 + c11 * f1 + c12 * f2
-            d2 = c20 * f0 + c21 * f1 + c22 * f2
+            d0, d1, d2 = _product(c00, c01, c02, c10, c11, c12, c20, c21, c22, e0 * scale, e1 * scale, e2 * scale)
             m0, m1, m2 = m0 + d0, m1 + d1, m2 + d2
-            f, g = w01 * d0 + w1 * d2, w0 * d1 - w1 * d2
-            px, py, pz = px + f * sx + g * tx, py + f * sy + g * ty, pz + f * sz + g * tz
-            f, g = w0 * d0 - w2 * d2, w02 * d1 + w2 * d2
-            qx, qy, qz = qx + f * sx + g * tx, qy + f * sy + g * ty, qz + f * sz + g * tz
+            px, py, pz = _pulled(px, py, pz, w01 * d0 + w1 * d2, w0 * d1 - w1 * d2, sx, sy, sz, tx, ty, tz)
+            qx, qy, qz = _pulled(qx, qy, qz, w0 * d0 - w2 * d2, w02 * d1 + w2 * d2, sx, sy, sz, tx, ty, tz)
             iteration += 1
         if tangent is None:
             # A bond that turned round has found the wrong root.
-            ps, qt = dot(px, py, pz, sx, sy, sz), dot(qx, qy, qz, tx, ty, tz)
-            us = dot(ux, uy, uz, tx - sx, ty - sy, tz - sz)
+            ps, qt, us = _products(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz)
             e0, e1, e2 = absolute(e0), absolute(e1), absolute(e2)
         else:
-            ps, qt, us = l0, l1, l2
-            e0, e1, e2 = e0 * e0, e1 * e1, e2 * e2
-        kept = all_within(TINY, ps) and all_within(TINY, qt) and all_within(TINY, us)
-        most = max(most, iteration)
-        bound = unit * worst
-        if not (
-            ok and kept and all_within(e0, l0 * bound) and all_within(e1, l1 * bound) and all_within(e2, l2 * bound)
-        ):
+            ps, qt, us, e0, e1, e2 = l0, l1, l2, e0 * e0, e1 * e1, e2 * e2
+        most, kept = max(most, iteration), all_within(TINY, ps) and all_within(TINY, qt) and all_within(TINY, us)
+        if not (ok and kept and _small(e0, e1, e2, l0, l1, l2, unit * worst)):
             store_triple(errors, 0, e0, e1, e2)
             store_triple(sizes, 0, unit * l0, unit * l1, unit * l2)
             if ok and not kept:
@@ -178,37 +223,12 @@ def project_triangles(
                 if move:
                     restore_points(velocities, atoms, undo, group, 3, kept_points, 3)
                 return False, worst if tangent is None else np.sqrt(worst), most, worst_at
-        f, g = w0 * m0, w0 * m1
-        x, y, z = f * sx + g * tx, f * sy + g * ty, f * sz + g * tz
-        scatter_points(points, atoms, at, ax + x, ay + y, az + z)
-        if tangent is None and move:
-            ax, ay, az = keep_points(velocities, atoms, at, undo, saved + 3 * SAVED)
-            x, y, z = ax + x * inverse_dt, ay + y * inverse_dt, az + z * inverse_dt
-            scatter_points(velocities, atoms, at, x, y, z)
-        f, g = -w1 * (m0 + m2), w1 * m2
-        x, y, z = f * sx + g * tx, f * sy + g * ty, f * sz + g * tz
-        scatter_points(points, atoms, bt, bx + x, by + y, bz + z)
-        if tangent is None and move:
-            bx, by, bz = keep_points(velocities, atoms, bt, undo, saved + 4 * SAVED)
-            x, y, z = bx + x * inverse_dt, by + y * inverse_dt, bz + z * inverse_dt
-            scatter_points(velocities, atoms, bt, x, y, z)
-        f, g = w2 * m2, -w2 * (m1 + m2)
-        x, y, z = f * sx + g * tx, f * sy + g * ty, f * sz + g * tz
-        scatter_points(points, atoms, ct, cx + x, cy + y, cz + z)
-        if tangent is None and move:
-            cx, cy, cz = keep_points(velocities, atoms, ct, undo, saved + 5 * SAVED)
-            x, y, z = cx + x * inverse_dt, cy + y * inverse_dt, cz + z * inverse_dt
-            scatter_points(velocities, atoms, ct, x, y, z)
+        f0, g0, f1, g1, f2, g2 = w0 * m0, w0 * m1, -w1 * (m0 + m2), w1 * m2, w2 * m2, -w2 * (m1 + m2)
+        _move(changed, moving, inverse_dt, table, at, 0, ax, ay, az, f0, g0, sx, sy, sz, tx, ty, tz, move, room, saved)
+        _move(changed, moving, inverse_dt, table, at, 1, bx, by, bz, f1, g1, sx, sy, sz, tx, ty, tz, move, room, saved)
+        _move(changed, moving, inverse_dt, table, at, 2, cx, cy, cz, f2, g2, sx, sy, sz, tx, ty, tz, move, room, saved)
         if report:
-            ux, uy, uz = tx - sx, ty - sy, tz - sz
-            if tangent is not None:
-                m0, m1, m2 = -m0, -m1, -m2
-            scatter_points(
-                multipliers, slots, group * WIDTH,
-                m0 * square_root(dot(sx, sy, sz, sx, sy, sz)),
-                m1 * square_root(dot(tx, ty, tz, tx, ty, tz)),
-                m2 * square_root(dot(ux, uy, uz, ux, uy, uz)),
-            )  # fmt: skip
+            _report(at_first(multipliers), at_first(slots), group * WIDTH, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz)
     return True, worst if tangent is None else np.sqrt(worst), most, worst_at
 
 
