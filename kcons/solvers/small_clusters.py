@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.solvers.distance_clusters import EightAtATime
 from kcons.solvers.kernels import groups_of_eight as groups
+from kcons.solvers.kernels.array_views import at_first
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -101,6 +102,102 @@ def _move(bonds, directions, step, coupling, n):
         _set_point(bonds, k, x, y, z)
 
 
+@njit(fastmath=FASTMATH, forceinline=True)
+def _spread(shifts, ends, bonds, total, n, n_local):
+    """What the multipliers `total` along the bonds do to each point, over its inverse mass."""
+    for a in range(n_local):
+        _set_point(shifts, a, splat(0.0), splat(0.0), splat(0.0))
+    for k in range(n):
+        x, y, z = _point(bonds, k)
+        f = peek(total, k)
+        x, y, z = f * x, f * y, f * z
+        i, j = ends[2 * k], ends[2 * k + 1]
+        a, b, c = _point(shifts, i)
+        _set_point(shifts, i, a + x, b + y, c + z)
+        a, b, c = _point(shifts, j)
+        _set_point(shifts, j, a - x, b - y, c - z)
+
+
+@njit(fastmath=FASTMATH, forceinline=True)
+def _move_points(points, velocities, inverse_dt, atoms, at, weights, shifts, n_local, move, undo, saved):
+    """Move the points of eight clusters, and change their velocities; what was there is kept."""
+    for a in range(n_local):
+        w, i = weights[a], at + a * WIDTH
+        dx, dy, dz = _point(shifts, a)
+        dx, dy, dz = w * dx, w * dy, w * dz
+        x, y, z = keep_points(points, atoms, i, undo, saved + a * groups.SAVED)
+        scatter_points(points, atoms, i, x + dx, y + dy, z + dz)
+        if move:
+            x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * groups.SAVED)
+            x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
+            scatter_points(velocities, atoms, i, x, y, z)
+
+
+@njit(fastmath=FASTMATH, forceinline=True)
+def _report(multipliers, slots, place, sign, bonds, total, n):
+    """Multipliers of unit gradients."""
+    for k in range(n):
+        x, y, z = _point(bonds, k)
+        f = peek(total, k) * square_root(groups.dot(x, y, z, x, y, z))
+        scatter(multipliers, slots, place, k, sign * f)
+
+
+# These two are spliced into the loop as they stand: compiled apart, they are rounded otherwise, or slower.
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _begin(
+    points, references, atoms, at, ends, goal, slots, place, cell, kind, tangent, driven, s, r, squares, wanted, sums, n
+):  # fmt: skip
+    """Bonds, and what is wanted of them; returns what relative velocities are compared with, squared."""
+    size = splat(0.0)
+    for k in range(n):
+        i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
+        x, y, z = gather_differences(references, atoms, i, j)
+        a, b, c = gather_differences(points, atoms, i, j)
+        if kind != groups.OPEN:
+            x, y, z = groups.minimum_image(x, y, z, cell, kind)
+            if tangent is None:
+                a, b, c = groups.minimum_image(a, b, c, cell, kind)
+        _set_point(s, k, x, y, z)
+        _set_point(r, k, a, b, c)
+        poke(sums, k, splat(0.0))
+        if tangent is None:
+            length = gather(goal, slots, place, k)
+            poke(squares, k, length * length)
+        else:
+            square = groups.dot(x, y, z, x, y, z)
+            poke(squares, k, square)
+            size = size + groups.dot(a, b, c, a, b, c)
+            rate = splat(0.0)
+            if driven:
+                rate = gather(goal, slots, place, k)
+                size = size + rate * rate
+                rate = rate * square_root(square)
+            poke(wanted, k, rate)
+    return size
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _judge(error, step, squares, bonds, references, tangent, limit, n):
+    """Whether no bond has turned round, and whether no error is above `limit`; sizes of errors, and the products."""
+    kept, better = True, True
+    for k in range(n):
+        e, inner = peek(error, k), peek(squares, k)
+        if tangent is None:
+            # A bond that turned round has found the wrong root.
+            x, y, z = _point(bonds, k)
+            a, b, c = _point(references, k)
+            e, inner = absolute(e), groups.dot(x, y, z, a, b, c)
+        else:
+            e = e * e
+        poke(error, k, e)
+        poke(step, k, inner)
+        kept = kept and all_within(groups.TINY, inner)
+        better = better and all_within(e, peek(squares, k) * limit)
+    return kept, better
+
+
 @functools.cache
 def _kernel(n_rows: int) -> Any:
     """The kernel for clusters of `n_rows` rows; the closed-over number unrolls its loops."""
@@ -115,8 +212,12 @@ def _kernel(n_rows: int) -> Any:
         """Project one group of eight clusters after another; `tangent` as in `project_triangles`."""
         move, report, driven = velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]
-        # Points kept of a cluster, and what residuals are counted in.
-        kept_points, unit = (2 * n_local, 2.0) if tangent is None else (n_local, 1.0)
+        # Arrays that are handed on inside the loop would cost reference counting.
+        changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
+        origins, goals, firsts = at_first(references), at_first(given), at_first(slots)
+        row_ends, heavy = at_first(ends), at_first(weights)
+        # Points kept of a cluster, what residuals are counted in, and the sign of multipliers.
+        kept_points, unit, sign = (2 * n_local, 2.0, 1.0) if tangent is None else (n_local, 1.0, -1.0)
         cell = groups.lattice_numbers(lattice)
         errors, sizes = np.empty(n * WIDTH), np.empty(n * WIDTH)
         # Reference bonds s, present bonds r; what is wanted of these, and what errors are compared with.
@@ -129,31 +230,10 @@ def _kernel(n_rows: int) -> Any:
         worst, worst_at, most = 0.0, -1, 0
         for group in range(slots.shape[0] // WIDTH):
             at = group * n_local * WIDTH
-            size = splat(0.0)
-            for k in range(n):
-                i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
-                x, y, z = gather_differences(references, atoms, i, j)
-                a, b, c = gather_differences(points, atoms, i, j)
-                if kind != groups.OPEN:
-                    x, y, z = groups.minimum_image(x, y, z, cell, kind)
-                    if tangent is None:
-                        a, b, c = groups.minimum_image(a, b, c, cell, kind)
-                _set_point(s, k, x, y, z)
-                _set_point(r, k, a, b, c)
-                poke(total, k, splat(0.0))
-                if tangent is None:
-                    length = gather(given, slots, group * WIDTH, k)
-                    poke(squares, k, length * length)
-                else:
-                    square = groups.dot(x, y, z, x, y, z)
-                    poke(squares, k, square)
-                    size = size + groups.dot(a, b, c, a, b, c)
-                    rate = splat(0.0)
-                    if driven:
-                        rate = gather(given, slots, group * WIDTH, k)
-                        size = size + rate * rate
-                        rate = rate * square_root(square)
-                    poke(wanted, k, rate)
+            size = _begin(
+                changed, origins, table, at, row_ends, goals, firsts, group * WIDTH, cell, kind, tangent, driven,
+                s, r, squares, wanted, total, n,
+            )  # fmt: skip
             if tangent is not None:
                 size = size * (groups.TANGENT_TOLERANCE * groups.TANGENT_TOLERANCE)
                 _gram(matrix, s, s, coupling, n)
@@ -186,20 +266,7 @@ def _kernel(n_rows: int) -> Any:
                     poke(total, k, peek(total, k) + peek(step, k))
                 iteration += 1
             most = max(most, iteration)
-            kept, better = True, True
-            for k in range(n):
-                e, inner = peek(error, k), peek(squares, k)
-                if tangent is None:
-                    # A bond that turned round has found the wrong root.
-                    x, y, z = _point(r, k)
-                    a, b, c = _point(s, k)
-                    e, inner = absolute(e), groups.dot(x, y, z, a, b, c)
-                else:
-                    e = e * e
-                poke(error, k, e)
-                poke(step, k, inner)
-                kept = kept and all_within(groups.TINY, inner)
-                better = better and all_within(e, peek(squares, k) * (unit * worst))
+            kept, better = _judge(error, step, squares, r, s, tangent, unit * worst, n)
             if not (ok and kept and better):
                 for k in range(n):
                     store(errors, k * WIDTH, peek(error, k))
@@ -214,31 +281,11 @@ def _kernel(n_rows: int) -> Any:
                     if move:
                         groups.restore_points(velocities, atoms, undo, group, n_local, kept_points, n_local)
                     return False, worst if tangent is None else np.sqrt(worst), most, worst_at
-            for a in range(n_local):
-                _set_point(shifts, a, splat(0.0), splat(0.0), splat(0.0))
-            for k in range(n):
-                x, y, z = _point(s, k)
-                f = peek(total, k)
-                if report:
-                    g = f * square_root(groups.dot(x, y, z, x, y, z))
-                    scatter(multipliers, slots, group * WIDTH, k, g if tangent is None else -g)
-                x, y, z = f * x, f * y, f * z
-                i, j = ends[2 * k], ends[2 * k + 1]
-                a, b, c = _point(shifts, i)
-                _set_point(shifts, i, a + x, b + y, c + z)
-                a, b, c = _point(shifts, j)
-                _set_point(shifts, j, a - x, b - y, c - z)
+            _spread(shifts, row_ends, s, total, n, n_local)
             saved = kept_points * group * groups.SAVED
-            for a in range(n_local):
-                w, i = weights[a], at + a * WIDTH
-                dx, dy, dz = _point(shifts, a)
-                dx, dy, dz = w * dx, w * dy, w * dz
-                x, y, z = keep_points(points, atoms, i, undo, saved + a * groups.SAVED)
-                scatter_points(points, atoms, i, x + dx, y + dy, z + dz)
-                if tangent is None and move:
-                    x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * groups.SAVED)
-                    x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
-                    scatter_points(velocities, atoms, i, x, y, z)
+            _move_points(changed, moving, inverse_dt, table, at, heavy, shifts, n_local, move, room, saved)
+            if report:
+                _report(at_first(multipliers), firsts, group * WIDTH, sign, s, total, n)
         return True, worst if tangent is None else np.sqrt(worst), most, worst_at
 
     return project
