@@ -138,7 +138,7 @@ def project_triangles(
     `tangent` is None where `points` are positions, to be brought to the lengths `given`, and anything else where
     they are velocities, to be brought to these rates: a kernel is compiled for each.
     """
-    move, report, driven = velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
+    move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
     n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
     # Arrays that are handed on inside the loop would cost reference counting.
     changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)

@@ -210,7 +210,7 @@ def _kernel(n_rows: int) -> Any:
         given, lattice, kind, multipliers, undo,
     ):  # fmt: skip
         """Project one group of eight clusters after another; `tangent` as in `project_triangles`."""
-        move, report, driven = velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
+        move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]
         # Arrays that are handed on inside the loop would cost reference counting.
         changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
