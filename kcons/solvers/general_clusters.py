@@ -18,6 +18,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
+from kcons.solvers.sparse.step_control import ROUNDINGS
 
 MAX_ITERATIONS = 50
 #: |A v - c| allowed after a projection, relative to the speeds of the cluster (unit rows).
@@ -212,7 +213,8 @@ class GeneralClusters:
             data = self._data(state, time, flight)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = _each(relative <= self._rounding(batch, data, state))
+            rounding = self._rounding(batch, data, state)
+            settled = _each(relative <= rounding)
             done |= settled & (polished | (error == 0.0))
             if done.all():
                 turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
@@ -244,7 +246,10 @@ class GeneralClusters:
                 factor = np.where(worse, np.where(settled, 0.0, 0.5 * factor), factor)
             else:
                 flat[batch.columns] = here
-                return _failed(batch, held & worse[:, None], iteration, relative)
+                if not (relative <= ROUNDINGS * np.sqrt(relative.shape[1]) * rounding)[worse].all():
+                    return _failed(batch, held & worse[:, None], iteration, relative)
+                done |= worse
+                continue
             polished |= settled
             along += factor[:, None] * step
             flat_moves[batch.columns] += factor[:, None] * shift
@@ -279,7 +284,7 @@ class GeneralClusters:
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = _each(relative <= self._rounding(batch, data, state))
+            settled = _each(relative <= ROUNDINGS * self._rounding(batch, data, state))
             if settled.all():
                 where = np.unravel_index(int(np.argmax(relative)), relative.shape)
                 return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))

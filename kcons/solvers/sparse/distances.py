@@ -315,13 +315,15 @@ def solve_positions(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def _resolved(first, last, state, lengths, places, links):  # type: ignore[no-untyped-def]
-    """Whether each |sigma| is within max(1e-14 d, 2 eps (|x_i| + |x_j|))."""
+    """Whether each |sigma| is max(1e-14 d, 2 eps (|x_i| + |x_j|)) or so, see `step_control.ROUNDINGS`."""
+    room = step_control.ROUNDINGS * np.sqrt(last - first)
     for k in range(first, last):
         reach = 0.0
         for side in range(2):
             a = 4 * np.int64(links[4 * k + 2 + side])
             reach += np.sqrt(places[a] ** 2 + places[a + 1] ** 2 + places[a + 2] ** 2)
-        if not (abs(state[8 * k + 7]) / lengths[k] <= max(1e-14 * lengths[k], 2 * _EPS * reach)):
+        rounding = max(1e-14 * lengths[k], 2 * _EPS * reach)
+        if not (abs(state[8 * k + 7]) / lengths[k] <= room * rounding):
             return False
     return True
 

@@ -15,6 +15,9 @@ from kcons.solvers.sparse.elimination import FAST
 #: Newton stops at this relative error in relative coordinates (a few roundings).
 NEWTON_TOLERANCE = 4e-15
 MAX_ITERATIONS = 50
+#: Roundings of its positions that a row may be left with where Newton's method gains no more, for a cluster of one row;
+#: they add up like errors at random. Rows that depend on each other miss each other's targets by them.
+ROUNDINGS = 4.0
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
 #: Halvings of one Newton step by the step control.
@@ -31,6 +34,12 @@ def overshot(careful, iteration, error, total, best):  # type: ignore[no-untyped
 def hopeless(iteration, error, previous):  # type: ignore[no-untyped-def]
     """Whether Newton runs away, or has had its time."""
     return iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0)
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def stalled(iteration, error, previous, excess, n_rows):  # type: ignore[no-untyped-def]
+    """Whether nothing is to be gained, where the largest residual is `excess` roundings."""
+    return iteration > 4 and error > 0.1 * previous and excess * excess <= ROUNDINGS * ROUNDINGS * n_rows
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")

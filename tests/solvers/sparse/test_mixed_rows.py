@@ -146,3 +146,22 @@ def test_dependent_rows_are_dropped():
     rows = given.jacobian(x).toarray() / np.sqrt(np.repeat(masses, 3))
     s = np.linalg.svd(rows / np.linalg.norm(rows, axis=1)[:, None], compute_uv=False)
     assert np.abs(given.jacobian(x) @ y.ravel()).max() <= 1e-14 * s[0] / s[3 * n - 1]
+
+
+@pytest.mark.parametrize(("apart", "converged"), [(0.0, True), (3e-14, True), (1e-12, False)])
+def test_dependent_rows_may_miss_by_some_roundings(apart, converged):
+    """The last of three rows of one angle wants another value by this much; more than the sum of roundings fails."""
+    x = np.array([[1.0, 0.1, 0.0], [0.0, 0.0, 0.0], [0.2, 0.9, 0.3]])
+    angle = Angle([[0, 1, 2]])
+    target = float(ConstraintSet(angle, x, np.ones(3)).target(0.0)[0])
+    rows = [Distance([[0, 1]]), Angle([[0, 1, 2]], target), Angle([[2, 1, 0]], target * (1 + apart))]
+    whole = ConstraintSet(rows, x, np.ones(3))
+    late = np.array([False, False, True])
+    moved = x + 0.01 * np.random.default_rng(0).normal(size=x.shape)
+    before = moved.copy()
+    outcome = SparseRows(whole, np.arange(3), np.ones(3), late).positions(Request(moved, x))
+    assert outcome.converged == converged
+    if converged:
+        assert np.all(np.abs(whole.value(moved)) <= 4 * np.sqrt(3) * whole.tolerance(moved))
+    else:
+        np.testing.assert_array_equal(moved, before)
