@@ -75,6 +75,14 @@ class Images:
         cells = np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - np.round(step @ lattice[1])
         return cells @ lattice[0]
 
+    def bodies(self) -> IntArray:
+        """For each atom the first of those that constant distances tie it to."""
+        first = np.arange(int(self.atoms.max(initial=-1)) + 1)
+        for atom, parent, loose in zip(self.atoms, self.parents, self.loose, strict=True):
+            if loose < 0:
+                first[atom] = first[parent]
+        return first
+
     def reached_half(self, y: FloatArray, lattice: FloatArray) -> int:
         """A loose link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
         links = np.flatnonzero(self.loose >= 0)
@@ -177,6 +185,9 @@ def find_images(
     frameworks = np.zeros(int(component.max(initial=-1)) + 1, bool)
     for table in tables:
         table.find_closures(y, lattice, longest, component, frameworks)
+        for k in table.untied(images):
+            long = float(table.lengths[k, 0])
+            _refuse_long(given, table.start + int(k), table.item.atoms[k], long, half_width)
     pairs = np.concatenate([t.item.atoms for t in held] or [np.zeros((0, 2), np.int64)])
     ends = np.concatenate([pairs, pairs[:, ::-1]]).T
     neighbours = sp.csr_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(n_atoms, n_atoms))
@@ -282,6 +293,15 @@ class _Links:
             self._nearest = nearest
         self._closing = closing & differs.any(axis=1)
         frameworks[label[self._closing]] = True
+
+    def untied(self, images: Images) -> IntArray:
+        """Distances of half the cell or more that close, through the boundary, what loose links alone tie."""
+        given = self.held and self.item.target is not None
+        long = np.flatnonzero(self._closing & self.whole & given)
+        if not len(long):
+            return long
+        body = images.bodies()
+        return long[body[self.item.atoms[long, 0]] != body[self.item.atoms[long, 1]]]
 
     def _sigma(self, r: FloatArray) -> FloatArray:
         difference = self.item.measure(r, self.time) - self.item.target_at(self.time)

@@ -213,3 +213,15 @@ def test_a_length_found_and_the_same_one_given():
     rows = ConstraintSet([Distance([[1, 2], [1, 0]]), Distance([[0, 1]], given)], far, MASSES[:5], cell=cell)
     assert rows.target()[1] == rows.target()[2] == given
     assert rows.target()[0] == pytest.approx(np.linalg.norm(x[2] - x[1]), abs=1e-12)
+
+
+def test_a_long_distance_beside_a_free_angle_is_ambiguous():
+    """Through the boundary its target fits as well, and nothing held says that the angle does not turn."""
+    cell = np.diag([2.6, 2.4, 1.9])
+    x = np.array([[0.0, 0.0, 0.0], [-0.12, -0.84, -1.65], [0.12, 0.02, -0.93]])
+    long = float(np.linalg.norm(x[1] - x[2]))
+    angle, masses = Angle([[1, 2, 0]]), np.ones(3)
+    with pytest.raises(InputError, match=r"row 1, Distance\(1, 2\): target .* is not shorter than half the box"):
+        ConstraintSet([angle, Distance([[1, 2]], long)], x, masses, cell=cell, pbc=True)
+    wide = ConstraintSet([angle, Distance([[1, 2]], long)], x, masses, cell=3 * cell, pbc=True)
+    assert abs(wide.value(x)).max() < 1e-14
