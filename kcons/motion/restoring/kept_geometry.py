@@ -105,6 +105,11 @@ class Geometry:
     def _given(self) -> IntArray | None:
         return None if self._bonds is None else self._bonds()
 
+    @property
+    def free(self) -> bool:
+        """Whether no bonds are given, and that was said: the nearest point is wanted, whatever else changes."""
+        return self._given is not None and not len(self._given)
+
     @cached_property
     def pieces(self) -> Pieces:
         bonds = bonds_of(self.held, self.start, self.time, self._given)
@@ -146,7 +151,7 @@ class Geometry:
         and of several distances that are held not most are far off.
         """
         if self._given is not None:
-            return len(self._given) > 0
+            return not self.free
         lengths = self._held_lengths[1]
         if len(lengths) > 1 and np.sum(lengths > FAR) > 0.5 * len(lengths):
             return False

@@ -79,7 +79,7 @@ def restored(
     geometry = Geometry(held, plan.labels, x, time, bonds)
     ways: list[Callable[[], FloatArray | None]] = [lambda: x, lambda: moved(geometry)]
 
-    if geometry.far() and len(geometry.pieces.bonds):
+    if geometry.far() and not geometry.free and len(geometry.pieces.bonds):
         ways.reverse()
     ways.append(lambda: eased(geometry))
     error: KconsError | None = None
