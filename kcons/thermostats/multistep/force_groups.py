@@ -36,20 +36,20 @@ class ForceGroups:
     def __init__(self, groups: Mapping[str, ForceFunction]) -> None:
         if not isinstance(groups, Mapping) or not groups:
             raise InputError("there are no groups of forces; give a mapping of names to functions", item="groups")
-        seen: dict[int, str] = {}
         for name, force in groups.items():
             if not isinstance(name, str) or not name:
                 raise InputError(f"a group of forces is called {name!r}; give it a name, a text", item="groups")
             if force is None:
                 raise InputError(f"the force of group {name!r} is None; give a function of x, t", item=name)
             check_call(f"the force of group {name!r}", force, ("x", "t"))
-            if id(force) in seen:
+            # By value: a method is another object each time it is looked up.
+            other = next(other for other in groups if groups[other] == force)
+            if other != name:
                 raise InputError(
-                    f"groups {seen[id(force)]!r} and {name!r} overlap: both are {force!r}, whose forces would count "
+                    f"groups {other!r} and {name!r} overlap: both are {force!r}, whose forces would count "
                     "twice. Put it into one of them",
                     item=name,
                 )
-            seen[id(force)] = name
         self.groups: dict[str, ForceFunction] = dict(groups)
         self.evaluations = dict.fromkeys(self.groups, 0)
 
@@ -69,11 +69,13 @@ class ForceGroups:
         Raises
         ------
         InputError
-            Both are the same function. While they run: their arrays differ in shape, so that they are of different
-            systems.
+            Both are the same function, or both groups have one name. While they run: their arrays differ in shape, so
+            that they are of different systems.
         """
-        if cheap is expensive:
+        if cheap == expensive:
             raise InputError("cheap and expensive forces are the same function; nothing is left to be slow", item=slow)
+        if fast == slow:
+            raise InputError(f"fast and slow forces are both called {fast!r}; give them two names", item="slow")
         return cls({fast: cheap, slow: Difference(cheap, expensive)})
 
     def __repr__(self) -> str:

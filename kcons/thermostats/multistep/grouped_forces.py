@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
 
 from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
 from kcons.steppers import State, System
 from kcons.steppers.stages.compensated_steps import check_finite
 from kcons.thermostats.freedom import carried
@@ -18,9 +20,10 @@ from kcons.thermostats.multistep.force_groups import ForceGroups
 class GroupedForces:
     """Forces by the names of their groups.
 
-    A state carries them, if there are two or more, in the order of their names behind the variables of its thermostat,
-    so that a run that is continued evaluates nothing anew. Where the slowest group, the first, kicks in the middle of
-    steps it carries none, and each step begins with an evaluation of the others.
+    A state carries them, if there are two or more, in the order of their names behind the variables of its thermostat
+    and a number that stands for the names, so that a run that is continued evaluates nothing anew. Where the slowest
+    group, the first, kicks in the middle of steps it carries none, and each step begins with an evaluation of the
+    others.
 
     Attributes
     ----------
@@ -53,10 +56,10 @@ class GroupedForces:
         Raises
         ------
         InputError
-            The state carries variables of another thermostat.
+            The state carries variables of another thermostat, or forces of groups of other names.
         """
         size = 3 * system.n_atoms
-        stored = len(names) * size if len(names) > 1 and not middle else 0
+        stored = len(names) * size + 1 if len(names) > 1 and not middle else 0
         if mark is not None and state.thermostat is not None and state.thermostat.flat[0] != mark:
             carried(state, -1, name)
         known = carried(state, variables + stored, name)
@@ -69,7 +72,13 @@ class GroupedForces:
             found.now[names[0]] = forces
         elif forces is not None and known:
             assert state.thermostat is not None
-            parts = state.thermostat[variables:].reshape(len(names), *x.shape)
+            if state.thermostat[variables] != _number_of(names):
+                raise InputError(
+                    f"the state carries forces of groups of other names than {', '.join(names)}; name the groups as "
+                    "they were, or begin from its positions and velocities: State(state.positions, state.velocities)",
+                    item="groups",
+                )
+            parts = state.thermostat[variables + 1 :].reshape(len(names), *x.shape)
             found.now.update(zip(sorted(names), parts, strict=True))
         else:
             for group in names:
@@ -104,4 +113,9 @@ class GroupedForces:
         """What a state carries: the variables of the thermostat, and forces."""
         if len(self.names) == 1 or self.middle:
             return variables
-        return np.concatenate([variables, *(self.now[name].ravel() for name in sorted(self.names))])
+        forces = [self.now[name].ravel() for name in sorted(self.names)]
+        return np.concatenate([variables, [_number_of(self.names)], *forces])
+
+
+def _number_of(names: tuple[str, ...]) -> float:
+    return float(zlib.crc32("\n".join(sorted(names)).encode()))

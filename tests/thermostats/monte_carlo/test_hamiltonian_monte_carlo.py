@@ -17,6 +17,7 @@ from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, ReversibilityCheck, State, Suzuki4, System, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import CHANGE, POTENTIAL, PROPOSAL, stream
+from kcons.thermostats.monte_carlo.replica_exchange import potential_of
 
 
 def started(n=2):
@@ -120,6 +121,18 @@ def test_a_run_goes_on_to_the_last_bit(saved):
     other = run(held, half, 0.4, 12, stepper=HamiltonianMonteCarlo(0.5, (1, 4), 4, keep=0.3))
     assert np.abs(other.positions - whole.positions).max() > 1e-3
     assert 0 < Counts.of(whole).accepted < 24 == Counts.of(whole).proposals
+
+
+def test_a_state_of_another_system_is_judged_by_the_energy_of_this_one():
+    """Its potential and its forces are those of where it was."""
+    x, sampler = np.array([[1.0, 0, 0]]), HamiltonianMonteCarlo(1.0, 3, 1)
+    stiff = system([], x, [1.0], lambda x, t: -9 * x, lambda x, t: 4.5 * float(np.sum(x * x)))
+    soft = system([], x, [1.0], lambda x, t: -x, lambda x, t: 0.5 * float(np.sum(x * x)))
+    state = sampler.step(stiff, stiff.initial_state(x), 0.1)
+    new = sampler.step(soft, soft.initial_state(state.positions, state.velocities), 0.1)
+    carried = sampler.step(soft, replace(state, step=0, time=0.0), 0.1)
+    np.testing.assert_array_equal(carried.positions, new.positions)
+    assert potential_of(carried) == potential_of(new) == soft.potential(carried.positions, 0.0)
 
 
 def test_what_has_no_solution_or_no_way_back_is_rejected_and_counted():

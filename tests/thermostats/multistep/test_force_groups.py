@@ -56,7 +56,22 @@ def test_groups_that_cannot_be(groups, words):
         ForceGroups(groups)
 
 
+def test_a_method_is_one_function_however_often_it_is_looked_up():
+    class Field:
+        def force(self, x, t):
+            return -x
+
+    field = Field()
+    with pytest.raises(InputError, match="'fast' and 'slow' overlap"):
+        ForceGroups({"fast": field.force, "slow": field.force})
+    with pytest.raises(InputError, match="the same function"):
+        ForceGroups.difference(field.force, field.force)
+    ForceGroups({"fast": field.force, "slow": Field().force})  # of another object
+
+
 def test_forces_of_different_systems():
+    with pytest.raises(InputError, match="both called 'a'"):
+        ForceGroups.difference(springs, quartic, fast="a", slow="a")
     with pytest.raises(InputError, match="the same function"):
         ForceGroups.difference(springs, springs)
     with pytest.raises(InputError, match="different systems"):

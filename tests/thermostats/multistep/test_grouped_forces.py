@@ -38,6 +38,16 @@ def test_what_a_state_carries_is_not_evaluated_anew():
     assert groups.evaluations == {"fast": 2, "slow": 2}
 
 
+def test_forces_of_groups_that_were_renamed():
+    """By another order of the names they would change places."""
+    held, _ = made()
+    found, _ = GroupedForces.of(held, State(X, 0 * X), NAMES, 2, "X")
+    state = State(X, 0 * X, forces=found.total(), thermostat=found.closed(np.array([1.0, 2.0])))
+    renamed = System(held.motion, ForceGroups({"a slow": quartic, "fast": springs}))
+    with pytest.raises(InputError, match="groups of other names than a slow, fast"):
+        GroupedForces.of(renamed, state, ("a slow", "fast"), 2, "X")
+
+
 def test_one_group_is_the_forces_of_the_state():
     held = System(made()[0].motion, springs)
     found, variables = GroupedForces.of(held, State(X, 0 * X, forces=2 * X), ("",), 1, "X")
