@@ -38,6 +38,12 @@ class _Batch:
     entries: IntArray  # where the subset's Jacobian data stand ...
     places: IntArray  # ... and where they go in the flat (n, K, C) array
 
+    def gradients(self, data: FloatArray) -> FloatArray:
+        """A of each cluster, shape (n, K, C), from the data of the subset's Jacobian."""
+        found = np.zeros((*self.rows.shape, self.columns.shape[1]))
+        found.reshape(-1)[self.places] = data[self.entries]
+        return found
+
 
 @dataclass(frozen=True)
 class _Flight:
@@ -131,24 +137,17 @@ class GeneralClusters:
     # -- pieces ---------------------------------------------------------------------------------
 
     def _weighted(self, batch: _Batch, data: FloatArray) -> FloatArray:
-        """A M^-1/2 of each cluster, shape (n, K, C), from the data of the subset's Jacobian."""
-        n, k = batch.rows.shape
-        b = np.zeros((n, k, batch.columns.shape[1]))
-        b.reshape(-1)[batch.places] = data[batch.entries]
-        return b * self._root_w[batch.columns][:, None, :]
+        return batch.gradients(data) * self._root_w[batch.columns][:, None, :]
 
     def _rounding(self, batch: _Batch, data: FloatArray, state: FloatArray) -> FloatArray:
         """Relative residual that rounding allows: max(1e-14, 2 eps sum |dq/dx_i| |x_i| / scale), (n, K)."""
-        gradient = np.zeros((*batch.rows.shape, batch.columns.shape[1]))
-        gradient.reshape(-1)[batch.places] = data[batch.entries]
         sizes = np.linalg.norm(state.reshape(-1)[batch.columns].reshape(len(batch.rows), -1, 3), axis=2)
-        norms = np.linalg.norm(gradient.reshape(*batch.rows.shape, -1, 3), axis=3)
+        norms = np.linalg.norm(batch.gradients(data).reshape(*batch.rows.shape, -1, 3), axis=3)
         reach = np.einsum("nka,na->nk", norms, sizes)
         return np.maximum(1e-14, 2 * _EPS * reach / self._scale[batch.rows])
 
     def _sigma(self, batch: _Batch, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
-        sigma = self.subset.value(state, time) + (0.0 if flight is None else flight.slips(state))
-        return sigma[batch.rows]
+        return (self.subset.value(state, time) + (0.0 if flight is None else flight.slips(state)))[batch.rows]
 
     def _data(self, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
         data = self.subset.jacobian(state, time).data

@@ -46,16 +46,7 @@ from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, miss
-from kcons.solvers.sparse.step_control import (
-    MAX_HALVINGS,
-    factor_serves,
-    go_back,
-    hopeless,
-    keep,
-    overshot,
-    refines,
-    stalled,
-)
+from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
@@ -387,7 +378,7 @@ def _positions(  # type: ignore[no-untyped-def]
             # Go on to the rounding of the relative coordinates as long as Newton still gains.
             if excess <= 1.0 and (error <= step_control.NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
-            if stalled(iteration, error, previous, excess, last - first):
+            if step_control.stalled(iteration, error, previous, excess, last - first):
                 break
             if careful:
                 best = total
