@@ -3,9 +3,9 @@
 Minimum images say it for a vector that is shorter than half the cell, and for no other. So rows are sorted at
 set-up:
 
-* A row is *plain* if a constant distance shorter than half the cell is held between each two neighbours in its
-  list of atoms. Minimum images along the list are then right at any time, whatever images are stored.
-* All other rows are *whole* rows: distances as long as half the cell and more (across a ring or an adsorbate),
+* A row is *plain* if a constant distance shorter than `NEARLY` half the cell is held between each two neighbours in
+  its list of atoms. Minimum images along the list are then right at any time, whatever images are stored.
+* All other rows are *whole* rows: distances nearly as long as half the cell and more (across a ring or an adsorbate),
   linear rows, free dihedrals and angles, centres of groups, moving targets. Their atoms are made whole along a
   spanning tree of the shortest links that the set has, held distances first, and the row takes positions in
   the images found there.
@@ -37,6 +37,8 @@ from kcons.errors import ImageError, InputError
 ALL_PAIRS_WIDTH = 12
 #: A link that closes a framework through the boundary is a bond: not much longer than the longest of the tree.
 BOND_LIKE = 1.5
+#: Part of half the cell from which a held distance is followed along the tree: off its row it may be longer than half.
+NEARLY = 0.9
 #: Parts of the cell at which a loose link is taken to have reached half of it.
 _HALF = 0.5 - 1e-9
 
@@ -229,7 +231,7 @@ class _Links:
                 self.unsure[:] = True
             else:
                 self.lengths = item.target_at(time)[:, None]
-            self.whole = ~self.unsure & (self.lengths[:, 0] >= half_width)
+            self.whole = ~self.unsure & (self.lengths[:, 0] >= NEARLY * half_width)
         self._local: BoolArray | None = None
 
     @property
@@ -279,7 +281,7 @@ class _Links:
         cells = -np.round(apart @ lattice[1]).astype(np.int64)
         nearest = np.linalg.norm(apart + cells @ lattice[0], axis=2)
         differs = cells.any(axis=2)
-        self._long = np.linalg.norm(apart, axis=2)[:, 0] >= self.half_width
+        self._long = np.linalg.norm(apart, axis=2)[:, 0] >= NEARLY * self.half_width
         self.windings[:, 1:] = np.cumsum(cells, axis=1)
         if item.target is not None and item.holonomic:
             # The target tells which of the two is meant.
