@@ -234,7 +234,7 @@ def test_off_its_row_a_distance_of_nearly_half_the_cell_is_not_that_of_another_i
     lengths = [float(np.linalg.norm(x[a] - x[b])) for a, b in pairs]
     row = Distance(pairs, lengths if given else None)
     held = ConstraintSet(row, x, np.ones(3), cell=2.1 * np.eye(3), pbc=True)  # 1.0 of 1.05
-    longer = x + [[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    longer = x + np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.0, 0.0]])
     expected = ConstraintSet(row, x, np.ones(3)).value(longer)
     for images in ([0, 0, 0], [0, -1, 0], [2, 5, -3]):
         np.testing.assert_allclose(held.value(longer + 2.1 * np.array(images)[:, None]), expected, rtol=0, atol=1e-13)
