@@ -55,6 +55,7 @@ class HeldCoordinatesReporter:
     ------
     InputError
         At the first report: rows of `CollectiveRows` that are neither named nor given as `beside`.
+        A report of another simulation than the first.
     UnsupportedError
         At the first report: a coordinate of a virtual site.
 
@@ -100,6 +101,8 @@ class HeldCoordinatesReporter:
         time = state.getTime()._value
         if self._held is None:
             self._begin(simulation, x, time)
+        elif simulation.context is not self._context:
+            raise InputError("this reporter belongs to another simulation; make a new one for this", item="simulation")
         assert self._held is not None and self._set is not None
         if self._set.lattice is not None:
             self._set.with_cell(cell_of(state.getPeriodicBoxVectors()))
@@ -133,8 +136,6 @@ class HeldCoordinatesReporter:
                 carried.append(row.select(new))
         rows = carried
         touched = np.unique(np.concatenate([row.atoms.ravel() for row in rows]))
-        if touched.max() >= len(masses):
-            raise InputError(f"there is no atom {touched.max()}; the System has {len(masses)} particles", item="atoms")
         refuse_virtual_sites(system, touched, masses)
         named = {(min(pair), max(pair)) for row in rows if row.family == "Distance" for pair in row.atoms.tolist()}
         for item in constraints_about(system, touched):
@@ -156,6 +157,7 @@ class HeldCoordinatesReporter:
         free = known and bool(np.all((masses > 0) | virtual))
         bonds = bonds_of(system, x) if free else None
         self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
+        self._context = simulation.context
         self.series = Series(self._held.names, self._held.periods)
         if not self._titled:
             titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]

@@ -31,7 +31,7 @@ from kcons.free_energy import AseWindows, Settings, Windows, scan
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "killed_runs.json"
 TORSION = Dihedral([[2, 0, 1, 3]])
 #: Seconds after its first note within which a run is killed.
-LATEST = 0.8
+LATEST = 0.2
 
 
 def windows(folder: Path) -> dict[str, object]:

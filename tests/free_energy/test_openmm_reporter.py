@@ -168,6 +168,10 @@ def test_bad_input():
     ]
     simulation.step(1)
     assert len(simulation.reporters[0].series) == 1
+    other = simulation_of(peptide(), ProjectedIntegrator(0.001))
+    other.reporters = simulation.reporters
+    with pytest.raises(InputError, match="belongs to another simulation"):
+        other.step(1)
     simulation.reporters = [
         HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[0, 99]])}, beside=[Dihedral([psi])])
     ]

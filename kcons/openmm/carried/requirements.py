@@ -13,7 +13,7 @@ from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.precision import Precision
 
 #: Rounding of positions, relative to the shortest row, that a run begins to show.
@@ -42,6 +42,9 @@ def free_groups(system: openmm.System, count: int) -> list[int]:
 
 
 def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatArray) -> None:
+    """Refuse virtual sites among `atoms`, and what is no particle of the System."""
+    if atoms.max(initial=0) >= len(masses):
+        raise InputError(f"there is no atom {atoms.max()}; the System has {len(masses)} particles", item="atoms")
     for atom in atoms[masses[atoms] == 0].tolist():
         if system.isVirtualSite(atom):
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")

@@ -11,7 +11,7 @@ from openmm import app
 from openmm_systems import DATA
 
 from kcons.constraints import Angle, Dihedral, Distance, Formula, Plane
-from kcons.errors import SingularGeometryError, UnsupportedError
+from kcons.errors import InputError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import OpenMMWindows, Series, Settings, Window
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
@@ -67,6 +67,8 @@ def test_coordinates_that_cannot_be_held():
         sampler({"p": Plane([0], (0, 0, 1))})
     with pytest.raises(UnsupportedError, match=r"r is .*one row"):
         sampler({"r": Distance([[0, 1], [1, 2]])})
+    with pytest.raises(InputError, match="no atom 99; the System has 22 particles"):
+        sampler({"phi": Dihedral([[4, 6, 8, 99]])}).begin()
     tight = system()
     x = PDB.positions
     for i, j in ((4, 6), (6, 8), (4, 8), (8, 14), (6, 14), (4, 14)):

@@ -86,6 +86,9 @@ class OutsideOfSteps(StatesOnConstraints, Integrator):
     def _run_alone(self, guard: Guard, first: int, end: int) -> None:
         """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
         context = guard.context
+        if not guard.started:  # what Forces tell here is not known yet
+            for part in self.parts:
+                part.take_place(self.program, context)
         time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
         self.refresh()
         program = self.program

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from collective_cases import CHAIN, angle, bond, held_chain
-from openmm_systems import context_of, masses_of, state_of
+from collective_cases import CHAIN, angle, bond, chain_system, held_chain
+from openmm_systems import context_of, masses_of, on_gpus, state_of
 
 from kcons.errors import InputError, KconsError
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 
 def test_constraints_applied_by_the_integrator():
@@ -55,3 +55,15 @@ def test_no_degree_of_freedom_no_temperature():
     assert integrator.degrees_of_freedom(context) == 0
     with pytest.raises(InputError, match="no degree of freedom"):
         integrator.computeSystemTemperature()
+
+
+@pytest.mark.parametrize("platform", on_gpus("mixed"))
+def test_before_the_first_step_forces_tell_what_they_tell(platform):
+    """Where Forces have single numbers, an open tolerance is known before anything is brought onto rows."""
+    system = chain_system()
+    part = CollectiveRows(system, [bond(0, 3), angle(2, 3, 4)], positions=CHAIN)
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    context = context_of(system, integrator, platform)
+    context.setPositions(CHAIN + 0.002 * np.random.default_rng(4).normal(size=CHAIN.shape))
+    integrator.applyConstraints(context)
+    assert np.abs(part.residuals(context)).max() < 5e-6
