@@ -15,6 +15,7 @@ opposite direction: a Newton step reads the chain once.
 import numpy as np
 from numba import njit
 
+from kcons.solvers.kernels.array_views import at_first
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -126,6 +127,73 @@ def _first_bad(work, present, first, n_slots, tangent):
     return -1
 
 
+# What follows is spliced into `_solve` as it stands: compiled apart it takes longer, and rounds otherwise.
+#
+# A row has its bond s, what is changed r, what is wanted of it (`target`), and `pull`, the step of its multiplier.
+# The row before it in the order of a sweep has p and `behind`, the next one n and `next_pull`; z and `pulls` are those
+# of the separators, q and `final` of that at which the sweep ends, h those of the first row. The sweep enters a row by
+# an atom whose displacement is e (`weight` its inverse mass), and leaves by one of o (`leave`). Eliminated, a row says
+# ``pull = right - ahead * next_pull - aside * final``; the eliminated rows of a lane add `head_diagonal`, `head_right`
+# and `to_head` to the separator at which the sweep began.
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _next_bond(points, atoms, at, ax, ay, az, cell, kind, wrapped):
+    """The bond from the atoms a to those at `at`, and these."""
+    bx, by, bz = gather_points(points, atoms, at)
+    nx, ny, nz = ax - bx, ay - by, az - bz
+    if kind != OPEN and wrapped:
+        nx, ny, nz = minimum_image(nx, ny, nz, cell, kind)
+    return nx, ny, nz, bx, by, bz
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _seam_bond(points, atoms, first, end, real, cell, kind, wrapped):
+    """The separators, from the last atoms of the lanes to the first ones of the next, and the first atoms."""
+    ax, ay, az = gather_points(points, atoms, first)
+    bx, by, bz = gather_points(points, atoms, end)
+    zx, zy, zz = (bx - from_next(ax)) * real, (by - from_next(ay)) * real, (bz - from_next(az)) * real
+    if kind != OPEN and wrapped:
+        zx, zy, zz = minimum_image(zx, zy, zz, cell, kind)
+    return zx, zy, zz, ax, ay, az
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _pull_of(work, slot, next_pull, final):
+    """The step of a multiplier, by those with which its row was eliminated."""
+    return load(work, slot + _RIGHT) - load(work, slot + _AHEAD) * next_pull - load(work, slot + _ASIDE) * final
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _add_up(work, slot, iteration, pull):
+    """The first step of a multiplier, and the sum of all later ones."""
+    if iteration == 1:
+        store(work, slot + _FIRST, pull)
+    elif iteration == 2:
+        store(work, slot + _LATER, pull)
+    elif iteration > 2:
+        store(work, slot + _LATER, load(work, slot + _LATER) + pull)
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _displacement(weight, nx, ny, nz, next_pull, sx, sy, sz, pull):
+    """Of the atom between two rows."""
+    ox = weight * product_difference(nx, next_pull, sx, pull)
+    oy = weight * product_difference(ny, next_pull, sy, pull)
+    oz = weight * product_difference(nz, next_pull, sz, pull)
+    return ox, oy, oz
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _judged(least, total, peak, peak_slot, positive, ratio, slot):
+    """What is known of all rows of a sweep, with one row more."""
+    least = where_greater(least, positive, positive, least)
+    total = total + ratio
+    peak_slot = where_greater(ratio, peak, splat(float(slot)), peak_slot)
+    peak = where_greater(ratio, peak, ratio, peak)
+    return least, total, peak, peak_slot
+
+
 @njit(fastmath=FASTMATH, error_model="numpy")
 def _solve(
     base, other, atoms, rows, present, weights, given, cell, kind, first, n_slots, whole, tangent, limit, work, small
@@ -135,38 +203,21 @@ def _solve(
     Bonds s come from the points `base`; r, from `other`, is what the multipliers change: bonds to bring to the lengths
     `given`, or relative velocities to bring to those rates along s. The slots before `whole` have a bond in every lane.
 
-    A row has its bond s, what is changed r, what is wanted of it (`target`), and `pull`, the step of its multiplier.
-    The row before it in the order of a sweep has p and `pull_behind`, the next one n and `next_pull`; z and `pulls` are
-    those of the separators, q and `pull_final` of that at which the sweep ends, h those of the first row. The sweep
-    enters a row by an atom whose displacement is e (`weight` its inverse mass), and leaves by one of o
-    (`leave_weight`). Eliminated, a row says ``pull = right - ahead * next_pull - aside * pull_final``; the eliminated
-    rows of a lane add `head_diagonal`, `head_right` and `to_head` to the separator at which the sweep began.
-
     Returns whether all is well, the worst residual, its place (slot and lane), and the number of solves.
     """
     n_rows = n_slots - 1
     end, seam = first + n_rows * WIDTH, n_rows * SLOT
     zero, one = splat(0.0), splat(1.0)
     driven = given.shape[0] > 0
+    # Arrays that are handed on inside the loop would cost reference counting.
+    origins, changed, table, room = at_first(base), at_first(other), at_first(atoms), at_first(work)
 
     # The separators, and the bond that the first sweep begins with.
     real = load(present, end)
-    ax, ay, az = gather_points(base, atoms, first)
-    bx, by, bz = gather_points(base, atoms, end)
-    zx, zy, zz = (bx - from_next(ax)) * real, (by - from_next(ay)) * real, (bz - from_next(az)) * real
-    bx, by, bz = gather_points(base, atoms, first + WIDTH)
-    ux, uy, uz = ax - bx, ay - by, az - bz
-    ax, ay, az = gather_points(other, atoms, first)
-    cx, cy, cz = gather_points(other, atoms, end)
-    cx, cy, cz = (cx - from_next(ax)) * real, (cy - from_next(ay)) * real, (cz - from_next(az)) * real
-    dx, dy, dz = gather_points(other, atoms, first + WIDTH)
-    vx, vy, vz = ax - dx, ay - dy, az - dz
-    if kind != OPEN:
-        zx, zy, zz = minimum_image(zx, zy, zz, cell, kind)
-        ux, uy, uz = minimum_image(ux, uy, uz, cell, kind)
-        if tangent is None:
-            cx, cy, cz = minimum_image(cx, cy, cz, cell, kind)
-            vx, vy, vz = minimum_image(vx, vy, vz, cell, kind)
+    zx, zy, zz, ax, ay, az = _seam_bond(origins, table, first, end, real, cell, kind, True)
+    ux, uy, uz, bx, by, bz = _next_bond(origins, table, first + WIDTH, ax, ay, az, cell, kind, True)
+    cx, cy, cz, ax, ay, az = _seam_bond(changed, table, first, end, real, cell, kind, tangent is None)
+    vx, vy, vz, dx, dy, dz = _next_bond(changed, table, first + WIDTH, ax, ay, az, cell, kind, tangent is None)
     store_triple(work, seam + _S, zx, zy, zz)
     store_triple(work, seam + _R, cx, cy, cz)
     count, scale = real, dot(cx, cy, cz, cx, cy, cz)
@@ -183,33 +234,27 @@ def _solve(
         opening, upward = iteration == 0, iteration % 2 == 0
         peak, peak_slot, least, total = splat(-1.0), zero, one, zero
         # At first, what lies before a row is a separator; after the last row there is one again.
-        px, py, pz, pull_behind = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(pulls)
-        qx, qy, qz, pull_final = zx, zy, zz, pulls
+        px, py, pz, behind = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(pulls)
+        qx, qy, qz, final = zx, zy, zz, pulls
         slot, stride, atom, step, onward = 0, SLOT, first, WIDTH, WIDTH
         if not upward:
-            px, py, pz, pull_behind, qx, qy, qz, pull_final = qx, qy, qz, pull_final, px, py, pz, pull_behind
+            px, py, pz, behind, qx, qy, qz, final = qx, qy, qz, final, px, py, pz, behind
             slot, stride, atom, step, onward = seam - SLOT, -SLOT, end - WIDTH, -WIDTH, 0
         sign = 1.0 if upward else -1.0
         if opening:
             sx, sy, sz, pull = ux, uy, uz, zero
         else:
             sx, sy, sz = load_triple(work, slot + _S)
-            pull = (
-                load(work, slot + _RIGHT)
-                - load(work, slot + _AHEAD) * pull_behind
-                - load(work, slot + _ASIDE) * pull_final
-            )
+            pull = _pull_of(room, slot, behind, final)
         weight = load(weights, atom + WIDTH - onward)
         head_weight, hx, hy, hz = weight, sx, sy, sz
         # Displacement, times sign, of the atom between two rows.
-        ex = weight * product_difference(sx, pull, px, pull_behind)
-        ey = weight * product_difference(sy, pull, py, pull_behind)
-        ez = weight * product_difference(sz, pull, pz, pull_behind)
+        ex, ey, ez = _displacement(weight, sx, sy, sz, pull, px, py, pz, behind)
         fx, fy, fz = ex, ey, ez
         right, ahead, aside = zero, zero, splat(-1.0)
         to_head, head_diagonal, head_right = one, zero, zero
         for row in range(n_rows):
-            nx, ny, nz, next_pull = qx, qy, qz, pull_final
+            nx, ny, nz, next_pull = qx, qy, qz, final
             if opening:
                 rx, ry, rz = vx, vy, vz
                 real = load(present, atom)
@@ -220,38 +265,19 @@ def _solve(
                 store_triple(work, slot + _S, sx, sy, sz)
                 store(work, slot + _TARGET, target)
                 if row + 1 < n_rows:
-                    ax, ay, az = bx, by, bz
-                    bx, by, bz = gather_points(base, atoms, atom + 2 * WIDTH)
-                    nx, ny, nz = ax - bx, ay - by, az - bz
-                    cx, cy, cz = dx, dy, dz
-                    dx, dy, dz = gather_points(other, atoms, atom + 2 * WIDTH)
-                    vx, vy, vz = cx - dx, cy - dy, cz - dz
-                    if kind != OPEN:
-                        nx, ny, nz = minimum_image(nx, ny, nz, cell, kind)
-                        if tangent is None:
-                            vx, vy, vz = minimum_image(vx, vy, vz, cell, kind)
+                    at, wrapped = atom + 2 * WIDTH, tangent is None
+                    nx, ny, nz, bx, by, bz = _next_bond(origins, table, at, bx, by, bz, cell, kind, True)
+                    vx, vy, vz, dx, dy, dz = _next_bond(changed, table, at, dx, dy, dz, cell, kind, wrapped)
             else:
                 rx, ry, rz = load_triple(work, slot + _R)
                 target = load(work, slot + _TARGET)
-                if iteration == 1:
-                    store(work, slot + _FIRST, pull)
-                elif iteration == 2:
-                    store(work, slot + _LATER, pull)
-                else:
-                    store(work, slot + _LATER, load(work, slot + _LATER) + pull)
+                _add_up(room, slot, iteration, pull)
                 real = one if atom < whole else load(present, atom)
                 if row + 1 < n_rows:
-                    there = slot + stride
-                    nx, ny, nz = load_triple(work, there + _S)
-                    next_pull = (
-                        load(work, there + _RIGHT)
-                        - load(work, there + _AHEAD) * pull
-                        - load(work, there + _ASIDE) * pull_final
-                    )
-            leave_weight = load(weights, atom + onward)
-            ox = leave_weight * product_difference(nx, next_pull, sx, pull)
-            oy = leave_weight * product_difference(ny, next_pull, sy, pull)
-            oz = leave_weight * product_difference(nz, next_pull, sz, pull)
+                    nx, ny, nz = load_triple(work, slot + stride + _S)
+                    next_pull = _pull_of(room, slot + stride, pull, final)
+            leave = load(weights, atom + onward)
+            ox, oy, oz = _displacement(leave, nx, ny, nz, next_pull, sx, sy, sz, pull)
             rx, ry, rz = rx + (ex - ox), ry + (ey - oy), rz + (ez - oz)
             store_triple(work, slot + _R, rx, ry, rz)
             if tangent is not None:
@@ -259,22 +285,19 @@ def _solve(
                 rx, ry, rz = sx, sy, sz
             else:
                 error, inner, positive, ratio = _length_error(rx, ry, rz, sx, sy, sz, target, real)
-            least = where_greater(least, positive, positive, least)
-            total = total + ratio
-            peak_slot = where_greater(ratio, peak, splat(float(slot)), peak_slot)
-            peak = where_greater(ratio, peak, ratio, peak)
-            masses = (weight + leave_weight) * real
+            least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, slot)
+            masses = (weight + leave) * real
             lower = weight * dot(rx, ry, rz, px, py, pz)
             pivot = 1.0 / (where_zero(masses, 1.0, masses * inner) + lower * ahead)
             right = (error + lower * right) * pivot
             aside = flushed(lower * aside * pivot)
-            ahead = -leave_weight * dot(rx, ry, rz, nx, ny, nz) * pivot
+            ahead = -leave * dot(rx, ry, rz, nx, ny, nz) * pivot
             store_triple(work, slot + _RIGHT, right, ahead, aside)
             head_diagonal = head_diagonal + to_head * aside
             head_right = head_right + to_head * right
             to_head = flushed(-to_head * ahead)
             px, py, pz, sx, sy, sz, pull = sx, sy, sz, nx, ny, nz, next_pull
-            ex, ey, ez, weight = ox, oy, oz, leave_weight
+            ex, ey, ez, weight = ox, oy, oz, leave
             slot += stride
             atom += step
         # The separators: move, measure, and add what the pieces pass on.
@@ -286,22 +309,14 @@ def _solve(
             gx, gy, gz, fx, fy, fz = fx, fy, fz, from_next(ex), from_next(ey), from_next(ez)
         rx, ry, rz = rx + real * (gx - fx), ry + real * (gy - fy), rz + real * (gz - fz)
         store_triple(work, seam + _R, rx, ry, rz)
-        if iteration == 1:
-            store(work, seam + _FIRST, pulls)
-        elif iteration == 2:
-            store(work, seam + _LATER, pulls)
-        elif iteration > 2:
-            store(work, seam + _LATER, load(work, seam + _LATER) + pulls)
+        _add_up(room, seam, iteration, pulls)
         real = load(present, end)
         if tangent is not None:
             error, inner, positive, ratio = _rate_error(rx, ry, rz, zx, zy, zz, seam_target, real)
             rx, ry, rz = zx, zy, zz
         else:
             error, inner, positive, ratio = _length_error(rx, ry, rz, zx, zy, zz, seam_target, real)
-        least = where_greater(least, positive, positive, least)
-        total = total + ratio
-        peak_slot = where_greater(ratio, peak, splat(float(seam)), peak_slot)
-        peak = where_greater(ratio, peak, ratio, peak)
+        least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, seam)
         if tangent is not None and opening:
             limit = limit * np.sqrt(lane_sum(scale, small) / lane_sum(count, small))
         # Comparisons drop NaN, sums keep it.
