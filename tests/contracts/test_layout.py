@@ -126,10 +126,6 @@ def test_each_test_file_mirrors_a_module():
 LINES, FUNCTION, CLASS, PARAMETERS = 500, 100, 300, 11
 #: Folders whose kernels take one argument an array.
 KERNELS = ("solvers/", "steppers/stages/fused_stages.py", "thermostats/isokinetic/fused_step.py")
-#: What is larger: name -> size, one a line. Nothing is added and no size raised; what has become small is taken out.
-LARGER = {
-    "solvers/chains/sweeps.py: lines of _solve": 207,
-}
 
 
 def sizes(path: Path) -> dict[str, int]:
@@ -159,10 +155,8 @@ def sizes(path: Path) -> dict[str, int]:
 
 
 def test_modules_functions_and_classes_are_small():
-    """But for what is listed, which may become smaller only, and goes where it is small."""
     found = {name: size for path in FILES for name, size in sizes(path).items()}
-    assert {name: size for name, size in found.items() if size > LARGER.get(name, 0)} == {}, "too large"
-    assert set(LARGER) <= set(found), "no longer larger: take it out of the list"
+    assert found == {}, "too large"
 
 
 def test_what_is_larger_than_it_may_be_is_found(tmp_path, monkeypatch):

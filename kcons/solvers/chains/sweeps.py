@@ -1,15 +1,12 @@
 """Open chains of held distances, of any length.
 
-A chain is cut into eight pieces, one a lane, of equal length. The bond between
-two pieces is a *separator*: once the separators' multipliers are known, the
-pieces are independent. Each lane eliminates its tridiagonal piece and what
-couples it to the separators at its two ends; a tridiagonal system of seven
-separators remains. So the division that every pivot waits for is shared by
-eight rows. Short chains take one lane each, eight chains at a time.
+A chain is cut into eight pieces, one a lane, of equal length. The bond between two pieces is a *separator*: once the
+separators' multipliers are known, the pieces are independent. Each lane eliminates its tridiagonal piece and what
+couples it to the separators at its two ends; a tridiagonal system of seven separators remains. So the division that
+every pivot waits for is shared by eight rows. Short chains take one lane each, eight chains at a time.
 
-A sweep substitutes back along the pieces, and as it passes moves the bonds,
-measures their residuals and eliminates for the next Newton step in the
-opposite direction: a Newton step reads the chain once.
+A sweep substitutes back along the pieces, and as it passes moves the bonds, measures their residuals and eliminates
+for the next Newton step in the opposite direction: a Newton step reads the chain once.
 """
 
 import numpy as np
@@ -194,6 +191,93 @@ def _judged(least, total, peak, peak_slot, positive, ratio, slot):
     return least, total, peak, peak_slot
 
 
+@njit(fastmath=FASTMATH, inline="always")
+def _opened(work, slot, rx, ry, rz, sx, sy, sz, target, scale, tangent):
+    """Keep the bond of a row and what is wanted of it; returns this, and squares added up."""
+    scale = scale + (dot(rx, ry, rz, rx, ry, rz) + target * target)
+    target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent is not None else target)
+    store_triple(work, slot + _S, sx, sy, sz)
+    store(work, slot + _TARGET, target)
+    return target, scale
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _measured(work, slot, rx, ry, rz, sx, sy, sz, target, real, tangent):
+    """Keep r; its errors, and the gradient along it."""
+    store_triple(work, slot + _R, rx, ry, rz)
+    if tangent is not None:
+        error, inner, positive, ratio = _rate_error(rx, ry, rz, sx, sy, sz, target, real)
+        rx, ry, rz = sx, sy, sz
+    else:
+        error, inner, positive, ratio = _length_error(rx, ry, rz, sx, sy, sz, target, real)
+    return error, inner, positive, ratio, rx, ry, rz
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _eliminated(work, slot, masses, lower, inner, error, leave, onward, right, ahead, aside):
+    """Eliminate a row by the one before it."""
+    pivot = 1.0 / (where_zero(masses, 1.0, masses * inner) + lower * ahead)
+    right = (error + lower * right) * pivot
+    aside = flushed(lower * aside * pivot)
+    ahead = -leave * onward * pivot
+    store_triple(work, slot + _RIGHT, right, ahead, aside)
+    return right, ahead, aside
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _sweep(
+    origins, changed, table, rows, present, weights, given, room, cell, kind, tangent, driven, n_rows, whole, iteration,
+    way, p, behind, q, final, s, pull, e, weight, b, d, v, count, scale,
+):  # fmt: skip
+    """One row after another, from one separator to the next; what they add to these, and what is known of them."""
+    slot, stride, atom, step, onward = way
+    (px, py, pz), (qx, qy, qz), (sx, sy, sz), (ex, ey, ez) = p, q, s, e
+    (bx, by, bz), (dx, dy, dz), (vx, vy, vz) = b, d, v
+    opening, zero, one = iteration == 0, splat(0.0), splat(1.0)
+    right, ahead, aside = zero, zero, splat(-1.0)
+    to_head, head_diagonal, head_right = one, zero, zero
+    least, total, peak, peak_slot = one, zero, splat(-1.0), zero
+    for row in range(n_rows):
+        nx, ny, nz, next_pull = qx, qy, qz, final
+        if opening:
+            rx, ry, rz = vx, vy, vz
+            real = load(present, atom)
+            target = gather(given, rows, atom, 0) * real if driven else zero
+            count = count + real
+            target, scale = _opened(room, slot, rx, ry, rz, sx, sy, sz, target, scale, tangent)
+            if row + 1 < n_rows:
+                at, wrapped = atom + 2 * WIDTH, tangent is None
+                nx, ny, nz, bx, by, bz = _next_bond(origins, table, at, bx, by, bz, cell, kind, True)
+                vx, vy, vz, dx, dy, dz = _next_bond(changed, table, at, dx, dy, dz, cell, kind, wrapped)
+        else:
+            rx, ry, rz = load_triple(room, slot + _R)
+            target = load(room, slot + _TARGET)
+            _add_up(room, slot, iteration, pull)
+            real = one if atom < whole else load(present, atom)
+            if row + 1 < n_rows:
+                nx, ny, nz = load_triple(room, slot + stride + _S)
+                next_pull = _pull_of(room, slot + stride, pull, final)
+        leave = load(weights, atom + onward)
+        ox, oy, oz = _displacement(leave, nx, ny, nz, next_pull, sx, sy, sz, pull)
+        error, inner, positive, ratio, rx, ry, rz = _measured(
+            room, slot, rx + (ex - ox), ry + (ey - oy), rz + (ez - oz), sx, sy, sz, target, real, tangent
+        )
+        least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, slot)
+        right, ahead, aside = _eliminated(
+            room, slot, (weight + leave) * real, weight * dot(rx, ry, rz, px, py, pz), inner, error,
+            leave, dot(rx, ry, rz, nx, ny, nz), right, ahead, aside,
+        )  # fmt: skip
+        head_diagonal = head_diagonal + to_head * aside
+        head_right = head_right + to_head * right
+        to_head = flushed(-to_head * ahead)
+        px, py, pz, sx, sy, sz, pull = sx, sy, sz, nx, ny, nz, next_pull
+        ex, ey, ez, weight = ox, oy, oz, leave
+        slot += stride
+        atom += step
+    added = head_diagonal, head_right, to_head, ahead, right, aside
+    return added, (px, py, pz, ex, ey, ez, weight), (least, total, peak, peak_slot), count, scale
+
+
 @njit(fastmath=FASTMATH, error_model="numpy")
 def _solve(
     base, other, atoms, rows, present, weights, given, cell, kind, first, n_slots, whole, tangent, limit, work, small
@@ -202,37 +286,27 @@ def _solve(
 
     Bonds s come from the points `base`; r, from `other`, is what the multipliers change: bonds to bring to the lengths
     `given`, or relative velocities to bring to those rates along s. The slots before `whole` have a bond in every lane.
-
     Returns whether all is well, the worst residual, its place (slot and lane), and the number of solves.
     """
     n_rows = n_slots - 1
     end, seam = first + n_rows * WIDTH, n_rows * SLOT
-    zero, one = splat(0.0), splat(1.0)
-    driven = given.shape[0] > 0
+    zero, driven = splat(0.0), given.shape[0] > 0
     # Arrays that are handed on inside the loop would cost reference counting.
     origins, changed, table, room = at_first(base), at_first(other), at_first(atoms), at_first(work)
-
+    numbers, exists, heavy, goals = at_first(rows), at_first(present), at_first(weights), at_first(given)
     # The separators, and the bond that the first sweep begins with.
     real = load(present, end)
     zx, zy, zz, ax, ay, az = _seam_bond(origins, table, first, end, real, cell, kind, True)
     ux, uy, uz, bx, by, bz = _next_bond(origins, table, first + WIDTH, ax, ay, az, cell, kind, True)
     cx, cy, cz, ax, ay, az = _seam_bond(changed, table, first, end, real, cell, kind, tangent is None)
     vx, vy, vz, dx, dy, dz = _next_bond(changed, table, first + WIDTH, ax, ay, az, cell, kind, tangent is None)
-    store_triple(work, seam + _S, zx, zy, zz)
     store_triple(work, seam + _R, cx, cy, cz)
-    count, scale = real, dot(cx, cy, cz, cx, cy, cz)
-    seam_target = gather(given, rows, end, 0) * real if driven else zero
-    if tangent is not None:
-        scale = scale + seam_target * seam_target
-        seam_target = seam_target * square_root(dot(zx, zy, zz, zx, zy, zz))
-    else:
-        seam_target = seam_target * seam_target
+    count, seam_target = real, gather(given, rows, end, 0) * real if driven else zero
+    seam_target, scale = _opened(room, seam, cx, cy, cz, zx, zy, zz, seam_target, zero, tangent)
 
-    pulls = zero  # multipliers of the separators, each in the lane before it
-    ok, finite, iteration, least, peak, peak_slot = False, False, 0, zero, zero, zero
+    pulls, ok, finite, iteration, least, peak, peak_slot = zero, False, False, 0, zero, zero, zero
     for iteration in range(MAX_ITERATIONS + 1):
         opening, upward = iteration == 0, iteration % 2 == 0
-        peak, peak_slot, least, total = splat(-1.0), zero, one, zero
         # At first, what lies before a row is a separator; after the last row there is one again.
         px, py, pz, behind = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(pulls)
         qx, qy, qz, final = zx, zy, zz, pulls
@@ -251,55 +325,14 @@ def _solve(
         # Displacement, times sign, of the atom between two rows.
         ex, ey, ez = _displacement(weight, sx, sy, sz, pull, px, py, pz, behind)
         fx, fy, fz = ex, ey, ez
-        right, ahead, aside = zero, zero, splat(-1.0)
-        to_head, head_diagonal, head_right = one, zero, zero
-        for row in range(n_rows):
-            nx, ny, nz, next_pull = qx, qy, qz, final
-            if opening:
-                rx, ry, rz = vx, vy, vz
-                real = load(present, atom)
-                target = gather(given, rows, atom, 0) * real if driven else zero
-                count = count + real
-                scale = scale + (dot(rx, ry, rz, rx, ry, rz) + target * target)
-                target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent is not None else target)
-                store_triple(work, slot + _S, sx, sy, sz)
-                store(work, slot + _TARGET, target)
-                if row + 1 < n_rows:
-                    at, wrapped = atom + 2 * WIDTH, tangent is None
-                    nx, ny, nz, bx, by, bz = _next_bond(origins, table, at, bx, by, bz, cell, kind, True)
-                    vx, vy, vz, dx, dy, dz = _next_bond(changed, table, at, dx, dy, dz, cell, kind, wrapped)
-            else:
-                rx, ry, rz = load_triple(work, slot + _R)
-                target = load(work, slot + _TARGET)
-                _add_up(room, slot, iteration, pull)
-                real = one if atom < whole else load(present, atom)
-                if row + 1 < n_rows:
-                    nx, ny, nz = load_triple(work, slot + stride + _S)
-                    next_pull = _pull_of(room, slot + stride, pull, final)
-            leave = load(weights, atom + onward)
-            ox, oy, oz = _displacement(leave, nx, ny, nz, next_pull, sx, sy, sz, pull)
-            rx, ry, rz = rx + (ex - ox), ry + (ey - oy), rz + (ez - oz)
-            store_triple(work, slot + _R, rx, ry, rz)
-            if tangent is not None:
-                error, inner, positive, ratio = _rate_error(rx, ry, rz, sx, sy, sz, target, real)
-                rx, ry, rz = sx, sy, sz
-            else:
-                error, inner, positive, ratio = _length_error(rx, ry, rz, sx, sy, sz, target, real)
-            least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, slot)
-            masses = (weight + leave) * real
-            lower = weight * dot(rx, ry, rz, px, py, pz)
-            pivot = 1.0 / (where_zero(masses, 1.0, masses * inner) + lower * ahead)
-            right = (error + lower * right) * pivot
-            aside = flushed(lower * aside * pivot)
-            ahead = -leave * dot(rx, ry, rz, nx, ny, nz) * pivot
-            store_triple(work, slot + _RIGHT, right, ahead, aside)
-            head_diagonal = head_diagonal + to_head * aside
-            head_right = head_right + to_head * right
-            to_head = flushed(-to_head * ahead)
-            px, py, pz, sx, sy, sz, pull = sx, sy, sz, nx, ny, nz, next_pull
-            ex, ey, ez, weight = ox, oy, oz, leave
-            slot += stride
-            atom += step
+        (
+            (head_diagonal, head_right, to_head, ahead, right, aside), (px, py, pz, ex, ey, ez, weight),
+            (least, total, peak, peak_slot), count, scale,
+        ) = _sweep(
+            origins, changed, table, numbers, exists, heavy, goals, room, cell, kind, tangent, driven, n_rows, whole,
+            iteration, (slot, stride, atom, step, onward), (px, py, pz), behind, (qx, qy, qz), final, (sx, sy, sz),
+            pull, (ex, ey, ez), weight, (bx, by, bz), (dx, dy, dz), (vx, vy, vz), count, scale,
+        )  # fmt: skip
         # The separators: move, measure, and add what the pieces pass on.
         real = load(present, end) * sign
         rx, ry, rz = load_triple(work, seam + _R)
@@ -308,14 +341,11 @@ def _solve(
         else:
             gx, gy, gz, fx, fy, fz = fx, fy, fz, from_next(ex), from_next(ey), from_next(ez)
         rx, ry, rz = rx + real * (gx - fx), ry + real * (gy - fy), rz + real * (gz - fz)
-        store_triple(work, seam + _R, rx, ry, rz)
         _add_up(room, seam, iteration, pulls)
         real = load(present, end)
-        if tangent is not None:
-            error, inner, positive, ratio = _rate_error(rx, ry, rz, zx, zy, zz, seam_target, real)
-            rx, ry, rz = zx, zy, zz
-        else:
-            error, inner, positive, ratio = _length_error(rx, ry, rz, zx, zy, zz, seam_target, real)
+        error, inner, positive, ratio, rx, ry, rz = _measured(
+            room, seam, rx, ry, rz, zx, zy, zz, seam_target, real, tangent
+        )
         least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, seam)
         if tangent is not None and opening:
             limit = limit * np.sqrt(lane_sum(scale, small) / lane_sum(count, small))
@@ -355,9 +385,8 @@ def _solve(
 def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, first, n_slots, solves, undo, keep):
     """Add the displacements of a strip, keeping what was there.
 
-    The first solve's part is repeated as the sweep computed it, number for
-    number: multipliers of a straight chain are much larger than displacements,
-    and the later solves corrected just this rounding.
+    The first solve's part is repeated as the sweep computed it, number for number: multipliers of a straight chain are
+    much larger than displacements, and the later solves corrected just this rounding.
     """
     move = velocities.shape[0] > 0
     seam = (n_slots - 1) * SLOT
@@ -433,11 +462,7 @@ def project(
     points, references, velocities, inverse_dt, tangent, starts, atoms, owned, full, rows, present, weights, wholes,
     given, lattice, kind, multipliers, work, undo,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Project one strip after another.
-
-    `tangent` is None where `points` are positions, and anything else where
-    they are velocities: a kernel is compiled for each.
-    """
+    """Project one strip after another; `tangent` is None for positions. A kernel is compiled for each of the two."""
     small = np.empty(8 * WIDTH)
     cell = lattice_numbers(lattice)
     worst, worst_row, most = 0.0, -1, 0
