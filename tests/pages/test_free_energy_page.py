@@ -33,7 +33,8 @@ def test_alanine_dipeptide_against_mbar():
     steps, windows = f"{found['steps of each method']:,}", found["windows"]
     assert f"{windows} windows from both sides" in TEXT and f"({steps}, 4 fs)" in TEXT
     assert found["root mean square difference"] < (ours**2 + theirs**2) ** 0.5
-    assert found["doubtful windows"] == []
+    # At a level of 1 % each: of 36, two or more have a chance of 5 %.
+    assert len(found["doubtful windows"]) == 1 and "two sides of one window differ" in TEXT
 
 
 def test_pulls_against_windows():
