@@ -401,7 +401,7 @@ def main(arguments: list[str]) -> None:
     if "--alanine" in arguments:
         folder = Path(arguments[arguments.index("--alanine") + 1])
         folder.mkdir(parents=True, exist_ok=True)
-        found = {"alanine dipeptide": alanine(folder, 24, 36, 120_000, 1)}
+        found = {"alanine dipeptide": alanine(folder, 24, 36, 240_000, 1)}
     elif "--placement" in arguments:
         found = {"placement": placement()}
     elif "--recording" in arguments:
