@@ -15,6 +15,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
+from kcons.constraints.arguments import as_array, numbers
 from kcons.errors import InputError
 
 #: The record at the end of an archive without comment; the fifth number is how many files there are.
@@ -95,3 +96,19 @@ def stored_arrays(file: BinaryIO) -> dict[str, Any]:
                 raise ValueError(f"{name} is longer than what it holds")
             found[name.removesuffix(".npy")] = array if array.ndim else array.item()
     return found
+
+
+def checked_state(values: dict[str, Any]) -> dict[str, Any]:
+    """What a state is made of, as a step needs it."""
+    shape = np.shape(values["positions"])
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"positions have shape {shape}")
+    for name in ("positions", "velocities", "forces", "remainder"):
+        if name in values:
+            values[name] = as_array(values[name], shape, name)
+    for name in {"thermostat", "barostat"} & set(values):
+        values[name] = np.atleast_1d(numbers(values[name], name))
+    for name, kind in (("time", float | int), ("time_remainder", float | int), ("step", int)):
+        if not isinstance(values.get(name, 0), kind):
+            raise ValueError(f"{name} is {values[name]!r:.40}")
+    return values

@@ -13,6 +13,7 @@ Notes, eq. 105 (corrected); Baumgarte, Comput. Methods Appl. Mech. Eng. 1, 1 (19
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import ref
 
 import numpy as np
 
@@ -87,7 +88,7 @@ class ProjectedOde:
                     system.motion.project_velocities(x, v, time=time, out=v)
         except ConvergenceError as error:
             raise explained(error, system, state, dt, number) from error
-        return State(x, v, time, forces, number, None, time_remainder)
+        return State(x, v, time, forces, number, None, time_remainder, origin=(ref(system), x))
 
     def _with_forces(self, system: System, state: State) -> State:
         return system.with_forces(state)

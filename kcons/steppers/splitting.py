@@ -103,7 +103,7 @@ class Splitting(Listed):
             return still
         flights = self._flights(system)
         if flights is not None:
-            start = state if state.forces is not None else system.with_forces(state)
+            start = state if state is system.last and state.forces is not None else system.with_forces(state)
             return fused_steps(system, start, dt, 1, flights, self.kicks, self._stages)[0]
         operations = self.operations(system)
         start = system.with_forces(state) if operations[0].verb == "kick" else state

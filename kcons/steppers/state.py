@@ -9,6 +9,7 @@ from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO
+from weakref import ReferenceType, ref
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
-from kcons.steppers.files import in_one_piece, stored_arrays
+from kcons.steppers.files import checked_state, in_one_piece, stored_arrays
 from kcons.steppers.stages.compensated_steps import beyond, check_finite
 from kcons.steppers.stages.drifts import Drift, FreeFlight, GreatCircles
 from kcons.steppers.stages.friction import Friction
@@ -60,6 +61,9 @@ class State:
         What rounding took from the time, so that a million steps of dt are a million dt.
     thermostat, barostat : ndarray or None
         Their variables, if there are such; those of a barostat begin with the cell.
+    origin : tuple of a weak reference to System and of positions, or None
+        Whose forces these are, and where: those of another System or of other positions are evaluated anew. None, as of
+        a state that was loaded or made by hand: forces are taken as they are.
     """
 
     positions: FloatArray
@@ -71,6 +75,7 @@ class State:
     time_remainder: float = 0.0
     thermostat: FloatArray | None = None
     barostat: FloatArray | None = None
+    origin: tuple[ReferenceType[Any], FloatArray] | None = None
 
     def __init__(
         self,
@@ -83,6 +88,7 @@ class State:
         time_remainder: float = 0.0,
         thermostat: FloatArray | None = None,
         barostat: FloatArray | None = None,
+        origin: tuple[ReferenceType[Any], FloatArray] | None = None,
     ) -> None:
         # Written out, since a step makes one: what dataclass writes takes three times as long.
         own = vars(self)
@@ -95,6 +101,11 @@ class State:
         own["time_remainder"] = time_remainder
         own["thermostat"] = thermostat
         own["barostat"] = barostat
+        own["origin"] = origin
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All that means something to another process."""
+        return {name: value for name, value in vars(self).items() if name != "origin"}
 
     @property
     def cell(self) -> FloatArray | None:
@@ -107,6 +118,17 @@ class State:
         time = self.time + step
         part = time - self.time
         return time, (self.time - (time - part)) + (step - part)
+
+    def is_of(self, system: object) -> bool:
+        """Whether the state is of this System, as far as one can tell."""
+        return self.origin is None or self.origin[0]() is system
+
+    def has_forces_of(self, system: object) -> bool:
+        """Whether it carries forces of this System, at its positions, as far as one can tell."""
+        if self.origin is None or self.forces is None:
+            return self.forces is not None
+        there, here = self.origin[1], self.positions
+        return self.is_of(system) and (there is here or np.array_equal(there, here))
 
     def reversed(self) -> State:
         """The same point with opposite velocities."""
@@ -121,7 +143,7 @@ class State:
         file : path or binary file
             A path is replaced in one piece, so that an interrupted write leaves the older file.
         """
-        present = {name: value for name, value in vars(self).items() if value is not None}
+        present = {name: value for name, value in self.__getstate__().items() if value is not None}
         if not isinstance(file, str | PathLike):
             np.savez(file, **present)
             return
@@ -141,7 +163,7 @@ class State:
             with Path(file).open("rb") as opened:
                 return cls.load(opened)
         try:
-            return cls(**_checked(stored_arrays(file)))
+            return cls(**checked_state(stored_arrays(file)))
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
@@ -171,22 +193,6 @@ class _Shown(State):
 
 def _lent(array: FloatArray | None) -> FloatArray | None:
     return None if array is None else lent(array)
-
-
-def _checked(values: dict[str, Any]) -> dict[str, Any]:
-    """What a state is made of, as a step needs it."""
-    shape = np.shape(values["positions"])
-    if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"positions have shape {shape}")
-    for name in ("positions", "velocities", "forces", "remainder"):
-        if name in values:
-            values[name] = as_array(values[name], shape, name)
-    for name in {"thermostat", "barostat"} & set(values):
-        values[name] = np.atleast_1d(numbers(values[name], name))
-    for name, kind in (("time", float | int), ("time_remainder", float | int), ("step", int)):
-        if not isinstance(values.get(name, 0), kind):
-            raise ValueError(f"{name} is {values[name]!r:.40}")
-    return values
 
 
 class System:
@@ -272,8 +278,7 @@ class System:
         try:
             self.motion.certify(x, v, time)
         except CertificateError:
-            # Relative to the speed alone nothing that has come to rest could be certified, nor what is left of a kick
-            # along the constraints.
+            # By its speed alone nothing at rest could be certified, nor what is left of a kick along the constraints.
             self.motion.certify(x, v, time, still=self.rest(x, v, time, dt))
 
     # -- states ---------------------------------------------------------------------------------
@@ -362,10 +367,8 @@ class System:
                     item="velocities",
                     atoms=[atom],
                 )
-            v = tangent
-        elif not given:
-            v = tangent
-        return State(x, v, time, remainder=remainder)
+            given = False
+        return State(x, v if given else tangent, time, remainder=remainder)
 
     def rest(self, x: FloatArray, v: FloatArray, time: float, dt: float = 0.0) -> float:
         """Speed below which velocities are rounding: of a kick by which atoms cross the system, or of one for `dt`."""
@@ -419,7 +422,7 @@ class System:
         if state is self.last:
             return x, v, f
         x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
-        return x, v, None if f is None else as_array(f, self._shape, "forces")
+        return x, v, None if f is None or not state.has_forces_of(self) else as_array(f, self._shape, "forces")
 
     def resisted(self, f: FloatArray, v: FloatArray) -> FloatArray:
         """Applied forces and friction together, where friction is not solved exactly."""
@@ -427,10 +430,10 @@ class System:
 
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""
-        if state.forces is not None:
+        if state.has_forces_of(self):
             return state
         x, v, _ = self.taken(state)
-        return replace(state, forces=self.forces(x, v, state.time, state.step))
+        return replace(state, forces=self.forces(x, v, state.time, state.step), origin=(ref(self), state.positions))
 
     # -- energies -------------------------------------------------------------------------------
 

@@ -137,6 +137,8 @@ class NoseHooverChain(Listed):
 
     def start(self, system: System, state: State) -> State:
         """The state with its forces and a chain at rest."""
+        if not state.is_of(system):
+            state = replace(state, thermostat=None)  # degrees of freedom are those of another system
         known = carried(state, 2 * self.length + 1, "this NoseHooverChain")
         state = system.with_forces(state)
         if known:

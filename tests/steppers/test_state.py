@@ -1,9 +1,11 @@
-"""States and systems: checks at the start, saving and loading, positions far from the origin."""
+"""States and systems: checks at the start, saving, whose forces a state carries, positions far from the origin."""
 
 from __future__ import annotations
 
 import errno
 import io
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,17 @@ from stepper_systems import SYMMETRIC, gravity, rotor, spherical_pendulum, syste
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, MovingTarget
 from kcons.errors import InputError
-from kcons.steppers import BlanesMoan6, State, System, run
+from kcons.steppers import (
+    BlanesMoan6,
+    Geodesic,
+    ProjectedRungeKutta4,
+    ProjectedVerlet,
+    Rattle,
+    State,
+    System,
+    run,
+)
+from kcons.thermostats import Langevin, NoseHooverChain
 
 
 def test_float32_input_is_cast():
@@ -89,13 +101,25 @@ def test_energy_needs_a_potential():
         system.total_energy(state)
 
 
+def test_what_is_no_motion_or_force() -> None:
+    system, _ = rotor()
+    for item, given in (("motion", (None,)), ("force", (system.motion, 3))):
+        with pytest.raises(InputError, match=f"{item} is .*give") as caught:
+            System(*given)
+        assert caught.value.item == item
+    with pytest.raises(InputError, match=r"constraint_set is None; give a kcons\.ConstraintSet"):
+        Motion(None, np.zeros((2, 3)))
+    with pytest.raises(InputError, match="constraints is None; give"):
+        ConstraintSet(None, np.zeros((2, 3)), np.ones(2))
+
+
 # -- saving -----------------------------------------------------------------------------------------
 
 
 def assert_same(a: State, b: State) -> None:
     """To the last bit, in everything a state holds."""
-    assert vars(a).keys() == vars(b).keys()
-    for name, value in vars(a).items():
+    assert a.__getstate__().keys() == b.__getstate__().keys()
+    for name, value in a.__getstate__().items():
         other = getattr(b, name)
         assert type(value) is type(other), name
         assert np.array_equal(value, other), name
@@ -230,12 +254,89 @@ def test_a_full_disk_leaves_nothing_behind(room: int, tmp_path: Path, monkeypatc
     assert_same(State.load(path), older)
 
 
-# -- time and distance ------------------------------------------------------------------------------
+# -- time, and whose forces -------------------------------------------------------------------------
 
 
 def test_time_adds_up_exactly() -> None:
     system, state = rotor(omega=0.0)
     assert run(system, state, 0.1, 1000).time == 100.0
+
+
+def pendulum(g: float) -> tuple[System, State, list[float]]:
+    """A pendulum of three atoms in a field of its own, and the field of each evaluation."""
+    asked: list[float] = []
+
+    def force(x: np.ndarray, t: float) -> np.ndarray:
+        asked.append(g)
+        return np.tile([0.0, 0.0, -g], (3, 1))
+
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    system = system_of([FixedAtoms([0]), Distance([[0, 1], [1, 2]])], x, np.ones(3), force, potential=lambda x, t: 0.0)
+    return system, system.initial_state(x), asked
+
+
+STEPPERS = [Rattle(), BlanesMoan6(), Geodesic(), ProjectedVerlet(), ProjectedRungeKutta4()]
+
+
+@pytest.mark.parametrize("stepper", [*STEPPERS, Langevin(1.0, 1.0, 5), NoseHooverChain(1.0, 5.0)], ids=repr)
+def test_forces_of_another_system_are_not_taken(stepper) -> None:
+    here, start, asked = pendulum(1.0)
+    there = pendulum(7.0)[0]
+    end = stepper.step(there, start, 0.05)
+    asked.clear()
+    taken = stepper.step(here, end, 0.05)
+    made = State(end.positions, end.velocities, end.time, None, end.step, end.remainder, end.time_remainder)
+    assert set(asked) == {1.0} and np.array_equal(taken.positions, stepper.step(here, made, 0.05).positions)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS[:3], ids=repr)
+def test_forces_are_kept_at_their_positions_only(stepper) -> None:
+    system, start, asked = pendulum(1.0)
+    end = stepper.step(system, start, 0.05)
+    assert np.array_equal(system.with_forces(end).forces, end.forces)
+    asked.clear()
+    stepper.step(system, end, 0.05)
+    once = len(asked)
+    asked.clear()
+    stepper.step(system, replace(end, velocities=end.velocities / 2), 0.05)
+    assert len(asked) == once
+    asked.clear()
+    same = stepper.step(system, replace(end, positions=end.positions.copy()), 0.05)
+    assert len(asked) == once and np.array_equal(same.positions, stepper.step(system, end, 0.05).positions)
+    asked.clear()
+    turned = replace(end, positions=end.positions[:, [1, 0, 2]], velocities=end.velocities[:, [1, 0, 2]])
+    stepper.step(system, turned, 0.05)
+    first = len(stepper.kicks) > 0 and stepper.operations(system)[0].verb == "kick"
+    assert len(asked) == once + first
+
+
+def test_another_system_begins_a_thermostat_anew() -> None:
+    here, start, _ = pendulum(1.0)
+    there = pendulum(7.0)[0]
+    chain = NoseHooverChain(1.0, 5.0)
+    warm = run(there, start, 0.05, 20, stepper=chain)
+    assert not np.array_equal(warm.thermostat, chain.start(there, start).thermostat)
+    assert np.array_equal(chain.start(there, warm).thermostat, warm.thermostat)
+    assert np.array_equal(chain.start(here, warm).thermostat, chain.start(here, start).thermostat)
+
+
+def test_copies_know_whose_forces_they_carry() -> None:
+    here, start, asked = pendulum(1.0)
+    there = pendulum(7.0)[0]
+    end = Rattle().step(here, start, 0.05)
+    own = end.copied()
+    assert own.positions is not end.positions and own.has_forces_of(here) and not own.has_forces_of(there)
+    assert end.shown().has_forces_of(here) and not end.shown().has_forces_of(there)
+    # Nothing else can be known of what another process or a file says.
+    again = pickle.loads(pickle.dumps(end))
+    assert again.origin is None and again.has_forces_of(here) and again.has_forces_of(there)
+    assert_same(again, end)
+    asked.clear()
+    assert_same(Rattle().step(here, own, 0.05), Rattle().step(here, again, 0.05))
+    assert len(asked) == 2
+
+
+# -- far from the origin ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
@@ -273,15 +374,3 @@ def test_far_may_be_switched_off() -> None:
 def test_bad_far(far) -> None:
     with pytest.raises(InputError, match="far is"):
         rotor(far=far)
-
-
-def test_what_is_no_motion_or_force() -> None:
-    system, _ = rotor()
-    for item, given in (("motion", (None,)), ("force", (system.motion, 3))):
-        with pytest.raises(InputError, match=f"{item} is .*give") as caught:
-            System(*given)
-        assert caught.value.item == item
-    with pytest.raises(InputError, match=r"constraint_set is None; give a kcons\.ConstraintSet"):
-        Motion(None, np.zeros((2, 3)))
-    with pytest.raises(InputError, match="constraints is None; give"):
-        ConstraintSet(None, np.zeros((2, 3)), np.ones(2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import ref
+
 from kcons.constraints.target import FloatArray
 from kcons.steppers.state import State, System
 
@@ -58,6 +60,8 @@ class Frame:
         if self.shift is not None:
             positions = x + self.shift
             remainder = x - (positions - self.shift)
-        last = State(positions, v, self.time, forces, self.number, remainder, self.left_over, thermostat)
-        self.system.last = last
+        system, number = self.system, self.number
+        origin = ref(system), positions
+        last = State(positions, v, self.time, forces, number, remainder, self.left_over, thermostat, origin=origin)
+        system.last = last
         return last

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
+from weakref import ref
 
 import numpy as np
 
@@ -116,7 +117,7 @@ def fused_steps(
         flights.motion.took(found)
     x, remainder = _relative(x, shift, work) if shift is not None or far else (x, None)
     forces = start.forces if force is None else f.copy()
-    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over)
+    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, origin=(ref(system), x))
     return state, steps
 
 

@@ -181,6 +181,10 @@ class Isokinetic(Splitting):
             A row couples the thermostatted atoms to others.
         """
         self.check(system)
+        if not state.is_of(system):
+            state = replace(state, forces=None, thermostat=None)  # degrees of freedom are those of another system, too
+        elif not state.has_forces_of(system):
+            state = replace(state, forces=None)
         if carried(state, 4, "Isokinetic"):
             if state.forces is None and state.thermostat is not None:
                 state = system.with_forces(state)

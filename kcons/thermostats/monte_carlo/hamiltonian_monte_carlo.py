@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,7 +168,6 @@ class HamiltonianMonteCarlo:
             )
         self.conserve_momentum = bool(conserve_momentum)
         self.tolerance = positive(tolerance, "tolerance")
-        self._left: tuple[System, State] | None = None
         self._known: tuple[System, ReversedSteps, FloatArray] | None = None
 
     def __repr__(self) -> str:
@@ -230,9 +230,8 @@ class HamiltonianMonteCarlo:
             raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
         held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
         held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
-        if not self._knows(system, state) or math.isnan(held[POTENTIAL]):
-            # What it carries may be of other positions, or of another System.
-            state = replace(state, forces=None)
+        # Positions without forces may be new ones, and what a state carries that of another system.
+        if not state.has_forces_of(system) or math.isnan(held[POTENTIAL]):
             held[POTENTIAL] = energy_at(system, state)
             if not math.isfinite(held[POTENTIAL]):
                 raise NonFiniteError(
@@ -256,9 +255,8 @@ class HamiltonianMonteCarlo:
         else:
             held[POTENTIAL] = potential
         time, left_over = state.later(length)
-        end = replace(end, time=time, time_remainder=left_over, step=state.step + 1, thermostat=held)
-        self._left = system, end
-        return end
+        number, origin = state.step + 1, (ref(system), end.positions)
+        return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 
     def trajectory(self, system: System, state: State, dt: float, count: int) -> State:
         """The end of so many steps from `state`, each of which was taken back.
@@ -295,13 +293,6 @@ class HamiltonianMonteCarlo:
         if not math.isfinite(change):
             return begin, NOT_FINITE, math.nan, potential
         return end, ACCEPTED if threshold < -change else ENERGY, change, there
-
-    def _knows(self, system: System, state: State) -> bool:
-        """Whether the last proposal ended at these positions of this system."""
-        if self._left is None or self._left[0] is not system or state.forces is None:
-            return False
-        last = self._left[1]
-        return last is state or np.array_equal(last.positions, state.positions)
 
     def _refreshed(self, system: System, state: State, random: np.random.Generator) -> FloatArray:
         """Velocities of which a part is kept and a part drawn, in the tangent plane."""

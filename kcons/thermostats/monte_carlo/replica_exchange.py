@@ -11,6 +11,7 @@ import numpy as np
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError
 from kcons.steppers import State
+from kcons.steppers.state import START_TOLERANCE
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTENTIAL, SIZE, seed_number, stream
 
 
@@ -45,7 +46,7 @@ def exchange(
     ------
     InputError
         Fewer than two states, not as many temperatures; temperatures that are not positive; a state without a potential
-        energy.
+        energy; states of Systems of other masses or constraints.
     """
     if not all(isinstance(given, Sequence | np.ndarray) for given in (states, thermal_energies)):
         raise InputError("give a sequence of states, and of as many temperatures", item="states")
@@ -68,6 +69,7 @@ def exchange(
             )
         if state.positions.shape != states[0].positions.shape:
             raise InputError(f"state {k} has another number of atoms than state 0", item="states")
+        _refuse_others(states[0], state, k)
     chances = np.log1p(-stream(seed_number(seed), int(number), EXCHANGE).random(len(states)))
     after = list(states)
     told: list[bool | None] = [None] * (len(states) - 1)
@@ -85,6 +87,21 @@ def potential_of(state: State) -> float:
     return math.nan if state.thermostat is None else float(state.thermostat[POTENTIAL])
 
 
+def _refuse_others(first: State, other: State, k: int) -> None:
+    """Refuse states of which one is not on the constraints of the other."""
+    systems = [None if state.origin is None else state.origin[0]() for state in (first, other)]
+    if systems[0] is None or systems[1] is None:
+        return
+    if not np.array_equal(systems[0].masses, systems[1].masses):
+        raise InputError(f"state {k} has other masses than state 0", item="states")
+    for system, state in zip(systems, (other, first), strict=True):
+        assert system is not None
+        held = system.motion.constraint_set
+        x, time = state.positions, state.time
+        if (np.abs(held.value(x, time)) > np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))).any():
+            raise InputError(f"state {k} is of other constraints than state 0", item="states")
+
+
 def _moved(there: State, here: State, scale: float) -> State:
     """The configuration of `there`, with velocities scaled, in the run of `here`."""
     assert there.thermostat is not None and here.thermostat is not None
@@ -97,4 +114,5 @@ def _moved(there: State, here: State, scale: float) -> State:
         forces=there.forces,
         remainder=there.remainder,
         thermostat=held,
+        origin=there.origin,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -48,7 +50,7 @@ class ReversedSteps:
         KconsError
             As the stepper.
         """
-        watched = self.watched
+        watched, state = self.watched, replace(state, origin=None)  # forces of the system are those of the watched one
         self._known = [] if state.forces is None else [(state.positions, state.forces)]
         self._back = False
         after = stepper.step(watched, state, dt)

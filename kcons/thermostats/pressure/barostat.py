@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -249,7 +249,8 @@ class Barostat:
             return replace(state, barostat=variables)
         variables[:WORK] = after.cell.ravel()
         variables[WORK] += after.energy - before.energy
-        return replace(state, positions=positions, remainder=remainder, forces=after.forces, barostat=variables)
+        moved = replace(state, positions=positions, remainder=remainder, barostat=variables)
+        return replace(moved, forces=after.forces, origin=(ref(system), positions))
 
     def _enter(self, system: CellSystem, cell: FloatArray, positions: FloatArray) -> None:
         self._check_width(system, cell)

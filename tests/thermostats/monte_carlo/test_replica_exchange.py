@@ -7,7 +7,9 @@ import math
 import numpy as np
 import pytest
 from monte_carlo_systems import trap, trap_potential, trimer
+from thermostat_systems import system
 
+from kcons.constraints import Distance
 from kcons.errors import InputError
 from kcons.steppers import State, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange
@@ -75,6 +77,24 @@ def test_bad_input():
     ):
         with pytest.raises(InputError, match=words):
             exchange(given, temperatures, 1, number)
+
+
+@pytest.mark.parametrize("other", ["masses", "constraints"])
+def test_states_of_other_systems(other):
+    held, states = ladder(1)
+    masses = held.masses * (2 if other == "masses" else 1)
+    rods = Distance([[0, 1], [1, 2]]) if other == "masses" else Distance([[0, 1]], 1.3)
+    x = states[1].positions
+    apart = system([rods], x, masses, trap, trap_potential)
+    changed = run(apart, apart.initial_state(x, project=True), 0.3, 1, stepper=HamiltonianMonteCarlo(0.45, 3, 1))
+    for given in ([states[0], changed, states[2]], [changed, states[1], states[2]]):
+        with pytest.raises(InputError, match=f"state 1 .*other {other} than state 0"):
+            exchange(given, LADDER, 1, 0)
+    # Another System of the same masses and constraints is as good.
+    same, start = trimer(trap, trap_potential)
+    again = run(same, start, 0.3, 1, stepper=HamiltonianMonteCarlo(0.45, 3, 1, keep=0.2))
+    after, _ = exchange([states[0], again, states[2]], LADDER, 1, 0)
+    assert np.isfinite(run(held, after[0], 0.3, 1, stepper=HamiltonianMonteCarlo(0.3, 3, 0, keep=0.2)).positions).all()
 
 
 def test_what_are_no_states_or_temperatures():
