@@ -15,9 +15,15 @@ from kcons.ase.thermostat_dynamics import ThermostattedDynamics
 from kcons.constraints.arguments import numbers, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import State, System
 from kcons.thermostats import ForceGroups, IsokineticSpheres, LangevinRespa
 
 Bath = Literal["langevin", "spheres"]
+
+_OF_ONE_BATH: dict[Bath, tuple[str, ...]] = {
+    "langevin": ("conserve_momentum",),
+    "spheres": ("spheres", "auxiliary"),
+}
 
 
 class MultipleTimeSteps(ThermostattedDynamics):
@@ -63,7 +69,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     ------
     InputError
         One calculator given twice; calculators of other atoms; bad numbers of steps, friction or
-        temperature. The atoms are then as they were.
+        temperature; options of the other bath. The atoms are then as they were. While it runs: the atoms got another
+        calculator.
     UnsupportedError
         Spheres with constraints that move or that hold velocities.
     """
@@ -87,12 +94,10 @@ class MultipleTimeSteps(ThermostattedDynamics):
             raise InputError(f"bath is {bath!r}; choose 'langevin' or 'spheres'", item="bath")
         #: Seed of the noise.
         self.seed = seed_from(seed, "seed")
-        own = (
-            "order",
-            "substeps",
-            "slow_kicks",
-            *(("spheres", "auxiliary") if bath == "spheres" else ("conserve_momentum",)),
-        )
+        other = _OF_ONE_BATH["langevin" if bath == "spheres" else "spheres"]
+        for name in set(other) & set(kwargs):
+            raise InputError(f"{name} is no option with bath={bath!r}; leave it out", item=name)
+        own = "order", "substeps", "slow_kicks", *_OF_ONE_BATH[bath]
         self._options = {name: kwargs.pop(name) for name in own if name in kwargs}
         self._options["steps"] = {"slow": 1, "fast": fast_steps}
         self._bath: Bath = bath
@@ -112,7 +117,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
             self.groups = ForceGroups({"fast": cheap, "slow": expensive})
         self._force = self.groups  # type: ignore[method-assign, assignment]
         before = atoms.calc
-        atoms.calc = slow if difference else SumCalculator([fast, slow])
+        atoms.calc = self._whole = slow if difference else SumCalculator([fast, slow])
         try:
             super().__init__(atoms, timestep, cast(Any, stepper), **kwargs)
         except BaseException:
@@ -139,6 +144,15 @@ class MultipleTimeSteps(ThermostattedDynamics):
             return found
 
         return force
+
+    def _start(self, system: System) -> State:
+        if self.atoms.calc is not self._whole:
+            raise InputError(
+                f"the atoms got another calculator, {self.atoms.calc!r:.80}, while forces are those of fast and slow; "
+                "make another MultipleTimeSteps with it",
+                item="calculator",
+            )
+        return super()._start(system)
 
     def _begin(self) -> None:
         """Find the spheres, so that what cannot be is refused before the first step."""

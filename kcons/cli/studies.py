@@ -100,6 +100,8 @@ def compare_steps(chosen: argparse.Namespace, budget: float, folder: Path) -> in
         raise InputError("--slow needs --fast: give the cheap forces, too", item="fast")
     if chosen.target_error is not None or chosen.forces is not None:
         raise InputError("--slow and --fast take the place of --forces, and have no --target-error", item="slow")
+    if chosen.slow == chosen.fast:
+        raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
     with Bars() as watcher:
         with watcher.piece("building the system", 1):
             layers = _layers(chosen)
@@ -136,7 +138,7 @@ def _layers(chosen: argparse.Namespace) -> Any:
                 item="fast",
             ) from None
         fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
-        return layers.of_fluid(fluid, fast, slow, sweeps=2000 if chosen.quick else 20_000, seed=chosen.seed)
+        return layers.of_fluid(fluid, fast, slow, sweeps=10_000 if chosen.quick else 20_000, seed=chosen.seed)
     if chosen.scene is None or not Path(chosen.scene).is_file():
         known = ", ".join(test_systems.FLUIDS)
         raise InputError(f"--slow and --fast are for {known} and for files, not {chosen.scene!r}", item="scene")

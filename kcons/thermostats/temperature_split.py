@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, generator_of, positive, whole_number
+from kcons.constraints.arguments import as_array, generator_of, positive, refuse_other, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -48,6 +48,8 @@ UNCHANGED = 1e-9
 THIN = 1e-9
 #: Share of its thermal energy below which a cluster has no motion of its own.
 RIGID = 1e-9
+#: Violation of a row, relative to its scale, that no temperature shows; positions in single precision have 1e-6.
+OFF = 1e-5
 #: How far atoms are moved, as a share of the size of all, to see whether a row knows a place in space.
 _SPREAD = 1e-3
 
@@ -225,6 +227,7 @@ class TemperatureSplit:
         directions: int = 1,
         groups: Mapping[str, ArrayLike] | None = None,
     ) -> None:
+        refuse_other(system, System, "system", "a kcons.steppers.System")
         if system.motion.plan.driven or system.velocity_dependent:
             raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
         if not system.motion.constraint_set.holonomic.all():
@@ -252,7 +255,7 @@ class TemperatureSplit:
         Raises
         ------
         InputError
-            Wrong shapes, NaN or infinity.
+            Wrong shapes, NaN or infinity; positions off the constraints; groups without a cluster.
         NonFiniteError
             Forces that are not finite.
         """
@@ -261,6 +264,16 @@ class TemperatureSplit:
         bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if len(bad):
             raise InputError(f"positions of atom {bad[0]} are not finite; leave this frame out", atoms=[int(bad[0])])
+        held = system.motion.constraint_set
+        miss = np.abs(held.value(x, 0.0)) / held.scale
+        if not np.all(miss <= OFF):
+            row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss)))
+            raise InputError(
+                f"positions are off row {held.row_name(row)} by {miss[row]:.3g} of its size; bring them onto the "
+                "constraints with Motion.restore_positions",
+                item="positions",
+                atoms=held.row_atoms(row),
+            )
         f = self._forces(x) if forces is None else as_array(forces, shape, "forces")
         check_finite(f, "force", len(self._series))
         if self._clusters is None:
@@ -332,6 +345,12 @@ class TemperatureSplit:
         atoms = np.flatnonzero(moving)
         np.minimum.at(first, clusters.label[atoms], atoms)
         members = [np.ones(clusters.count), *(np.isin(first, chosen) * 1.0 for chosen in self._groups.values())]
+        for name, member in zip(self._groups, members[1:], strict=True):
+            if not member.any():
+                raise InputError(
+                    f"group {name!r} has no first atom of a cluster that moves; give all atoms of its clusters",
+                    item="groups",
+                )
         self._member: FloatArray = np.array(members)
         #: Axes about which each cluster turns.
         self._axes: IntArray = clusters.unit_turns(clusters.arms(x)).any(axis=1).sum(axis=1)

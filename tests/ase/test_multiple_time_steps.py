@@ -172,6 +172,8 @@ def test_temperatures():
         ({"bath": "hot"}, "bath is 'hot'"),
         ({"bath": "spheres", "spheres": "axes", "auxiliary": 0}, "radius 0"),
         ({"slow": 3}, "slow is 3; give an ASE calculator"),
+        ({"auxiliary": 2}, "auxiliary is no option with bath='langevin'"),
+        ({"conserve_momentum": True, "bath": "spheres"}, "conserve_momentum is no option with bath='spheres'"),
     ],
 )
 def test_bad_input_changes_nothing(options, words):
@@ -220,3 +222,19 @@ def test_a_step_that_fails_leaves_the_atoms_as_they_were():
     assert caught.value.step == 3
     np.testing.assert_array_equal(atoms.positions, before)
     np.testing.assert_array_equal(atoms.get_momenta(), momenta)
+
+
+def test_another_calculator_on_the_atoms():
+    """Its energies would be logged, and its forces not used."""
+    atoms = waters()
+    moving = MultipleTimeSteps(atoms, 4 * FS, fast=Waves(), slow=Waves(0.05), **TWO)
+    moving.run(2)
+    whole, before, momenta = atoms.calc, atoms.positions.copy(), atoms.get_momenta()
+    atoms.calc = Waves()
+    with pytest.raises(InputError, match=r"another calculator, .* make another MultipleTimeSteps"):
+        moving.run(1)
+    np.testing.assert_array_equal(atoms.positions, before)
+    np.testing.assert_array_equal(atoms.get_momenta(), momenta)
+    atoms.calc = whole
+    moving.run(1)
+    assert moving.evaluations == {"fast": 13, "slow": 4}

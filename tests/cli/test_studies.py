@@ -45,6 +45,7 @@ def test_how_long_the_step_may_be(tmp_path, monkeypatch, capsys):
         ("compare chain --fast 3", "are for thermostat, thermostat-dumbbells, thermostat-water and for files"),
         ("compare thermostat-water --fast 3 --methods rattle", "there is no method 'rattle'"),
         ("compare thermostat-water --fast 9", "molecules reach 9"),
+        ("compare run.pdb --slow gfn2 --fast gfn2", "are both gfn2: give cheaper forces to --fast"),
     ],
 )
 def test_expensive_and_cheap_forces_that_cannot_be(command, text, tmp_path, monkeypatch, capsys):

@@ -338,11 +338,28 @@ def test_bad_input():
     ):
         with pytest.raises(InputError, match=text):
             TemperatureSplit(held, **options)
+    with pytest.raises(InputError, match="system is None; give"):
+        TemperatureSplit(None)
+    with pytest.raises(InputError, match="group 'ends' has no first atom of a cluster"):
+        TemperatureSplit(held, groups={"all": [0, 1, 2, 3], "ends": [1, 3]}).add(x)
     with pytest.raises(InputError, match="one atom only"):
         TemperatureSplit(system([], [[0.0, 0, 0]], [1.0], quartic)).add([[0.1, 0, 0]])
     fixed = system([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], quartic)
     with pytest.raises(InputError, match="all atoms are fixed"):
         TemperatureSplit(fixed).add([[0.0, 0, 0]])
+
+
+def test_frames_off_the_constraints():
+    """As of files in few digits, or of another cell."""
+    held, x = dumbbells(2)
+    split = TemperatureSplit(held)
+    split.add(x.astype(np.float32))
+    off = x.copy()
+    off[3] += 0.01 * (x[3] - x[2])
+    with pytest.raises(InputError, match=r"off row #1 .* by 0\.01 of its size; .* Motion\.restore_positions") as caught:
+        split.add(off)
+    assert len(split) == 1 and tuple(caught.value.atoms) == (2, 3)
+    split.add(held.motion.restore_positions(off))
 
 
 def test_refused():

@@ -418,6 +418,10 @@ def compare(
     """
     if not budget > 0:
         raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
+    for step in steps or ():
+        if not (math.isfinite(step) and step > 0):
+            shown = f"{step / layers.units.time_unit:g} {layers.units.time}"
+            raise InputError(f"time step {shown}: give a positive number", item="steps")
     wanted, watching = chosen(methods), watcher or Watcher()
     asked = sorted(layers.steps if steps is None else steps)
     rates = (1 / (12.5 * layers.inner), 1 / (50 * layers.inner)) if frictions is None else tuple(frictions)

@@ -99,6 +99,9 @@ class CellSystem(System):
     def set_cell(self, cell: FloatArray, positions: FloatArray) -> None:
         """Change the cell; `positions` are those in it.
 
+        Forces and energies that states carry are of the cell that was: go on with `dataclasses.replace(state,
+        positions=positions, forces=None)`.
+
         Raises
         ------
         InputError, ImageError

@@ -116,5 +116,7 @@ def test_bad_input(layers):
         step, friction = given.pop("step"), given.pop("friction")
         with pytest.raises(InputError, match=text):
             measure(layers, METHODS["spheres"], step, friction, **given)
+    with pytest.raises(InputError, match="time step -3 fs: give a positive number"):
+        compare(layers, methods=["langevin"], steps=[4 * FS, -3 * FS])
     with pytest.raises(InputError, match="give a positive number of seconds"):
         compare(layers, budget=0)
