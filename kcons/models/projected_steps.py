@@ -108,8 +108,8 @@ def check_sizes(options: Mapping[str, Any], n: int) -> None:
         shapes = [(), (n,)] if name.endswith("tol") else [()]
         if given.shape not in shapes or not np.all(given >= least) or ("step" in name and not given > 0):
             raise InputError(
-                f"{name} is {options[name]!r:.60}; give a number of {least:g} or more"
-                + (", not 0" if "step" in name else f", or {n} of them"),
+                f"{name} is {options[name]!r:.60}; give a "
+                + ("positive number" if "step" in name else f"number of {least:g} or more, or {n} of them"),
                 item=name,
             )
 

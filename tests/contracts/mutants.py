@@ -607,6 +607,30 @@ MUTANTS = [
         "tests/steppers/test_state.py::test_a_full_disk_leaves_nothing_behind",
     ),
     (
+        "steppers/state.py",
+        "return self.is_of(system) and (",
+        "return (",
+        "tests/steppers/test_state.py::test_forces_of_another_system_are_not_taken",
+    ),
+    (
+        "steppers/state.py",
+        "(there is here or np.array_equal(there, here))",
+        "True",
+        "tests/steppers/test_state.py::test_forces_are_kept_at_their_positions_only",
+    ),
+    (
+        "thermostats/nose_hoover.py",
+        "if not state.is_of(system):",
+        "if False:",
+        "tests/steppers/test_state.py::test_another_system_begins_a_thermostat_anew",
+    ),
+    (
+        "thermostats/temperature_split.py",
+        "if not np.all(miss <= OFF):",
+        "if False:",
+        "tests/thermostats/test_temperature_split.py::test_frames_off_the_constraints",
+    ),
+    (
         "constraints/arguments.py",
         'if array.dtype.kind == "c":',
         "if False:",
