@@ -16,6 +16,7 @@ TEXT = " ".join(page("free_energy.md").split())
 def test_three_thermostats_agree_with_the_quadrature():
     chain = FOUND["chain"]
     assert chain["degrees of freedom"] <= 12 and chain["steps"] >= 400_000
+    assert f"{chain['runs']} runs of {chain['steps'] // chain['runs']:,} steps each" in TEXT
     assert f"{chain['quadrature']:.2f} by quadrature" in TEXT
     for name, row in chain["thermostats"].items():
         off = (row["mean force"] - chain["quadrature"]) / row["error"]
