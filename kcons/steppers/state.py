@@ -61,9 +61,9 @@ class State:
         What rounding took from the time, so that a million steps of dt are a million dt.
     thermostat, barostat : ndarray or None
         Their variables, if there are such; those of a barostat begin with the cell.
-    origin : tuple of a weak reference to System and of positions, or None
-        Whose forces these are, and where: those of another System or of other positions are evaluated anew. None, as of
-        a state that was loaded or made by hand: forces are taken as they are.
+    origin : tuple of a weak reference to System, or None, and of positions; or None
+        Whose forces these are, and where: those of another System or of other positions are evaluated anew. Without a
+        System, as of a state that was loaded or made by hand, they are taken by any.
     """
 
     positions: FloatArray
@@ -75,7 +75,7 @@ class State:
     time_remainder: float = 0.0
     thermostat: FloatArray | None = None
     barostat: FloatArray | None = None
-    origin: tuple[ReferenceType[Any], FloatArray] | None = None
+    origin: tuple[ReferenceType[Any] | None, FloatArray] | None = None
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class State:
         time_remainder: float = 0.0,
         thermostat: FloatArray | None = None,
         barostat: FloatArray | None = None,
-        origin: tuple[ReferenceType[Any], FloatArray] | None = None,
+        origin: tuple[ReferenceType[Any] | None, FloatArray] | None = None,
     ) -> None:
         # Written out, since a step makes one: what dataclass writes takes three times as long.
         own = vars(self)
@@ -101,7 +101,7 @@ class State:
         own["time_remainder"] = time_remainder
         own["thermostat"] = thermostat
         own["barostat"] = barostat
-        own["origin"] = origin
+        own["origin"] = (None, positions) if origin is None and forces is not None else origin
 
     def __getstate__(self) -> dict[str, Any]:
         """All that means something to another process."""
@@ -121,7 +121,7 @@ class State:
 
     def is_of(self, system: object) -> bool:
         """Whether the state is of this System, as far as one can tell."""
-        return self.origin is None or self.origin[0]() is system
+        return self.origin is None or self.origin[0] is None or self.origin[0]() is system
 
     def has_forces_of(self, system: object) -> bool:
         """Whether it carries forces of this System, at its positions, as far as one can tell."""

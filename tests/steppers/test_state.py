@@ -228,7 +228,7 @@ def test_a_file_that_ends_early_is_refused(saved: bytes) -> None:
     ],
 )
 def test_arrays_that_no_step_can_take_are_refused(name: str, value, tmp_path: Path) -> None:
-    np.savez(tmp_path / "x.npz", **{**vars(whole_state()), name: value})
+    np.savez(tmp_path / "x.npz", **{**whole_state().__getstate__(), name: value})
     with pytest.raises(InputError, match="holds no state"):
         State.load(tmp_path / "x.npz")
 
@@ -327,6 +327,10 @@ def test_copies_know_whose_forces_they_carry() -> None:
     own = end.copied()
     assert own.positions is not end.positions and own.has_forces_of(here) and not own.has_forces_of(there)
     assert end.shown().has_forces_of(here) and not end.shown().has_forces_of(there)
+    # Made by hand: of any system, and where they were given only.
+    hand = State(end.positions, end.velocities, forces=end.forces)
+    assert hand.has_forces_of(here) and hand.has_forces_of(there)
+    assert not replace(hand, positions=start.positions).has_forces_of(here)
     # Nothing else can be known of what another process or a file says.
     again = pickle.loads(pickle.dumps(end))
     assert again.origin is None and again.has_forces_of(here) and again.has_forces_of(there)

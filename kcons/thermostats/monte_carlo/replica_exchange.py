@@ -11,7 +11,6 @@ import numpy as np
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError
 from kcons.steppers import State
-from kcons.steppers.state import START_TOLERANCE
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTENTIAL, SIZE, seed_number, stream
 
 
@@ -89,17 +88,17 @@ def potential_of(state: State) -> float:
 
 def _refuse_others(first: State, other: State, k: int) -> None:
     """Refuse states of which one is not on the constraints of the other."""
-    systems = [None if state.origin is None else state.origin[0]() for state in (first, other)]
+    systems = [s.origin[0]() if s.origin is not None and s.origin[0] is not None else None for s in (first, other)]
     if systems[0] is None or systems[1] is None:
         return
     if not np.array_equal(systems[0].masses, systems[1].masses):
         raise InputError(f"state {k} has other masses than state 0", item="states")
     for system, state in zip(systems, (other, first), strict=True):
         assert system is not None
-        held = system.motion.constraint_set
-        x, time = state.positions, state.time
-        if (np.abs(held.value(x, time)) > np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))).any():
-            raise InputError(f"state {k} is of other constraints than state 0", item="states")
+        try:
+            system.initial_state(state.positions, time=state.time)
+        except InputError as error:
+            raise InputError(f"state {k} is of other constraints than state 0: {error}", item="states") from None
 
 
 def _moved(there: State, here: State, scale: float) -> State:
