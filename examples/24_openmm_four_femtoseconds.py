@@ -13,8 +13,9 @@ Wanner, Geometric Numerical Integration, IX.3),
     H + h^2 (f.M_par^+ f/24 - d(f.v)/dt/12),
 
 which does not follow what a molecule does to the difference of the two when it changes its shape. Residuals are the
-largest of all rows (nm, radian) at the ends of calls of 50 steps. With --full villin runs three times more, for 50 ps
-each: is a change of the energy one of precision, of the step, or of the run?
+largest of all rows (nm, radian) at the ends of calls of 50 steps. With --full villin runs from other starts as well,
+for 50 ps each: is a change of the energy one of precision, of the step, or of the run? Blocks within a run do not know
+of a walk; the error of the mean over runs, from their scatter, does.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from kcons.topology import HeldRows, bond_angles
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 TEMPERATURE, STEP, CALL = 300.0, 0.004, 50
-#: Platforms and steps of villin's other runs.
-AGAIN = (("OpenCL mixed", STEP), ("OpenCL double", STEP), ("OpenCL mixed", STEP / 2))
+#: Platforms, steps and numbers of villin's other runs, each from a start of its own.
+AGAIN = (("OpenCL mixed", STEP, 12), ("OpenCL double", STEP, 6), ("OpenCL mixed", STEP / 2, 4))
 KT = 0.00831446261815324 * TEMPERATURE
 #: The structures by name. Villin comes with OpenMM, in water and with ions, which are taken away.
 STRUCTURES = {
@@ -86,13 +87,13 @@ def conditions(held: HeldRows, x: np.ndarray) -> dict[str, tuple[int, int, float
 
 
 def placed(
-    system: openmm.System, held: HeldRows, x: np.ndarray, place: str, step: float, **options: Any
+    system: openmm.System, held: HeldRows, x: np.ndarray, place: str, step: float, seed: int = 1, **options: Any
 ) -> tuple[Any, ...]:
     """Integrator, rows and Context on a copy of the System."""
     own = copy.deepcopy(system)
     part = hold(own, held.constraint_set.constraints, x)
     integrator = ProjectedIntegrator(step, parts=[part], **options)
-    integrator.setRandomNumberSeed(1)
+    integrator.setRandomNumberSeed(seed)
     name, _, precision = place.partition(" ")
     properties = {"Precision": precision} if precision else {}
     context = openmm.Context(own, integrator, openmm.Platform.getPlatformByName(name), properties)
@@ -118,13 +119,13 @@ class Looks:
         return float(total), float(self.masses @ np.einsum("ij,ij->i", along, along))
 
 
-def run(name: str, place: str, picoseconds: float, warm_up: float, step: float = STEP) -> dict[str, Any]:
-    """One structure: conditions, drift, residuals."""
+def run(name: str, place: str, picoseconds: float, warm_up: float, step: float = STEP, seed: int = 1) -> dict[str, Any]:
+    """One structure: conditions, drift, residuals. The seed is that of what comes before."""
     topology, system, x = protein(STRUCTURES[name])
     held = constraints_of(topology, x, "allangles", system=system)
-    integrator, _, context = placed(system, held, x, place, step, ensemble=Langevin(TEMPERATURE, 5.0))
+    integrator, _, context = placed(system, held, x, place, step, seed, ensemble=Langevin(TEMPERATURE, 5.0))
     context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, TEMPERATURE, 1)
+    integrator.setVelocitiesToTemperature(context, TEMPERATURE, seed)
     integrator.step(round(warm_up / step))
     start = context.getState(positions=True, velocities=True)
     integrator, part, context = placed(system, held, x, place, step)
@@ -152,6 +153,7 @@ def run(name: str, place: str, picoseconds: float, warm_up: float, step: float =
         "freedom": freedom,
         "place": place,
         "step": step,
+        "seed": seed,
         "picoseconds": len(energies) * CALL * step,
         "temperature": float(np.mean(temperatures)),
         "residual": float(np.max(residuals)),
@@ -198,11 +200,28 @@ def show(result: dict[str, Any]) -> None:
                 for drift in (runs["drift"], runs["drift of what steps conserve"])
             ),
         )
-        for name, runs in [*result["runs"].items(), *(("villin", runs) for runs in result["again"])]
+        for name, runs in result["runs"].items()
     ]
     console.print(scripts.table("Constant energy", headings, {"molecule", "platform"}, rows))
+    if result["again"]:
+        console.print(scripts.table("Villin from other starts", *over_runs(result["again"])))
     machine = result["machine"]
     console.print(f"OpenMM {machine['versions']['openmm']}; {machine['date']}")
+
+
+def over_runs(runs: list[dict[str, Any]]) -> tuple[tuple[str, ...], set[str], list[tuple[str, ...]]]:
+    """Headings, those of text, and rows: means over the runs of a platform and step, with errors from their scatter."""
+    headings = ("platform", "fs", "runs", "ps each", "of what is conserved: mean", "least", "most", "blocks' error")
+    rows = []
+    for place, step in dict.fromkeys((each["place"], each["step"]) for each in runs):
+        same = [each for each in runs if (each["place"], each["step"]) == (place, step)]
+        slopes = np.array([each["drift of what steps conserve"]["slope"] for each in same])
+        within = np.mean([each["drift of what steps conserve"]["error"] for each in same])
+        mean = f"{slopes.mean():+.1e} ± {slopes.std(ddof=1) / np.sqrt(len(slopes)):.0e}"
+        length = f"{same[0]['picoseconds']:g}"
+        ends = (f"{slopes.min():+.1e}", f"{slopes.max():+.1e}", f"{within:.0e}")
+        rows.append((place, f"{1000 * step:g}", f"{len(same)}", length, mean, *ends))
+    return headings, {"platform"}, rows
 
 
 def measured(chosen: argparse.Namespace) -> dict[str, Any]:
@@ -213,7 +232,11 @@ def measured(chosen: argparse.Namespace) -> dict[str, Any]:
         "machine": measure.environment(),
         "full": chosen.full,
         "runs": {name: run(name, place, picoseconds, 5.0 if chosen.full else 0.2) for name in names},
-        "again": [run("villin", where, picoseconds / 2, 5.0, step) for where, step in AGAIN] if chosen.full else [],
+        "again": [
+            run("villin", where, picoseconds / 2, 5.0, step, seed)
+            for where, step, count in AGAIN * chosen.full
+            for seed in range(2, 2 + count)
+        ],
     }
 
 
