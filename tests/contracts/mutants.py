@@ -195,6 +195,18 @@ MUTANTS = [
     ),
     # -- programs for OpenMM --
     (
+        "openmm/ensembles/isokinetic_ensemble.py",
+        '"max((qq-ww-2*near*wq)/near^2, wq^2/ww)"',
+        '"max(qq-ww-2*near*wq, wq^2/ww)"',
+        "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_two_sums_do_where_velocities_are_not_read",
+    ),
+    (
+        "openmm/ensembles/isokinetic_ensemble.py",
+        'program.set("exact", float(precision == "double"))',
+        'program.set("exact", 0.0)',
+        "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
+    ),
+    (
         "openmm/integrator/step_writer.py",
         'p.let("good_steps", "good_steps+delta(failed)", "count it")',
         'p.let("good_steps", "good_steps+1", "count it")',

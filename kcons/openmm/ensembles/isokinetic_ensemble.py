@@ -153,6 +153,7 @@ class Isokinetic(Value):
     def declare(self, program: Program) -> None:
         p = program
         p.number("two_k", "2K, kept; 0 until the first step")
+        p.setting("exact", "whether 2K is summed before each kick: in double precision", 0.0)
         p.remember("growth", "integral of alpha over time")
         p.number("lost", "kicks that turned velocities round and lost digits")
         p.vector("w", "velocities before a kick")
@@ -161,6 +162,7 @@ class Isokinetic(Value):
             ("wq", "w.M.q, q = h M_par^+ f"),
             ("qq", "q.M.q"),
             ("z", "sqrt(q.M.q/2K)"),
+            ("near", "push/keep of weak kicks"),
             ("aim", "cosine between w and q"),
             ("decay", "exp(-z)"),
             ("sinhc", "exp(-z) sinh(z)/z"),
@@ -176,7 +178,14 @@ class Isokinetic(Value):
             p.integrator.setKineticEnergyExpression("m*u*u/2; u=v-impulse")
 
     def kick(
-        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+        self,
+        program: Program,
+        h: str,
+        force: str,
+        impulse: str,
+        project: Callable[[], None],
+        tangent: bool,
+        unseen: bool = False,
     ) -> str:
         """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
 
@@ -190,9 +199,7 @@ class Isokinetic(Value):
         p.each("w", "v", "velocities before the kick")
         p.each("v", f"{h}*{force}/m", "kick by the applied forces alone")
         project()
-        p.sum("ww", f"{of}m*w*w", "2K before")
-        p.sum("wq", f"{of}m*w*v", "along the kick")
-        p.sum("qq", f"{of}m*v*v", "size of the kick")
+        _sum_lengths(p, of, unseen)
         # h = 0 where constraints are applied alone: nothing changes then. 1e-300 keeps 0/0 away.
         p.let("z", f"select({h}, max(sqrt(qq/two_k), 1e-300), 1e-300)", "strength of the kick")
         p.let("aim", "min(max(wq/sqrt(max(ww*qq, 1e-300)), -1), 1)", "direction of the kick")
@@ -249,8 +256,10 @@ class Isokinetic(Value):
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())
+        precision = Precision.of(context).name
         integrator.program.write("two_k", twice)
-        if abs(found / twice - 1) > ROUNDING[Precision.of(context).name]:
+        integrator.program.set("exact", float(precision == "double"))
+        if abs(found / twice - 1) > ROUNDING[precision]:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
 
@@ -331,6 +340,28 @@ class Isokinetic(Value):
         state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
         heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")
         return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)) + heat
+
+
+def _sum_lengths(program: Program, of: str, unseen: bool) -> None:
+    """w.M.w, w.M.q and q.M.q of a kick.
+
+    GPUs wait for each sum. Where another kick follows before v is read, and unless they compute in double precision,
+    w.M.w is taken to be 2K, which drifts keep to fourth order (rigid bodies: to rounding), and q.M.q comes from the
+    length of w + c q. With c near push/keep, velocities get 1 - (push/keep c)^2 of what w.M.w is off by, and the kick
+    that is seen brings 2K back.
+    """
+    p = program
+    p.sum("wq", f"{of}m*w*v", "along the kick")
+    if not unseen:
+        p.sum("ww", f"{of}m*w*w", "2K before")
+        p.sum("qq", f"{of}m*v*v", "size of the kick")
+        return
+    p.let("near", "0.5*wq/two_k+sqrt(1+(0.5*wq/two_k)^2)", "push/keep of weak kicks")
+    p.sum("qq", f"{of}m*(w+near*v)^2", "2K before and the size of the kick")
+    with p.when("exact != 0", "sums are cheap, or rounding is far below what drifts change"):
+        p.sum("ww", f"{of}m*w*w", "2K before")
+    p.let("ww", "select(exact, ww, two_k)", "2K before, as drifts keep it")
+    p.let("qq", "max((qq-ww-2*near*wq)/near^2, wq^2/ww)", "size of the kick")
 
 
 def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np.ndarray:

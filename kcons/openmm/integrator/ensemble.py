@@ -73,7 +73,14 @@ class Ensemble(Protocol):
         ...
 
     def kick(
-        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+        self,
+        program: Program,
+        h: str,
+        force: str,
+        impulse: str,
+        project: Callable[[], None],
+        tangent: bool,
+        unseen: bool = False,
     ) -> str:
         """Let the applied forces act for a time.
 
@@ -92,6 +99,8 @@ class Ensemble(Protocol):
             Writes the computations that make v tangent to all constraints at x.
         tangent : bool
             Whether v is tangent before, without the impulse.
+        unseen : bool
+            Whether another kick follows before v is read.
 
         Returns
         -------
@@ -186,7 +195,14 @@ class ConstantEnergy(Value):
         pass
 
     def kick(
-        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+        self,
+        program: Program,
+        h: str,
+        force: str,
+        impulse: str,
+        project: Callable[[], None],
+        tangent: bool,
+        unseen: bool = False,
     ) -> str:
         return "+".join(filter(None, ["v", impulse, f"{h}*{force}/m"]))
 

@@ -85,7 +85,7 @@ class LeanStepWriter(StepWriter):
             p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
             u, h = "v", "(0.5*dt)" if self.halves else "dt"
             if ensemble.forceless:
-                u = self._kicked("kick*dt", tangent=True)
+                u = self._kicked("kick*dt", tangent=True, unseen=True)
             else:
                 self._kick("kick*dt", tangent=True)
             if self.halves:

@@ -265,11 +265,11 @@ class StepWriter:
         words = "constraint forces act, then the applied ones" if impulse else "applied forces act"
         self.program.each("v", self._kicked(h, impulse, tangent), f"the {words} (kick)")
 
-    def _kicked(self, h: str, impulse: str = "", tangent: bool = False) -> str:
+    def _kicked(self, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
         """The velocities after a kick, which a drift may begin with."""
-        # The leapfrog's velocities belong to half a step before.
-        tangent = tangent and self.scheme is not None
-        return self.ensemble.kick(self.program, h, self.force, impulse, self._project, tangent)
+        tangent = tangent and self.scheme is not None  # the leapfrog's velocities belong to half a step before
+        own = {"unseen": True} if unseen else {}
+        return self.ensemble.kick(self.program, h, self.force, impulse, self._project, tangent, **own)
 
     def _drift(self, h: str, u: str = "v") -> str:
         """Fly h along all constraints with velocities u; returns the impulse that keeps x on them, to be added to u."""
