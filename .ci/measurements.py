@@ -5,6 +5,9 @@
     python .ci/measurements.py --stale            measure again what is stale, one after the other
     python .ci/measurements.py --stale NAME ...   some of that
 
+After a measurement pages of docs that show what its example prints show the new lines; what their text says in words is
+for a person to read again (the tests of tests/pages find where it is no longer true).
+
 A result is stale where a definition of the code that it measures has changed since its commit (what was added, names of
 files, imports, documentation and layout do not count), and where its commit is not in this repository or not in the
 file. Times are those of an idle core; measure on an idle machine.
@@ -15,6 +18,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -230,9 +234,36 @@ def row(name: str) -> str:
     return "{:<30} {:>4} {:<10} {:<10} {:>4} {}".format(*columns)
 
 
+def shown(name: str) -> list[str]:
+    """What each example of a result prints of it, as pages show it; '' where one cannot, as before a first run."""
+    said = []
+    for example in dict.fromkeys(re.findall(r"examples/\w+\.py", " ".join(TABLE[name].commands))):
+        option = "--summary" if "--summary" in (ROOT / example).read_text(encoding="utf-8") else "--show"
+        words = [sys.executable, example, option, str(RESULTS / name)]
+        result = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+        text = "" if result.returncode else result.stdout.strip("\n")
+        said.append("\n".join(line.rstrip() for line in text.split("\n")))
+    return said
+
+
+def follow(old: str, new: str, pages: Path) -> int:
+    """Put new output in place of old wherever a page shows it, whole or in blocks; how many places were found."""
+    blocks = [(old, new)]
+    if all(old not in page.read_text(encoding="utf-8") for page in pages.glob("*.md")):
+        blocks = list(zip(old.split("\n\n"), new.split("\n\n"), strict=False))
+    places = 0
+    for page in sorted(pages.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        for before, after in blocks:
+            if before and after and before in text:
+                text, places = text.replace(before, after), places + 1
+        page.write_text(text, encoding="utf-8")
+    return places
+
+
 def measure(name: str) -> bool:
-    """Run the commands of a result; whether all went well."""
-    start = time.monotonic()
+    """Run the commands of a result and show it on the pages; whether all went well."""
+    start, before = time.monotonic(), shown(name)
     for command in TABLE[name].commands:
         words = [
             str(RESULTS / name) if w == "F" else w.replace("=F", f"={RESULTS / name}") for w in shlex.split(command)
@@ -243,6 +274,9 @@ def measure(name: str) -> bool:
         if subprocess.run(words, cwd=ROOT).returncode:
             print(f"== FAILED: {name}", file=sys.stderr)
             return False
+    for old, new in zip(before, shown(name), strict=True):
+        if old != new:
+            print(f"== {follow(old, new, ROOT / 'docs')} places on pages show the new lines: read what is said of them")
     print(f"== {name} took {(time.monotonic() - start) / 60:.1f} minutes", flush=True)
     return True
 

@@ -117,3 +117,30 @@ def test_a_command_that_fails_is_said(repository, measurements, monkeypatch, cap
     assert measurements.main(["--stale"]) == 1
     captured = capfd.readouterr()
     assert "FAILED: speed.json" in captured.err and "and 1 of unknown length" in captured.out
+
+
+def test_pages_show_the_new_lines(measurements, repository, tmp_path, monkeypatch):
+    """Whole where a page has all of it, block by block where it has parts; other lines stay."""
+    _, state, commit = repository
+    state(commit)
+    example = tmp_path / "examples" / "01_speed.py"
+    example.parent.mkdir()
+    example.write_text(
+        "import json, pathlib, sys\n"
+        "path = pathlib.Path(sys.argv[2])\n"
+        "n = json.loads(path.read_text()).get('n', 1)\n"
+        "if sys.argv[1] == '--out':\n"
+        "    path.write_text(json.dumps({'n': n + 1}))\n"
+        "else:\n"
+        "    print(f'first {n}   \\n\\nsecond {n}')\n"
+    )
+    made = measurements.Measurement(("solvers",), ("python examples/01_speed.py --out F",))
+    monkeypatch.setattr(measurements, "TABLE", {"speed.json": made})
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    (docs / "whole.md").write_text("a\nfirst 1\n\nsecond 1\nb\n")
+    assert measurements.measure("speed.json")
+    assert (docs / "whole.md").read_text() == "a\nfirst 2\n\nsecond 2\nb\n"
+    (docs / "whole.md").write_text("second 2\n\na\n\nfirst 2\nfirst 1\n")
+    assert measurements.measure("speed.json")
+    assert (docs / "whole.md").read_text() == "second 3\n\na\n\nfirst 3\nfirst 1\n"
