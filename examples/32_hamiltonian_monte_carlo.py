@@ -31,7 +31,15 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.comparison import environment, json_files
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, Geodesic, Rattle, Stepper
-from kcons.thermostats import Counts, HamiltonianMonteCarlo, Langevin, mean, thermal_velocities, tune
+from kcons.thermostats import (
+    Counts,
+    HamiltonianMonteCarlo,
+    Langevin,
+    autocorrelation_time,
+    mean,
+    thermal_velocities,
+    tune,
+)
 
 # -- three masses -----------------------------------------------------------------------------------
 
@@ -118,10 +126,15 @@ def exact(full: bool) -> tuple[list[float], list[Any]]:
     return [float(w @ cosine), float(w @ least + 1.5 * KT), float(w @ place)], smooth
 
 
+def independent(values: np.ndarray) -> np.ndarray:
+    """One of so many samples that what the slowest of the observables remembers has fallen to a few per cent."""
+    return values[:: math.ceil(2 * max(autocorrelation_time(column) for column in values.T))]
+
+
 def small(full: bool) -> dict[str, Any]:
     """Kolmogorov-Smirnov against quadrature and against Metropolis, and means with their errors."""
     means, functions = exact(full)
-    judge = metropolis(4000 if full else 200)
+    judge = metropolis(16000 if full else 200)
     cases: dict[str, tuple[Stepper, float, int]] = {
         "HMC, RATTLE": (HamiltonianMonteCarlo(KT, (3, 9), 1), 0.28, 1),
         "HMC, BlanesMoan4": (HamiltonianMonteCarlo(KT, (1, 3), 2, stepper=BlanesMoan4()), 0.9, 1),
@@ -130,12 +143,11 @@ def small(full: bool) -> dict[str, Any]:
         "Langevin, same step": (Langevin(KT, 1.0, 5), 0.28, 6),
         "Metropolis": (Rattle(), 0.0, 0),
     }
-    rows = []
+    rows, other = [], independent(judge)
     for name, (stepper, dt, apart) in cases.items():
-        values, counts = sampled(stepper, dt, (3000 if full else 150) * apart) if apart else (judge, None)
+        values, counts = sampled(stepper, dt, (15000 if full else 150) * apart) if apart else (judge, None)
         found = [mean(column) for column in values.T]
-        # Autocorrelations are below 0.04 from five proposals on; Metropolis has 60 moves between its samples.
-        thinned = values[:: 5 * apart or 2]
+        thinned = independent(values)
         rows.append(
             {
                 "method": name,
@@ -147,7 +159,7 @@ def small(full: bool) -> dict[str, Any]:
                 "mean": [float(m[0]) for m in found],
                 "error": [float(m[1]) for m in found],
                 "p": [float(kstest(q, f).pvalue) for q, f in zip(thinned.T, functions, strict=True)],
-                "p_metropolis": [float(ks_2samp(q, r).pvalue) for q, r in zip(thinned.T, judge.T, strict=True)],
+                "p_metropolis": [float(ks_2samp(q, r).pvalue) for q, r in zip(thinned.T, other.T, strict=True)],
             }
         )
     return {"exact": means, "rows": rows}
