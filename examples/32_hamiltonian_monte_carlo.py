@@ -488,11 +488,11 @@ def main() -> None:
     if chosen.show:
         show(json.loads(Path(chosen.show).read_text(encoding="utf-8")))
     elif chosen.full:
-        part = {chosen.full: PARTS[chosen.full](True)}
+        part = {chosen.full: {"environment": environment(), **PARTS[chosen.full](True)}}
         show(part)
         if chosen.out:
             known = json.loads(Path(chosen.out).read_text(encoding="utf-8")) if Path(chosen.out).exists() else {}
-            json_files.write(chosen.out, {"environment": environment(), **known, **part})
+            json_files.write(chosen.out, {**known, **part})
     else:
         show({"small": small(False)})
         system, state = three_masses()
