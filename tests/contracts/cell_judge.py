@@ -173,10 +173,12 @@ class Judge:
         given: list[Array],
         link: float | list[float],
         solvable: bool = True,
+        doubtful: list[bool] | None = None,
     ) -> Any:
         """The call's result, or None after an error; arguments must stay as they were.
 
-        `link` is how near half the cell is, or that before a run and after each of its steps.
+        `link` is how near half the cell is, or that before a run and after each of its steps; `doubtful` likewise what
+        `may_refuse` says of them.
         """
         before = [a.copy() for a in given]
         result = None
@@ -186,13 +188,21 @@ class Judge:
             near = link
             if isinstance(near, list):
                 reached = self._step_of(error, len(near))
-                solvable = solvable or reached < len(near)
+                solvable = (solvable or reached < len(near)) and not any((doubtful or [])[reached - 1 : reached])
                 near = max(near[:reached])
             self.refusal(operation, error, near, solvable)
         if any(a.tobytes() != c.tobytes() for a, c in zip(before, given, strict=True)):
             self.say(operation, "silent", "arguments were changed")
             return None
         return result
+
+    def may_refuse(self, link: float, cell: Array | None = None) -> bool:
+        """Whether the oracle's last ways to the rows are such as the engine need not go, and smaller steps help.
+
+        A gradient turned by a right angle or more, so that what holds the row there points the other way; or the
+        displacement brings atoms half the cell apart that are not so before and after it (`link`).
+        """
+        return any(turned or self.w.nearness(y, cell, every=True) > 1 >= link for y, turned in self.rows.ways)
 
     def _step_of(self, error: Exception, steps: int) -> int:
         """How many entries of the links an error concerns: those up to its step, and the next."""
@@ -254,6 +264,7 @@ class Judge:
         images = self.elsewhere(0.3)
         new = w.stored(moved, images)
         links = max(w.nearness(w.x, every=True), w.nearness(moved, every=True))
+        rows.ways.clear()
         try:
             exact, allowed = self.spread(lambda a, b: rows.solve(a, b, t)[0], moved, w.x, stored=_top(new, here))
             links, solvable = max(links, w.nearness(exact, every=True)), True
@@ -264,7 +275,7 @@ class Judge:
             lambda: motion.project_positions(new, here, time=t, reference_time=0.0),
             [new, here],
             links,
-            solvable,
+            solvable and not self.may_refuse(links),
         )
         if found is not None and solvable and rng.random() < 0.3:
             self.in_place(label, moved, images, here, t, links)
@@ -420,25 +431,33 @@ class Judge:
             if number and not w.drifting:
                 images, cell, state = self._between(state, images, cell, winds)
                 anchors[0] = w.anchors + images @ cell
-            self.done, link = done, [w.nearness(x, cell, every=True)]
+            self.done, link, doubtful = done, [w.nearness(x, cell, every=True)], [False]
             try:
                 for _ in range(steps):
                     t = done * w.dt
+                    rows.ways.clear()
                     x, v = advance(rows, w.stepper, x, v, t, w.dt, self._pull)
+                    near = w.nearness(x, cell, every=True)
+                    doubtful.append(self.may_refuse(max(near, *link), cell))
                     rows.targets = rows.targets + noise
                     try:
                         twin = list(advance(rows, w.stepper, *twin, t, w.dt, self._pull))
                     finally:
                         rows.targets = rows.targets - noise
                     done += 1
-                    link.append(w.nearness(x, cell, every=True))
+                    link.append(near)
                 solvable = True
             except NoSolution:
                 solvable = False
             before = (state.positions, state.velocities)
             here = state
             state = self.attempt(
-                name, lambda s=here, n=steps: run(system, s, w.dt, n, stepper=stepper), list(before), link, solvable
+                name,
+                lambda s=here, n=steps: run(system, s, w.dt, n, stepper=stepper),
+                list(before),
+                link,
+                solvable,
+                doubtful,
             )
             if state is None:
                 return

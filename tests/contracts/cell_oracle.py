@@ -118,6 +118,8 @@ class Dense:
         self.waving = np.array([[r.amplitude, r.omega, r.phase] for r in self.rows]).reshape(-1, 3).T
         self.targets = np.array([r.target for r in self.rows])
         self.turns = np.array([r.kind == "dihedral" for r in self.rows], dtype=bool)
+        #: Of each solution: the positions it was sought from, and whether a gradient has turned by a right angle or more.
+        self.ways: list[tuple[Array, bool]] = []
 
     def set_cell(self, cell: Array) -> None:
         """Lattice vectors as rows; rows through the boundary follow."""
@@ -230,6 +232,9 @@ class Dense:
             if float(np.abs(z - y).max()) > FAR:
                 break
             if length <= 1e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
+                a0, a = self.jacobian(x_ref), self.jacobian(z)
+                cosines = np.stack([a0 * a, a0 * a * self.root**2]).sum(axis=2)
+                self.ways.append((y, bool(np.any(cosines[:, (a0 * self.root).any(axis=1)] <= 0))))
                 return z, (spread @ unknown).reshape(-1, 3)
             last = length
         raise NoSolution("Newton's method for positions")
