@@ -118,7 +118,7 @@ class Dense:
         self.waving = np.array([[r.amplitude, r.omega, r.phase] for r in self.rows]).reshape(-1, 3).T
         self.targets = np.array([r.target for r in self.rows])
         self.turns = np.array([r.kind == "dihedral" for r in self.rows], dtype=bool)
-        #: Of each solution: the positions it was sought from, and whether a gradient has turned by a right angle or more.
+        #: Of each solution: the positions it was sought from, and whether a gradient has turned by a right angle.
         self.ways: list[tuple[Array, bool]] = []
 
     def set_cell(self, cell: Array) -> None:

@@ -807,6 +807,12 @@ MUTANTS = [
         "length",
         "tests/constraints/periodic/test_images.py::test_a_chain_of_moving_bonds_may_open_beyond_half_the_cell",
     ),
+    (
+        "solvers/sparse/step_control.py",
+        "FLAT = 0.01",
+        "FLAT = 0.0",
+        "tests/solvers/sparse/test_mixed_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",
+    ),
     # -- studies: what is kept, and what is shown --
     (
         "comparison/study/study.py",

@@ -399,6 +399,8 @@ def _positions(  # type: ignore[no-untyped-def]
             for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
                 rolled()
                 along += dot(first_vector(lines, 8 * p), second_vector(lines, 8 * p))
+                if iteration > step_control.MANY_ITERATIONS:
+                    along -= step_control.FLAT * dot(second_vector(lines, 8 * p), second_vector(lines, 8 * p))
             # A gradient must not have turned by 90 degrees or more within the step.
             if not (along > 0.0) and (entry(kinds, k) < VELOCITY or number(parameters, COUNT) != 0.0):
                 return False, np.inf, iteration, k
