@@ -92,17 +92,14 @@ class Judge:
         ROOM times what it changes where positions and targets are rounded as they are stored, and what the
         condition of the rows makes of the rounding of the answer itself.
         """
-        rows, targets, places = self.rows, self.rows.targets, self.rows.places
+        rows = self.rows
         exact = function(*points)
         change = 0.0
         noise = rows.rounding(points[0], stored)
-        for _ in range(2):
+        for slip in (EPS, -EPS):
             signs = [self.rng.choice([-1.0, 1.0], p.shape) for p in points]
-            rows.targets = targets + noise * self.rng.choice([-1.0, 1.0], len(targets))
-            try:
+            with rows.rounded(noise * self.rng.choice([-1.0, 1.0], len(noise)), slip):
                 other = function(*(p + EPS * stored * s for p, s in zip(points, signs, strict=True)))
-            finally:
-                rows.targets, rows.places = targets, places
             change = max(change, float(np.abs(other - exact).max(initial=0.0)))
         size = float(np.abs(exact).max(initial=0.0))
         return exact, ROOM * change + 64 * EPS * (self.dependent[2] * size + stored)
@@ -309,7 +306,7 @@ class Judge:
             (
                 "constraint_force",
                 lambda: motion.constraint_force(here, w.v, f),
-                lambda x: w.masses[:, None] * rows.acceleration(x, rows.velocities(x, w.v, 0.0), f, 0.0) - f,
+                lambda x: rows.force(x, rows.velocities(x, w.v, 0.0), f, 0.0),
                 [here, w.v, f],
             ),
         ):
@@ -439,11 +436,8 @@ class Judge:
                     x, v = advance(rows, w.stepper, x, v, t, w.dt, self._pull)
                     near = w.nearness(x, cell, every=True)
                     doubtful.append(self.may_refuse(max(near, *link), cell))
-                    rows.targets = rows.targets + noise
-                    try:
+                    with rows.rounded(noise, EPS):
                         twin = list(advance(rows, w.stepper, *twin, t, w.dt, self._pull))
-                    finally:
-                        rows.targets = rows.targets - noise
                     done += 1
                     link.append(near)
                 solvable = True
@@ -591,11 +585,8 @@ class Judge:
             solvable = True
             try:
                 x, v = advance(rows, "Rattle", x, v, 0.0, w.dt, self._pull)
-                rows.targets = rows.targets + noise
-                try:
+                with rows.rounded(noise, EPS):
                     twin = list(advance(rows, "Rattle", *twin, 0.0, w.dt, self._pull))
-                finally:
-                    rows.targets = rows.targets - noise
                 link = max(link, w.nearness(x, every=True))
             except NoSolution:
                 solvable = False

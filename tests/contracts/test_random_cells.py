@@ -75,12 +75,33 @@ def test_the_oracle_turns_a_rotor_as_rattle_does():
     np.testing.assert_allclose(u[0], [-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0], rtol=0, atol=1e-14)
 
 
+NOTHING = np.zeros(0, int), np.zeros((0, 3)), np.zeros((3, 0, 3))
+
+
+def test_the_oracle_is_as_precise_as_the_engine_where_masses_differ():
+    """A heavy atom near the centre that a radius of gyration is about; heavy molecules beside light ones."""
+    masses = np.array([0.01, 1.0, 1e4])
+    weights = {a: float(m / masses.sum()) for a, m in enumerate(masses)}
+    rng = np.random.default_rng(0)
+    x, v, f = rng.normal(size=(3, 6, 3))
+    rows = Dense([Row("gyration", [weights])], masses, np.eye(3), *NOTHING)
+    slopes = rows.jacobian(x[:3] + 10.0).reshape(3, 3)
+    assert np.abs(slopes.sum(axis=0)).max() < 1e-16 < 1e-3 < np.abs(slopes).max()
+
+    masses = np.array([0.01, 0.03, 0.01, 0.1, 80.0, 8000.0])
+    pairs = [
+        Row("linear", coefficients={a: c, a + 1: -c}) for a, c in zip((0, 2, 4), rng.normal(size=(3, 3)), strict=True)
+    ]
+    together = Dense(pairs, masses, np.eye(3), *NOTHING).force(x, v, f, 0.0)
+    heavy = Dense([pairs[2].renumbered(np.arange(-4, 2))], masses[4:], np.eye(3), *NOTHING)
+    np.testing.assert_allclose(together[4:], heavy.force(x[4:], v[4:], f[4:], 0.0), rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize(("rise", "turns"), [(0.001, False), (0.05, True)])
 def test_the_oracle_knows_gradients_that_turn(rise, turns):
     """An angle of nearly 180 degrees whose vertex goes through the line between its ends."""
     row = Row("angle", [{0: 1.0, 1: -1.0}, {2: 1.0, 1: -1.0}], [(0, 0, 0)] * 2)
-    nothing = np.zeros(0, int), np.zeros((0, 3)), np.zeros((3, 0, 3))
-    rows = Dense([row], np.ones(3), np.eye(3), *nothing)
+    rows = Dense([row], np.ones(3), np.eye(3), *NOTHING)
     x = np.array([[1.0, 0.01, 0], [0, 0, 0], [-1.0, 0.01, 0]])
     rows.targets = rows.measure(x)
     rows.solve(x + np.array([[0, 0, 0], [0, rise, 0], [0, 0, 0]]), x, 0.0)
