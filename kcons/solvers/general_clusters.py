@@ -216,8 +216,8 @@ class GeneralClusters:
             settled = _each(relative <= rounding)
             done |= settled & (polished | (error == 0.0))
             if done.all():
-                flat = FLAT * size0**2 if iteration > MANY_ITERATIONS else 0.0
-                turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > flat)
+                least = FLAT * size0**2 if iteration > MANY_ITERATIONS else np.zeros(size0.shape)
+                turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > least)
                 if turned.any():
                     return _failed(batch, turned, iteration)
                 unit_lam = np.einsum("nkr,nr->nk", u0, np.where(kept, along / np.where(kept, s0, 1.0), 0.0))
