@@ -8,13 +8,14 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
 from kcons.plan.plan import Plan
-from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request
 
-#: Radians from a straight line below which a held dihedral is named as the cause of a failure.
-STRAIGHT = 0.1
+#: Equal parts of a displacement, one after another, that tell one that is too long from one that nothing can follow.
+PARTS = 16
 
 
 class HasRows(Protocol):
@@ -96,17 +97,18 @@ def undefined_row(
 def positions_failed(
     constraint_set: ConstraintSet,
     numbers: IntArray | None,
-    x_ref: FloatArray,
+    request: Request,
     outcome: Outcome,
-    solver: HasRows,
+    solver: ClusterSolver,
     plan: Plan,
 ) -> KconsError:
-    """The error for a position projection without solution."""
+    """The error for a position projection without solution; `request` as it was given to `solver`."""
     row = _global_row(outcome, solver)
     if row < 0:
         return ConvergenceError("the position projection did not converge", residual=outcome.residual)
     name, atoms = _row_label(constraint_set, numbers, row)
-    straight = _nearly_straight(constraint_set, numbers, x_ref, np.flatnonzero(plan.labels == plan.labels[row]))
+    rows = np.flatnonzero(plan.labels == plan.labels[row])
+    straight = _becomes_straight(constraint_set, numbers, request, solver, rows)
     return ConvergenceError(
         f"no positions near the given ones fulfil row {name}: relative residual {outcome.residual:.3g} after "
         f"{outcome.iterations} iterations. "
@@ -125,26 +127,53 @@ def positions_failed(
     )
 
 
-def _nearly_straight(constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, rows: IntArray) -> str:
-    """What to say where a held dihedral among `rows` is about to lose its meaning; '' if none is."""
-    least, found = STRAIGHT, ""
+def _becomes_straight(
+    constraint_set: ConstraintSet, numbers: IntArray | None, request: Request, solver: ClusterSolver, rows: IntArray
+) -> str:
+    """What to say where a held dihedral among `rows` loses its meaning, with any time step; '' if none does."""
+    here, ahead = request.reference, request.changed
+    if not _straightened(constraint_set, numbers, here, ahead, rows):
+        return ""
+    # As a free flight in small steps: where these pass, the dihedral is not the cause.
+    start, step = request.reference_time, minimum_image(ahead - here, request.lattice) / PARTS
+    for part in range(1, PARTS + 1):
+        time = start + part / PARTS * (request.time - start)
+        wanted = None if request.wanted is None else constraint_set.target(time)
+        ahead = here + step
+        small = Request(ahead, here, wanted, request.lattice, time, start)
+        if not solver.positions(small).converged:
+            return _straightened(constraint_set, numbers, here, ahead, rows)
+        here, step = ahead, ahead - here
+    return ""
+
+
+def _straightened(
+    constraint_set: ConstraintSet, numbers: IntArray | None, before: FloatArray, after: FloatArray, rows: IntArray
+) -> str:
+    """What to say of three atoms of a held dihedral that pass through one line from `before` to `after`, or ''."""
+    least, found = np.inf, ""
     for row in rows.tolist():
         item, k = constraint_set.locate(row)
         if item.family != "Dihedral":
             continue
-        r = constraint_set.gather(item.select([k]), x)[0]
-        legs = np.diff(r, axis=0)
+        legs, then = (np.diff(constraint_set.gather(item.select([k]), x)[0], axis=0) for x in (before, after))
         for first in (0, 1):
-            u, w = legs[first], legs[first + 1]
-            bend = float(np.arctan2(np.linalg.norm(np.cross(u, w)), abs(u @ w)))
-            if bend < least:
+            side = _beside(legs[first], legs[first + 1])
+            bend = float(np.arctan2(np.linalg.norm(side), abs(legs[first] @ legs[first + 1])))
+            if side @ _beside(then[first], then[first + 1]) <= 0.0 and bend < least:
                 least, three = bend, ", ".join(str(a) for a in _named(numbers, item.atoms[k][first : first + 3]))
                 found = (
-                    f"Atoms {three} of row {_row_label(constraint_set, numbers, row)[0]} are {np.degrees(bend):.2g} "
-                    "degrees from one line, where a dihedral angle is undefined: the motion cannot go through it with "
-                    "any time step. Hold their angle too, or leave this dihedral free"
+                    f"Atoms {three} of row {_row_label(constraint_set, numbers, row)[0]} come onto one line, "
+                    f"{np.degrees(bend):.2g} degrees away, where a dihedral angle is undefined: the motion cannot go "
+                    "through it with any time step. Hold their angle too, or leave this dihedral free"
                 )
     return found
+
+
+def _beside(u: FloatArray, w: FloatArray) -> FloatArray:
+    """The part of w at right angles to u, times |u|."""
+    length = float(np.linalg.norm(u))
+    return length * w - (w @ u / length) * u if length > 0 else u
 
 
 def tangents_failed(

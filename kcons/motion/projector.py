@@ -172,7 +172,7 @@ class Projector:
         Raises
         ------
         ConvergenceError
-            No solution near enough; nothing was changed.
+            No solution near enough, or one where a row's gradient has turned by a right angle; nothing was changed.
         InputError
             Wrong shapes, or a NaN or infinity in the positions of a constrained atom.
         """

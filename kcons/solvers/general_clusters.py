@@ -18,7 +18,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
-from kcons.solvers.sparse.step_control import ROUNDINGS
+from kcons.solvers.sparse.step_control import FLAT, MANY_ITERATIONS, ROUNDINGS
 
 MAX_ITERATIONS = 50
 #: |A v - c| allowed after a projection, relative to the speeds of the cluster (unit rows).
@@ -216,7 +216,8 @@ class GeneralClusters:
             settled = _each(relative <= rounding)
             done |= settled & (polished | (error == 0.0))
             if done.all():
-                turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
+                least = FLAT * size0**2 if iteration > MANY_ITERATIONS else np.zeros(size0.shape)
+                turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > least)
                 if turned.any():
                     return _failed(batch, turned, iteration)
                 unit_lam = np.einsum("nkr,nr->nk", u0, np.where(kept, along / np.where(kept, s0, 1.0), 0.0))

@@ -92,17 +92,14 @@ class Judge:
         ROOM times what it changes where positions and targets are rounded as they are stored, and what the
         condition of the rows makes of the rounding of the answer itself.
         """
-        rows, targets, places = self.rows, self.rows.targets, self.rows.places
+        rows = self.rows
         exact = function(*points)
         change = 0.0
         noise = rows.rounding(points[0], stored)
-        for _ in range(2):
+        for slip in (EPS, -EPS):
             signs = [self.rng.choice([-1.0, 1.0], p.shape) for p in points]
-            rows.targets = targets + noise * self.rng.choice([-1.0, 1.0], len(targets))
-            try:
+            with rows.rounded(noise * self.rng.choice([-1.0, 1.0], len(noise)), slip):
                 other = function(*(p + EPS * stored * s for p, s in zip(points, signs, strict=True)))
-            finally:
-                rows.targets, rows.places = targets, places
             change = max(change, float(np.abs(other - exact).max(initial=0.0)))
         size = float(np.abs(exact).max(initial=0.0))
         return exact, ROOM * change + 64 * EPS * (self.dependent[2] * size + stored)
@@ -173,10 +170,12 @@ class Judge:
         given: list[Array],
         link: float | list[float],
         solvable: bool = True,
+        doubtful: list[bool] | None = None,
     ) -> Any:
         """The call's result, or None after an error; arguments must stay as they were.
 
-        `link` is how near half the cell is, or that before a run and after each of its steps.
+        `link` is how near half the cell is, or that before a run and after each of its steps; `doubtful` likewise what
+        `may_refuse` says of them.
         """
         before = [a.copy() for a in given]
         result = None
@@ -186,13 +185,21 @@ class Judge:
             near = link
             if isinstance(near, list):
                 reached = self._step_of(error, len(near))
-                solvable = solvable or reached < len(near)
+                solvable = (solvable or reached < len(near)) and not any((doubtful or [])[reached - 1 : reached])
                 near = max(near[:reached])
             self.refusal(operation, error, near, solvable)
         if any(a.tobytes() != c.tobytes() for a, c in zip(before, given, strict=True)):
             self.say(operation, "silent", "arguments were changed")
             return None
         return result
+
+    def may_refuse(self, link: float, cell: Array | None = None) -> bool:
+        """Whether the oracle's last ways to the rows are such as the engine need not go, and smaller steps help.
+
+        A gradient turned by a right angle or more, so that what holds the row there points the other way; or the
+        displacement brings atoms half the cell apart that are not so before and after it (`link`).
+        """
+        return any(turned or self.w.nearness(y, cell, every=True) > 1 >= link for y, turned in self.rows.ways)
 
     def _step_of(self, error: Exception, steps: int) -> int:
         """How many entries of the links an error concerns: those up to its step, and the next."""
@@ -254,6 +261,7 @@ class Judge:
         images = self.elsewhere(0.3)
         new = w.stored(moved, images)
         links = max(w.nearness(w.x, every=True), w.nearness(moved, every=True))
+        rows.ways.clear()
         try:
             exact, allowed = self.spread(lambda a, b: rows.solve(a, b, t)[0], moved, w.x, stored=_top(new, here))
             links, solvable = max(links, w.nearness(exact, every=True)), True
@@ -264,7 +272,7 @@ class Judge:
             lambda: motion.project_positions(new, here, time=t, reference_time=0.0),
             [new, here],
             links,
-            solvable,
+            solvable and not self.may_refuse(links),
         )
         if found is not None and solvable and rng.random() < 0.3:
             self.in_place(label, moved, images, here, t, links)
@@ -298,7 +306,7 @@ class Judge:
             (
                 "constraint_force",
                 lambda: motion.constraint_force(here, w.v, f),
-                lambda x: w.masses[:, None] * rows.acceleration(x, rows.velocities(x, w.v, 0.0), f, 0.0) - f,
+                lambda x: rows.force(x, rows.velocities(x, w.v, 0.0), f, 0.0),
                 [here, w.v, f],
             ),
         ):
@@ -420,25 +428,30 @@ class Judge:
             if number and not w.drifting:
                 images, cell, state = self._between(state, images, cell, winds)
                 anchors[0] = w.anchors + images @ cell
-            self.done, link = done, [w.nearness(x, cell, every=True)]
+            self.done, link, doubtful = done, [w.nearness(x, cell, every=True)], [False]
             try:
                 for _ in range(steps):
                     t = done * w.dt
+                    rows.ways.clear()
                     x, v = advance(rows, w.stepper, x, v, t, w.dt, self._pull)
-                    rows.targets = rows.targets + noise
-                    try:
+                    near = w.nearness(x, cell, every=True)
+                    doubtful.append(self.may_refuse(max(near, *link), cell))
+                    with rows.rounded(noise, EPS):
                         twin = list(advance(rows, w.stepper, *twin, t, w.dt, self._pull))
-                    finally:
-                        rows.targets = rows.targets - noise
                     done += 1
-                    link.append(w.nearness(x, cell, every=True))
+                    link.append(near)
                 solvable = True
             except NoSolution:
                 solvable = False
             before = (state.positions, state.velocities)
             here = state
             state = self.attempt(
-                name, lambda s=here, n=steps: run(system, s, w.dt, n, stepper=stepper), list(before), link, solvable
+                name,
+                lambda s=here, n=steps: run(system, s, w.dt, n, stepper=stepper),
+                list(before),
+                link,
+                solvable,
+                doubtful,
             )
             if state is None:
                 return
@@ -572,11 +585,8 @@ class Judge:
             solvable = True
             try:
                 x, v = advance(rows, "Rattle", x, v, 0.0, w.dt, self._pull)
-                rows.targets = rows.targets + noise
-                try:
+                with rows.rounded(noise, EPS):
                     twin = list(advance(rows, "Rattle", *twin, 0.0, w.dt, self._pull))
-                finally:
-                    rows.targets = rows.targets - noise
                 link = max(link, w.nearness(x, every=True))
             except NoSolution:
                 solvable = False

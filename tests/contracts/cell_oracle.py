@@ -10,6 +10,8 @@ other; fixed atoms have infinite mass.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -118,6 +120,26 @@ class Dense:
         self.waving = np.array([[r.amplitude, r.omega, r.phase] for r in self.rows]).reshape(-1, 3).T
         self.targets = np.array([r.target for r in self.rows])
         self.turns = np.array([r.kind == "dihedral" for r in self.rows], dtype=bool)
+        #: Of each solution: the positions it was sought from, and whether a gradient has turned by a right angle.
+        self.ways: list[tuple[Array, bool]] = []
+        #: See `rounded`.
+        self.slip = 0.0
+
+    @contextmanager
+    def rounded(self, noise: Array, slip: float) -> Iterator[None]:
+        """Meanwhile targets are off by `noise`, and centres of gyration, in gradients, by `slip` times the extent.
+
+        The engine subtracts the centre once, in double precision and from positions about an atom of the row: each
+        x - c of a gradient w (x - c)/q is off by the same eps times the extent D. So is the part w . v of A v that the
+        common speed V of the atoms has, by eps D V/q, and the speed of an atom at d from c by eps D V d/q^2. Where a
+        heavy atom makes q small, this is more than what rounding the positions does, as these shift c with that atom.
+        """
+        targets, self.slip = self.targets, slip
+        self.targets = targets + noise
+        try:
+            yield
+        finally:
+            self.targets, self.slip = targets, 0.0
 
     def set_cell(self, cell: Array) -> None:
         """Lattice vectors as rows; rows through the boundary follow."""
@@ -137,16 +159,25 @@ class Dense:
         if kind == "linear":
             return np.einsum("kai,ai->k", self.blocks[kind][2], x)
         if kind == "gyration":
-            return np.sqrt(self._spread(x, x))
+            return np.sqrt(self._spread(x, x)[0])
         d = self._vectors(kind, x)
         if kind == "norm":
             return np.linalg.norm(d[0], axis=1)
         s, c = _angle(*d)[:2] if kind == "angle" else _dihedral(*d)[:2]
         return np.arctan2(s, c)
 
-    def _spread(self, x: Array, y: Array) -> Array:
+    def _spread(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Sum of w (x - c) . (y - c'), and x - c, with the centres c and c' of x and y.
+
+        What rounds is c, by eps |c|, and with it all of x - c, so that they are taken about their own centre again:
+        heavy atoms lie next to c, at a distance that may be eps |c| times 1e13 and less.
+        """
         w = self.blocks["gyration"][0][0]
-        return np.einsum("ka,ai,ai->k", w, x, y) - np.einsum("ki,ki->k", w @ x, w @ y)
+        about = [np.broadcast_to(z, (len(w), *z.shape)) for z in (x, y)]
+        for _ in range(2):
+            about = [z - np.einsum("ka,kai->ki", w, z)[:, None] for z in about]
+        extent = np.abs(np.where(w[..., None] != 0, about[0], 0.0)).max(axis=(1, 2), keepdims=True)
+        return np.einsum("ka,kai,kai->k", w, *about), about[0] + self.slip * extent
 
     def value(self, x: Array, t: float) -> Array:
         """sigma of every row, dihedrals to the nearest turn."""
@@ -163,9 +194,8 @@ class Dense:
         if kind == "linear":
             return linear
         if kind == "gyration":
-            w = table[0]
-            q = np.sqrt(self._spread(x, x))
-            return w[:, :, None] * (x[None] - (w @ x)[:, None]) / q[:, None, None]
+            square, about = self._spread(x, x)
+            return table[0][:, :, None] * about / np.sqrt(square)[:, None, None]
         d = self._vectors(kind, x)
         if kind == "norm":
             slopes = d / np.linalg.norm(d, axis=2, keepdims=True)
@@ -182,8 +212,8 @@ class Dense:
         if kind == "linear":
             return np.zeros(len(self.blocks[kind][2]))
         if kind == "gyration":
-            q = np.sqrt(self._spread(x, x))
-            return (self._spread(v, v) - (self._spread(x, v) / q) ** 2) / q
+            q = np.sqrt(self._spread(x, x)[0])
+            return (self._spread(v, v)[0] - (self._spread(x, v)[0] / q) ** 2) / q
         d, u = self._vectors(kind, x), self._vectors(kind, v, moving=True)
         if kind == "norm":
             q = np.linalg.norm(d[0], axis=1)
@@ -230,30 +260,54 @@ class Dense:
             if float(np.abs(z - y).max()) > FAR:
                 break
             if length <= 1e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
+                a0, a = self.jacobian(x_ref), self.jacobian(z)
+                cosines = np.stack([a0 * a, a0 * a * self.root**2]).sum(axis=2)
+                self.ways.append((y, bool(np.any(cosines[:, (a0 * self.root).any(axis=1)] <= 0))))
                 return z, (spread @ unknown).reshape(-1, 3)
             last = length
         raise NoSolution("Newton's method for positions")
 
-    def _admissible(self, x: Array, y: Array, wanted: Array) -> Array:
-        """The nearest to y, in the mass metric, with A y = wanted; fixed atoms stay."""
+    def _change(self, x: Array, y: Array, wanted: Array) -> Array:
+        """From y to the nearest, in the mass metric, with A y = wanted; fixed atoms stay."""
         basis, a, _ = self.basis(x)
         spread = (basis * self.root).T
         size = np.linalg.norm(a, axis=1)
         size[size == 0] = 1.0
-        miss = (wanted - a @ y.ravel()) / size
-        return y + (spread @ np.linalg.lstsq((a @ spread) / size[:, None], miss, rcond=1e-10)[0]).reshape(-1, 3)
+        change = np.zeros(y.shape)
+        for _ in range(2):
+            # Once more: the first is as precise as its largest part, which may be that of other molecules.
+            miss = (wanted - a @ (y + change).ravel()) / size
+            change += (spread @ np.linalg.lstsq((a @ spread) / size[:, None], miss, rcond=1e-10)[0]).reshape(-1, 3)
+        return change
 
     def velocities(self, x: Array, v: Array, t: float) -> Array:
         """A v = c."""
         v = v.copy()
         self.pin(v, t, 1)
-        return self._admissible(x, v, wave(*self.waving, t, 1))
+        return v + self._change(x, v, wave(*self.waving, t, 1))
+
+    def _pushed(self, x: Array, v: Array, f: Array, t: float) -> tuple[Array, Array]:
+        """Accelerations without constraints, but for fixed atoms, and what the least constraint force adds."""
+        a = f * self.weights[:, None]
+        self.pin(a, t, 2)
+        return a, self._change(x, a, wave(*self.waving, t, 2) - self.curvature(x, v))
 
     def acceleration(self, x: Array, v: Array, f: Array, t: float) -> Array:
         """A a = b, with the least constraint force."""
-        a = f * self.weights[:, None]
-        self.pin(a, t, 2)
-        return self._admissible(x, a, wave(*self.waving, t, 2) - self.curvature(x, v))
+        a, change = self._pushed(x, v, f, t)
+        return a + change
+
+    def force(self, x: Array, v: Array, f: Array, t: float) -> Array:
+        """M a - f as A^T lambda: where masses differ much, M times the rounding of a is many times that of f."""
+        a, change = self._pushed(x, v, f, t)
+        gradients = self.jacobian(x)
+        b = gradients * self.root
+        size = np.linalg.norm(b, axis=1)
+        size[size == 0] = 1.0
+        weighted = change.ravel() / np.where(self.root > 0, self.root, 1.0)
+        z = (gradients.T @ (np.linalg.lstsq((b / size[:, None]).T, weighted, rcond=RANK)[0] / size)).reshape(-1, 3)
+        z[self.pinned] = self.masses[self.pinned, None] * a[self.pinned] - f[self.pinned]
+        return z
 
     def restore(self, x: Array, t: float) -> Array:
         """The nearest point on the rows in the mass metric."""

@@ -803,9 +803,27 @@ MUTANTS = [
     ),
     (
         "motion/failures.py",
-        "STRAIGHT = 0.1",
-        "STRAIGHT = 1e-9",
+        "_beside(then[first], then[first + 1]) <= 0.0",
+        "_beside(then[first], then[first + 1]) <= -1.0",
         "tests/motion/test_failures.py::test_a_run_that_ends_where_a_dihedral_is_straight_names_no_time_step",
+    ),
+    (
+        "motion/failures.py",
+        '        here, step = ahead, ahead - here\n    return ""',
+        "    return _straightened(constraint_set, numbers, *request[1::-1], rows)",
+        "tests/motion/test_failures.py::test_a_dihedral_that_is_passed_in_small_parts_is_not_named",
+    ),
+    (
+        "constraints/periodic/images.py",
+        "np.where(distance, length, BOND_LIKE * length)",
+        "length",
+        "tests/constraints/periodic/test_images.py::test_a_chain_of_moving_bonds_may_open_beyond_half_the_cell",
+    ),
+    (
+        "solvers/sparse/step_control.py",
+        "FLAT = 0.01",
+        "FLAT = 0.0",
+        "tests/solvers/sparse/test_mixed_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",
     ),
     # -- studies: what is kept, and what is shown --
     (

@@ -7,7 +7,8 @@ Outcomes, from best to worst:
 
 right      agrees with the oracle as far as rounding and the conditioning of the case allow.
 refused    a typed error for a reason that holds, with its remedy; nothing was changed.
-unfounded  a typed error although there is a solution and no link is near half the cell.
+unfounded  a typed error although there is a solution, no gradient of a row turns by a right angle on the way there, and
+           no link is near half the cell, there or where the displacement ends.
 silent     a wrong result, NaN, an untyped error, changed arguments, more than 5 s, or another remedy for a link that
            nears half the cell.
 """

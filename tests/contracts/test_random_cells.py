@@ -11,7 +11,7 @@ import pytest
 import random_cells
 from cell_judge import judge
 from cell_molecules import KINDS
-from cell_oracle import Dense, advance
+from cell_oracle import Dense, Row, advance
 from cell_worlds import world
 
 from kcons import Motion
@@ -60,8 +60,6 @@ def test_gradients_and_second_derivatives_of_the_oracle(seed):
 
 def test_the_oracle_turns_a_rotor_as_rattle_does():
     """Free rotor: exactly asin(omega dt) a step of RATTLE."""
-    from cell_oracle import Row
-
     rows = Dense(
         [Row("norm", [{0: 1.0, 1: -1.0}], target=2.0)],
         np.ones(2),
@@ -75,6 +73,53 @@ def test_the_oracle_turns_a_rotor_as_rattle_does():
     turn = np.arcsin(0.3)
     np.testing.assert_allclose(y[0], [np.cos(turn), np.sin(turn), 0], rtol=0, atol=1e-14)
     np.testing.assert_allclose(u[0], [-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0], rtol=0, atol=1e-14)
+
+
+NOTHING = np.zeros(0, int), np.zeros((0, 3)), np.zeros((3, 0, 3))
+
+
+def test_the_oracle_is_as_precise_as_the_engine_where_masses_differ():
+    """A heavy atom near the centre that a radius of gyration is about; heavy molecules beside light ones."""
+    masses = np.array([0.01, 1.0, 1e4])
+    weights = {a: float(m / masses.sum()) for a, m in enumerate(masses)}
+    rng = np.random.default_rng(0)
+    x, v, f = rng.normal(size=(3, 6, 3))
+    rows = Dense([Row("gyration", [weights])], masses, np.eye(3), *NOTHING)
+    slopes = rows.jacobian(x[:3] + 10.0).reshape(3, 3)
+    assert np.abs(slopes.sum(axis=0)).max() < 1e-16 < 1e-3 < np.abs(slopes).max()
+
+    masses = np.array([0.01, 0.03, 0.01, 0.1, 80.0, 8000.0])
+    pairs = [
+        Row("linear", coefficients={a: c, a + 1: -c}) for a, c in zip((0, 2, 4), rng.normal(size=(3, 3)), strict=True)
+    ]
+    together = Dense(pairs, masses, np.eye(3), *NOTHING).force(x, v, f, 0.0)
+    heavy = Dense([pairs[2].renumbered(np.arange(-4, 2))], masses[4:], np.eye(3), *NOTHING)
+    np.testing.assert_allclose(together[4:], heavy.force(x[4:], v[4:], f[4:], 0.0), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("rise", "turns"), [(0.001, False), (0.05, True)])
+def test_the_oracle_knows_gradients_that_turn(rise, turns):
+    """An angle of nearly 180 degrees whose vertex goes through the line between its ends."""
+    row = Row("angle", [{0: 1.0, 1: -1.0}, {2: 1.0, 1: -1.0}], [(0, 0, 0)] * 2)
+    rows = Dense([row], np.ones(3), np.eye(3), *NOTHING)
+    x = np.array([[1.0, 0.01, 0], [0, 0, 0], [-1.0, 0.01, 0]])
+    rows.targets = rows.measure(x)
+    rows.solve(x + np.array([[0, 0, 0], [0, rise, 0], [0, 0, 0]]), x, 0.0)
+    assert [turned for _, turned in rows.ways] == [turns]
+
+
+def test_the_judge_lets_a_displacement_be_too_long_where_smaller_steps_help():
+    by = cell_judge.Judge(world(0), 0)
+    near, far = by.w.x, 10 * by.w.x
+    assert by.w.nearness(near, every=True) < 1 < by.w.nearness(far, every=True)
+    for ways, link, allowed in (
+        ([(near, False)], 0.5, False),
+        ([(near, True)], 1.1, True),
+        ([(far, False)], 0.5, True),
+        ([(far, False)], 1.1, False),
+    ):
+        by.rows.ways = ways
+        assert by.may_refuse(link) is allowed
 
 
 def _seed_of(kind: str) -> int:

@@ -388,12 +388,16 @@ def _tree(
     pair = np.sort(np.concatenate([o[0] for o in offered]), axis=1)
     row = np.concatenate([o[2] for o in offered])
     length = np.concatenate([o[1] for o in offered])
-    held = np.concatenate([np.full(len(o[2]), table.held) for table, o in zip(tables, offered, strict=True)])
+    held, distance = (
+        np.concatenate([np.full(len(o[2]), kind) for kind, o in zip(kinds, offered, strict=True)])
+        for kinds in ([t.held for t in tables], [t.item.family == "Distance" for t in tables])
+    )
     unknown = np.isnan(length)
     apart = x[pair[unknown, 1]] - x[pair[unknown, 0]]
     length[unknown] = np.linalg.norm(minimum_image(apart, lattice), axis=1)
-    # Held links as long as half the cell have no image of their own; they come last, to be refused.
-    order = np.lexsort((length, ~held, length >= half_width))
+    # Held links as long as half the cell have no image of their own; they come last, to be refused. Links that nothing
+    # holds may grow, so that distances that move are taken before such as are little shorter.
+    order = np.lexsort((np.where(distance, length, BOND_LIKE * length), ~held, length >= half_width))
     _, first = np.unique(pair[order, 0] * n_atoms + pair[order, 1], return_index=True)
     chosen = order[np.sort(first)]
     ranks = np.arange(1.0, len(chosen) + 1)

@@ -90,7 +90,7 @@ class Rescuers:
         np.copyto(x, saved[0])
         if velocities is not None and saved[1] is not None:
             np.copyto(velocities, saved[1])
-        raise error or failures.positions_failed(self._local, self._numbers, reference, outcome, solver, self._plan)
+        raise error or failures.positions_failed(self._local, self._numbers, request, outcome, solver, self._plan)
 
     def _damped(
         self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None

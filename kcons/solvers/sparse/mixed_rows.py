@@ -45,7 +45,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
 from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
-from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, miss
+from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, first_flat, miss
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
@@ -394,6 +394,10 @@ def _positions(  # type: ignore[no-untyped-def]
                 functions[4], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
             )
             iteration += 1
+        if iteration > step_control.MANY_ITERATIONS:
+            bad_row = first_flat(first, last, links, lines)
+            if bad_row >= 0:
+                return False, np.inf, iteration, bad_row
         for k in range(first, last):
             along = 0.0
             for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):

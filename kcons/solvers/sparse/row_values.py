@@ -19,9 +19,21 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import RowKind
 from kcons.solvers.called_solvers import address_of, caller_of
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS
-from kcons.solvers.kernels.two_and_four_wide import dot, entry, lane, load_quad, number, put, quad, rolled
+from kcons.solvers.kernels.two_and_four_wide import (
+    dot,
+    entry,
+    first_vector,
+    lane,
+    load_quad,
+    number,
+    put,
+    quad,
+    rolled,
+    second_vector,
+)
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, call_row
+from kcons.solvers.sparse.step_control import FLAT
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
@@ -212,6 +224,21 @@ def evaluate(  # type: ignore[no-untyped-def]
 def addresses_for(kinds: NDArray[np.uint32]) -> tuple[int, int]:
     """Of `evaluate`, and of the function that it takes for rows of such kinds: 0 where none is a function."""
     return address_of(evaluate, _EVALUATE), address_of(_function, _FUNCTION) if (kinds >= FUNCTION).any() else 0
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def first_flat(first, last, links, lines):  # type: ignore[no-untyped-def]
+    """The first row whose gradient has less than `FLAT` of that at the reference along it; -1 if none has."""
+    for k in range(first, last):
+        along, size = 0.0, 0.0
+        for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
+            rolled()
+            g = second_vector(lines, 8 * p)
+            along += dot(first_vector(lines, 8 * p), g)
+            size += dot(g, g)
+        if along < FLAT * size:
+            return k
+    return -1
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")

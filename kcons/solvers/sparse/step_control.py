@@ -20,6 +20,9 @@ MAX_ITERATIONS = 50
 ROUNDINGS = 4.0
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
+#: Part of itself that a gradient must have along it where more than that end: where it has less, the row has flattened
+#: out on the way, as a dihedral that is to turn over does far away, and the positions are none near the given ones.
+FLAT = 0.01
 #: Halvings of one Newton step by the step control.
 MAX_HALVINGS = 30
 

@@ -11,6 +11,7 @@ from kcons.constraints import (
     Angle,
     CenterDistance,
     CenterOfMass,
+    Dihedral,
     Distance,
     FixedAtoms,
     LinearCombination,
@@ -238,3 +239,17 @@ def test_off_its_row_a_distance_of_nearly_half_the_cell_is_not_that_of_another_i
     expected = ConstraintSet(row, x, np.ones(3)).value(longer)
     for images in ([0, 0, 0], [0, -1, 0], [2, 5, -3]):
         np.testing.assert_allclose(held.value(longer + 2.1 * np.array(images)[:, None]), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("turn", [0.5, 1.5, 2.5, 3.1])
+def test_a_chain_of_moving_bonds_may_open_beyond_half_the_cell(turn):
+    """Its ends are the nearest atoms at the start, but it is the bonds that make it whole."""
+
+    def chain(turn):
+        return np.array([[0.1, 1.1, 0.0], [0, 0, 0], [1.1, 0, 0], [1.0, 1.1 * np.cos(turn), 1.1 * np.sin(turn)]])
+
+    still = MovingTarget(lambda t: np.linalg.norm([0.1, 1.1]), lambda t: 0.0, lambda t: 0.0)
+    rows = [Distance([[0, 1], [2, 3]], still), Distance([[1, 2]]), Dihedral([[0, 1, 2, 3]])]
+    held = ConstraintSet(rows, chain(0.0), np.ones(4), cell=[3.2] * 3)
+    there = stored(chain(turn), 3.2 * np.eye(3), (True, True, True), 1)[0]
+    np.testing.assert_allclose(np.abs(held.value(there)), [0, 0, 0, turn], rtol=0, atol=1e-14)

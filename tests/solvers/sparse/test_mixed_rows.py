@@ -6,6 +6,7 @@ import pytest
 from kcons.constraints import Angle, Cylinder, Dihedral, Distance, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.solvers.cluster_solver import Request
+from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
 CONSTRAINTS = [
@@ -165,3 +166,23 @@ def test_dependent_rows_may_miss_by_some_roundings(apart, converged):
         assert np.all(np.abs(whole.value(moved)) <= 4 * np.sqrt(3) * whole.tolerance(moved))
     else:
         np.testing.assert_array_equal(moved, before)
+
+
+@pytest.mark.parametrize("seed", [12, 22, 166, 1459])
+def test_a_dihedral_that_turns_over_has_no_solution_far_away(seed):
+    """Bent to the other side it is off by pi; hundreds of displacements away it is flat, and would be right again."""
+    rng = np.random.default_rng(seed)
+    legs = rng.normal(size=(3, 3)) * 10 ** rng.uniform(-1.5, 0.3, (3, 1))
+    side = np.cross(legs[1], rng.normal(size=3))
+    side *= 0.01 * np.linalg.norm(legs[2]) / np.linalg.norm(side)
+    legs[2] = legs[1] + side
+    x = np.vstack([np.zeros(3), np.cumsum(legs, axis=0)])
+    x_new = x.copy()
+    x_new[3] -= 2 * side
+    inv_mass = 10 ** rng.uniform(0, 1, 4)
+    held = ConstraintSet([Distance([[0, 1]]), Dihedral([[0, 1, 2, 3]])], x, 1 / inv_mass)
+    rows = np.arange(2)
+    for solver in (SparseRows(held, rows, inv_mass), GeneralClusters(held, rows, 0 * rows, inv_mass)):
+        changed = x_new.copy()
+        assert not solver.positions(Request(changed, x)).converged
+        assert np.array_equal(changed, x_new)
