@@ -146,6 +146,11 @@ class Engine:
         self._begin_drift()
         return self._nothing
 
+    def stand_at(self, x: FloatArray) -> None:
+        """Particles are here, where others may have moved them: positions of all, shape (n_particles, 3)."""
+        np.copyto(self._x, x[self.atoms])
+        self._begin_drift()
+
     def _begin_drift(self) -> None:
         self._landing = None
         self._begun = True
