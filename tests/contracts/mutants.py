@@ -748,6 +748,12 @@ MUTANTS = [
     ),
     # -- topology: all angles --
     (
+        "topology/rows_by_name.py",
+        "reshape(-1, 2), TORN_WATER)",
+        "reshape(-1, 2), np.inf)",
+        "tests/topology/test_rows_by_name.py::test_bodies_that_a_missing_cell_tears_are_refused",
+    ),
+    (
         "topology/angle_rows.py",
         "flat = volume < np.sin(np.radians(FLAT_CENTRE))",
         "flat = volume < -np.sin(np.radians(FLAT_CENTRE))",
