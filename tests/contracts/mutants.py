@@ -273,6 +273,18 @@ MUTANTS = [
         "tests/openmm/integrator/test_schemes.py",
     ),
     (
+        "openmm/integrator/projected.py",
+        "                part.serve(self, notes)\n",
+        "",
+        "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
+    ),
+    (
+        "openmm/integrator/system_checks.py",
+        "if rows and any(_scales_atoms",
+        "if not rows and any(_scales_atoms",
+        "tests/openmm/integrator/test_projected.py::test_barostat_and_rows_between_molecules",
+    ),
+    (
         "openmm/carried/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",

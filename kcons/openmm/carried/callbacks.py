@@ -112,6 +112,9 @@ class Engine:
     def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
         """Take times and step sizes from this integrator; `lean` as for parts."""
         self._lean = lean
+        self._push.fill(np.nan)
+        self._push_before.fill(np.nan)
+        self._fractions, self._nodes, self._within = (1.0,), (0.0, 1.0), False
         self._integrator = weakref.ref(integrator)
         self.carries_rest = not getattr(integrator, "thermostatted", False)
         scheme = getattr(integrator, "scheme", None)

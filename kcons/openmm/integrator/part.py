@@ -130,6 +130,18 @@ class Part(ABC):
     alone: bool = False
     stays_finite: bool = False
     sited: bool = False
+    #: Attributes that a program sets in a part while it is written: each integrator that has the part has its own.
+    written: tuple[str, ...] = ("code", "lean")
+    #: The integrator that the part serves, as `object` that no other has.
+    serves: object = None
+
+    def notes(self) -> dict[str, Any]:
+        """What the program that was written last has set."""
+        return {name: vars(self)[name] for name in self.written if name in vars(self)}
+
+    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
+        """Serve another integrator than before; `notes` are those of its program."""
+        vars(self).update(notes)
 
     @property
     def driven(self) -> bool:

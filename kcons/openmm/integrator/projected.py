@@ -116,6 +116,11 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         writer: type[LeanStepWriter] = getattr(self._ensemble, "writer", None) or self._writer
         self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
+        #: What parts know as this integrator, and what its program has set in each.
+        self._self = object()
+        self._notes = [part.notes() for part in self.parts]
+        for part in self.parts:
+            part.serves = self._self
         listen(self)
 
     def __repr__(self) -> str:
@@ -192,10 +197,18 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
             self._guard = Guard(context, self)
 
     def _watch(self, context: openmm.Context | None = None) -> Guard:
+        elsewhere = any(part.serves is not self._self for part in self.parts)
+        if elsewhere:
+            for part, notes in zip(self.parts, self._notes, strict=True):
+                part.serve(self, notes)
+                part.serves = self._self
         if context is None:
             context = self.context
         self.context = context
         assert self._guard is not None
+        if elsewhere:
+            self.take_precision(self._guard.constraints.precision)
+            self._guard.disturbed = True
         return self._guard
 
     def _failure(self, code: int, step: int) -> KconsError:
