@@ -285,6 +285,13 @@ MUTANTS = [
         "tests/openmm/integrator/test_projected.py::test_barostat_and_rows_between_molecules",
     ),
     (
+        "openmm/integrator/guard.py",
+        "{openmm.CMMotionRemover, openmm.CustomExternalForce} <= kinds",
+        "False",
+        "tests/openmm/integrator/test_guard.py"
+        "::test_a_motion_remover_meets_complete_velocities_beside_an_external_force",
+    ),
+    (
         "openmm/carried/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",
