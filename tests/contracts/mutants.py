@@ -292,6 +292,18 @@ MUTANTS = [
         "::test_a_motion_remover_meets_complete_velocities_beside_an_external_force",
     ),
     (
+        "openmm/integrator/projected.py",
+        "            part.forget()\n",
+        "",
+        "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
+    ),
+    (
+        "openmm/surfaces/compiled_quadrics.py",
+        "super()._declare_solution(p)",
+        "super()",
+        "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
+    ),
+    (
         "openmm/carried/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",

@@ -139,8 +139,14 @@ class Part(ABC):
         """What the program that was written last has set."""
         return {name: vars(self)[name] for name in self.written if name in vars(self)}
 
+    def forget(self) -> None:
+        """Be as before any program was written."""
+        for name in self.written:
+            vars(self).pop(name, None)
+
     def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
         """Serve another integrator than before; `notes` are those of its program."""
+        self.forget()
         vars(self).update(notes)
 
     @property

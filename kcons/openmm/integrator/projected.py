@@ -106,6 +106,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         for k, part in enumerate(self.parts, start=1):
+            part.forget()
             part.code = k
         #: Force groups that carry rows, not forces.
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
