@@ -304,6 +304,12 @@ MUTANTS = [
         "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
+        "openmm/collective/clock.py",
+        'p.write(f"clock_start{self.code}", time)',
+        'p.write(f"clock_start{self.code}", 0.0)',
+        "tests/openmm/collective/test_clock.py::test_members_of_a_compound_integrator_pull_in_turn",
+    ),
+    (
         "openmm/carried/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",

@@ -149,6 +149,9 @@ class Part(ABC):
         self.forget()
         vars(self).update(notes)
 
+    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
+        """`before`, another member of a CompoundIntegrator with these notes, has made steps in the same Context."""
+
     @property
     def driven(self) -> bool:
         """Whether rows demand velocities that are not 0."""

@@ -18,7 +18,7 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.states.calls import Calls
 from kcons.openmm.integrator.states.copies import Copies
-from kcons.openmm.integrator.states.hearing import listen
+from kcons.openmm.integrator.states.hearing import listen, listeners
 from kcons.openmm.integrator.states.outside_of_steps import OutsideOfSteps
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
@@ -118,10 +118,10 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
         #: What parts know as this integrator, and what its program has set in each.
-        self._self = object()
+        self.identity = object()
         self._notes = [part.notes() for part in self.parts]
         for part in self.parts:
-            part.serves = self._self
+            part.serves = self.identity
         listen(self)
 
     def __repr__(self) -> str:
@@ -198,18 +198,23 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
             self._guard = Guard(context, self)
 
     def _watch(self, context: openmm.Context | None = None) -> Guard:
-        elsewhere = any(part.serves is not self._self for part in self.parts)
-        if elsewhere:
+        served = [part.serves for part in self.parts if part.serves is not self.identity]
+        if served:
             for part, notes in zip(self.parts, self._notes, strict=True):
                 part.serve(self, notes)
-                part.serves = self._self
+                part.serves = self.identity
         if context is None:
             context = self.context
         self.context = context
         assert self._guard is not None
-        if elsewhere:
+        if served:
             self.take_precision(self._guard.constraints.precision)
             self._guard.disturbed = True
+            for before in listeners(self._guard.context):
+                if isinstance(before, ProjectedIntegrator) and any(before.identity is one for one in served):
+                    for part, notes in zip(before.parts, before._notes, strict=True):
+                        if any(part is own for own in self.parts):
+                            part.continue_from(before, notes, self.program)
         return self._guard
 
     def _failure(self, code: int, step: int) -> KconsError:
