@@ -94,6 +94,12 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
             "GRO, PDB or mmCIF",
             item="topology",
         )
+    if not (hasattr(universe.atoms, "names") or hasattr(universe.atoms, "types")):
+        raise InputError(
+            f"{topology} says nothing of its atoms, as trajectories do; give a topology such as PSF, PRMTOP, TPR, GRO, "
+            "PDB or mmCIF. The trajectory comes first: check_trajectory(trajectory, topology)",
+            item="topology",
+        )
     if trajectory is not None:
         load_trajectory(universe, trajectory, topology)
     return universe

@@ -85,12 +85,21 @@ def snapshot_of(universe: Any) -> Snapshot:
     Raises
     ------
     InputError
-        No coordinates.
+        No coordinates; an atom that is twice in a group.
     """
     group = universe.atoms
     whole = group.universe
     if not len(group):
         raise InputError("there are no atoms in the group", item="atoms")
+    if group.n_atoms != group.unique.n_atoms:
+        _, first = np.unique(group.indices, return_index=True)
+        twice = int(np.setdiff1d(np.arange(len(group)), first)[0])
+        raise InputError(
+            f"the group has atom {group.indices[twice]} of its Universe twice, the second time in place {twice}; take "
+            "group.unique",
+            item="atoms",
+            atoms=[twice],
+        )
     try:
         step = whole.trajectory.ts
         x = as_written(group.positions)

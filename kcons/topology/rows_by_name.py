@@ -34,8 +34,8 @@ from kcons.topology.rigid_groups import (
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
 from kcons.topology.virtual_sites import VirtualSites
 
-#: No bond is that long, in angstrom.
-TORN = 10.0
+#: No bond is that long, in angstrom, and none of water.
+TORN, TORN_WATER = 10.0, 3.0
 
 
 class HeldRows(list[Constraint]):
@@ -164,6 +164,9 @@ def rows_of(
         groups = [kept for kept in (g[selected[g].all(axis=1)] for g in groups) if len(kept)]
     groups = _without_waters(groups, waters.triples)
     groups += listed_bodies(snapshot, bodies)
+    _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2), TORN_WATER)
+    bonds = snapshot.topology.bonds
+    _refuse_torn(snapshot, bonds[inside_bodies(snapshot.topology.n_atoms, bonds, groups)])
     rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
     rows += waters.rows(geometry, snapshot.angstrom)
     rows += body_rows(snapshot, groups, flat)
@@ -327,10 +330,10 @@ def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
 # -- checks ---------------------------------------------------------------------------------------
 
 
-def _refuse_torn(snapshot: Snapshot, bonds: IntArray) -> None:
+def _refuse_torn(snapshot: Snapshot, bonds: IntArray, longest: float = TORN) -> None:
     d = minimum_image(snapshot.positions[bonds[:, 0]] - snapshot.positions[bonds[:, 1]], snapshot.lattice)
     long = np.linalg.norm(d, axis=1) / snapshot.angstrom
-    if len(long) and long.max() > TORN:
+    if len(long) and long.max() > longest:
         i, j = (int(a) for a in bonds[int(np.argmax(long))])
         name = snapshot.topology.atom_name
         raise InputError(

@@ -285,6 +285,49 @@ MUTANTS = [
         "tests/openmm/integrator/test_schemes.py",
     ),
     (
+        "openmm/integrator/projected.py",
+        "                part.serve(self, notes)\n",
+        "",
+        "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
+    ),
+    (
+        "openmm/integrator/system_checks.py",
+        "if rows and any(_scales_atoms",
+        "if not rows and any(_scales_atoms",
+        "tests/openmm/integrator/test_projected.py::test_barostat_and_rows_between_molecules",
+    ),
+    (
+        "openmm/integrator/guard.py",
+        "{openmm.CMMotionRemover, openmm.CustomExternalForce} <= kinds",
+        "False",
+        "tests/openmm/integrator/test_guard.py"
+        "::test_a_motion_remover_meets_complete_velocities_beside_an_external_force",
+    ),
+    (
+        "openmm/integrator/projected.py",
+        "            part.forget()\n",
+        "",
+        "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
+    ),
+    (
+        "openmm/surfaces/compiled_quadrics.py",
+        "super()._declare_solution(p)",
+        "super()",
+        "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
+    ),
+    (
+        "openmm/collective/clock.py",
+        'p.write(f"clock_start{self.code}", time)',
+        'p.write(f"clock_start{self.code}", 0.0)',
+        "tests/openmm/collective/test_clock.py::test_members_of_a_compound_integrator_pull_in_turn",
+    ),
+    (
+        "openmm/carried/carried_constraints.py",
+        "self._engine.stand_at(self._state(context)[0])",
+        "self._state(context)[0]",
+        "tests/openmm/integrator/states/test_settings.py::test_a_run_goes_on_bit_for_bit",
+    ),
+    (
         "openmm/carried/carried_constraints.py",
         "return self.motion.rank - 3 * fixed",
         "return self.motion.rank",
@@ -753,6 +796,12 @@ MUTANTS = [
         "tests/constraints/periodic/test_images.py::test_a_length_found_and_the_same_one_given",
     ),
     # -- topology: all angles --
+    (
+        "topology/rows_by_name.py",
+        "reshape(-1, 2), TORN_WATER)",
+        "reshape(-1, 2), np.inf)",
+        "tests/topology/test_rows_by_name.py::test_bodies_that_a_missing_cell_tears_are_refused",
+    ),
     (
         "topology/angle_rows.py",
         "flat = volume < np.sin(np.radians(FLAT_CENTRE))",

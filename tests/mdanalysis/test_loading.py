@@ -6,7 +6,7 @@ import water_files as files
 
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnreadableError
-from kcons.mdanalysis import ConstraintCheck, load_trajectory, open_universe
+from kcons.mdanalysis import ConstraintCheck, check_trajectory, load_trajectory, open_universe
 
 N = 30
 
@@ -79,3 +79,10 @@ def test_topologies_that_cannot_be_read(tmp_path):
     path.write_text("nothing\n")
     with pytest.raises(InputError, match=r"t\.psf: MDAnalysis cannot read this topology"):
         open_universe(path)
+
+
+def test_a_trajectory_is_no_topology(tmp_path, x):
+    path, top = files.write(tmp_path / "w.dcd", x), files.topology(tmp_path / "t.pdb", N, x[0])
+    with pytest.raises(InputError, match=r"w\.dcd says nothing of its atoms, .* The trajectory comes first"):
+        check_trajectory(top, path)
+    assert check_trajectory(path, top).n_atoms == 3 * N

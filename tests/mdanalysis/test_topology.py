@@ -9,7 +9,7 @@ from host_systems import VILLIN, quietly, read_universe
 
 from kcons.constraints import CenterDistance, CenterOfMass, Sphere
 from kcons.errors import InputError
-from kcons.mdanalysis import constraints_of, selected, snapshot_of
+from kcons.mdanalysis import constraints_of, selected, snapshot_of, to_ase
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +81,14 @@ def test_a_universe_without_coordinates_or_masses():
         constraints_of(bare)
     with pytest.raises(InputError, match=r"OW of SOL 1 \(atom 0\) has no mass"):
         constraints_of(waters(2), "none")
+
+
+@pytest.mark.parametrize("taken", [constraints_of, to_ase, snapshot_of])
+def test_an_atom_that_is_twice_in_a_group_is_refused(taken):
+    made = waters(2, masses=[15.9994, 1.008, 1.008] * 2)
+    with pytest.raises(InputError, match=r"atom 1 of its Universe twice, .* in place 3; take group.unique"):
+        taken(made.atoms[[0, 1, 2, 1, 3, 4, 5]])
+    assert constraints_of(made.atoms[[5, 0, 1, 2, 4, 3]], "none").constraint_set.n_rows == 6
 
 
 def test_sites_without_mass_are_found_by_mass_and_name():

@@ -163,6 +163,29 @@ def test_no_masses_no_hydrogens_and_torn_molecules():
     assert whole[0].target == pytest.approx(1.5)
 
 
+@pytest.mark.parametrize(
+    ("atom", "shift", "said", "options"),
+    [
+        (
+            10,
+            26.0,
+            r"H of HOH 2 \(atom 10\) are bonded and 27 angstrom apart; give the periodic cell",
+            {},
+        ),
+        (10, 6.0, "give the periodic cell", {"water_geometry": "TIP3P"}),
+        (0, 26.0, r"C of EOH 1 \(atom 0\) and C of EOH 1 \(atom 1\)", {"rigid_residues": ["EOH"]}),
+        (0, 26.0, r"C of EOH 1 \(atom 0\) and C of EOH 1 \(atom 1\)", {"rigid_bodies": [np.arange(4)]}),
+    ],
+)
+def test_bodies_that_a_missing_cell_tears_are_refused(atom, shift, said, options):
+    made = solution()
+    x = made.positions.copy()
+    x[atom, 0] += shift
+    with pytest.raises(InputError, match=said):
+        held_rows(replace(made, positions=x), "none", **options)
+    held_rows(replace(made, positions=x, cell=np.diag([shift, 40.0, 40.0]), pbc=np.full(3, True)), "none", **options)
+
+
 def test_bond_angles_are_all_of_them():
     rng = np.random.default_rng(0)
     bonds = np.array([p for p in combinations(range(12), 2) if rng.random() < 0.3])

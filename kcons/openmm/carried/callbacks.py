@@ -112,6 +112,9 @@ class Engine:
     def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
         """Take times and step sizes from this integrator; `lean` as for parts."""
         self._lean = lean
+        self._push.fill(np.nan)
+        self._push_before.fill(np.nan)
+        self._fractions, self._nodes, self._within = (1.0,), (0.0, 1.0), False
         self._integrator = weakref.ref(integrator)
         self.carries_rest = not getattr(integrator, "thermostatted", False)
         scheme = getattr(integrator, "scheme", None)
@@ -145,6 +148,11 @@ class Engine:
         self.passage.take(state, self._x)
         self._begin_drift()
         return self._nothing
+
+    def stand_at(self, x: FloatArray) -> None:
+        """Particles are here, where others may have moved them: positions of all, shape (n_particles, 3)."""
+        np.copyto(self._x, x[self.atoms])
+        self._begin_drift()
 
     def _begin_drift(self) -> None:
         self._landing = None

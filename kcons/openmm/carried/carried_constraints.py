@@ -41,6 +41,7 @@ from kcons.openmm.carried.requirements import (
 )
 from kcons.openmm.integrator.part import NEAR, Miss
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
@@ -224,6 +225,10 @@ class CarriedConstraints(CarriedProgram):
                 item="velocities",
                 atoms=[atom],
             )
+
+    def take_place(self, program: Program, context: openmm.Context) -> None:
+        """A State or checkpoint that was loaded is where its own steps ended, the engine is not."""
+        self._engine.stand_at(self._state(context)[0])
 
     def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
         """sigma and A v of the constraints that were given, from the positions and velocities of the context."""

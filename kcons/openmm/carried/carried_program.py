@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import openmm
+
 from kcons.openmm.carried.callbacks import LOW_SCALE, SPEED_SCALE, Engine
 from kcons.openmm.carried.passage import CARRY_SCALE
 from kcons.openmm.carried.requirements import refuse_single_precision
@@ -15,6 +19,7 @@ class CarriedProgram(Part):
 
     evaluates = True
     lands_last = True
+    written = (*Part.written, "_early")
     _engine: Engine
     #: Of each phase, the force group whose evaluation calls the engine.
     _groups: dict[str, int]
@@ -23,6 +28,11 @@ class CarriedProgram(Part):
         self._engine.follow(program.integrator, self.lean)
         #: Where a step may end without a projection, the solve for positions must tell of failures itself.
         self._early = self.lean or getattr(program.integrator, "scheme", None) is None
+
+    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
+        """Times, stages and lengths of drifts are those of the integrator that makes steps."""
+        super().serve(integrator, notes)
+        self._engine.follow(integrator, self.lean)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""

@@ -110,7 +110,7 @@ def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callabl
             )
         rigid = getattr(force, "getScaleMoleculesAsRigid", None)
         if rigid is not None and not rigid():
-            raise UnsupportedError(f"{name} scales molecules; call setScaleMoleculesAsRigid(True)")
+            raise UnsupportedError(f"{name} scales atoms one by one; call setScaleMoleculesAsRigid(True)")
         row = _row_between(held, molecules())
         if row is not None:
             raise UnsupportedError(

@@ -31,6 +31,11 @@ class Clock:
         kept = variables[f"pending{c}"] and variables[f"step_start{c}"] != variables["good_steps"]
         return variables[f"clock_end{c}" if kept else f"clock_start{c}"]
 
+    def set(self, p: Program, time: float) -> None:
+        """Let it be this time, between steps."""
+        p.write(f"clock_start{self.code}", time)
+        p.write(f"pending{self.code}", 0.0)
+
     def begin(self, p: Program) -> None:
         """At the first drift of a step. A step that failed is not counted in good_steps, and its time is not kept."""
         c = self.code

@@ -232,9 +232,9 @@ class MeasuredRows:
 
 def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
-    for ours in listeners(context):
-        if rows._of("push", 0) in ours.program.numbers:
-            return ours
+    holding = [ours for ours in listeners(context) if rows._of("push", 0) in ours.program.numbers]
+    if holding:  # of members of a CompoundIntegrator the one that made steps last
+        return next((ours for ours in holding if getattr(ours, "identity", None) is rows.serves), holding[0])
     integrator = context.getIntegrator()
     found = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):

@@ -27,9 +27,8 @@ class GroupRows(Part):
         One entry a row.
     """
 
-    evaluates = True
-    stays_finite = True
-    solves_alone = True
+    evaluates = stays_finite = solves_alone = True
+    written = (*Part.written, "_leapfrog", "_single", "_blocks", "_forecast", "_base", "_start")
     code = 1
     names: tuple[str, ...]
     atoms: tuple[tuple[int, ...], ...]

@@ -186,8 +186,12 @@ class Guard:
         refuse_old_positions(integrator, self.system, self.constraints.precision)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
-        #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
-        self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
+        #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them, and
+        #: a CMMotionRemover, to which half a kick matters where forces add up to something.
+        kinds = {type(force) for force in forces_of(self.system)}
+        self.undisturbed = not (
+            openmm.AndersenThermostat in kinds or {openmm.CMMotionRemover, openmm.CustomExternalForce} <= kinds
+        )
         self.started = False  # whether the set-up was checked
         #: Whether others may have moved x or v since: the next step looks where they are.
         self.disturbed = True

@@ -130,6 +130,27 @@ class Part(ABC):
     alone: bool = False
     stays_finite: bool = False
     sited: bool = False
+    #: Attributes that a program sets in a part while it is written: each integrator that has the part has its own.
+    written: tuple[str, ...] = ("code", "lean")
+    #: The integrator that the part serves, as `object` that no other has.
+    serves: object = None
+
+    def notes(self) -> dict[str, Any]:
+        """What the program that was written last has set."""
+        return {name: vars(self)[name] for name in self.written if name in vars(self)}
+
+    def forget(self) -> None:
+        """Be as before any program was written."""
+        for name in self.written:
+            vars(self).pop(name, None)
+
+    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
+        """Serve another integrator than before; `notes` are those of its program."""
+        self.forget()
+        vars(self).update(notes)
+
+    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
+        """`before`, another member of a CompoundIntegrator with these notes, has made steps in the same Context."""
 
     @property
     def driven(self) -> bool:

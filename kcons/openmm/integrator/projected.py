@@ -18,7 +18,7 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.states.calls import Calls
 from kcons.openmm.integrator.states.copies import Copies
-from kcons.openmm.integrator.states.hearing import listen
+from kcons.openmm.integrator.states.hearing import listen, listeners
 from kcons.openmm.integrator.states.outside_of_steps import OutsideOfSteps
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
@@ -106,6 +106,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         for k, part in enumerate(self.parts, start=1):
+            part.forget()
             part.code = k
         #: Force groups that carry rows, not forces.
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
@@ -116,6 +117,11 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         writer: type[LeanStepWriter] = getattr(self._ensemble, "writer", None) or self._writer
         self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
+        #: What parts know as this integrator, and what its program has set in each.
+        self.identity = object()
+        self._notes = [part.notes() for part in self.parts]
+        for part in self.parts:
+            part.serves = self.identity
         listen(self)
 
     def __repr__(self) -> str:
@@ -192,10 +198,23 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
             self._guard = Guard(context, self)
 
     def _watch(self, context: openmm.Context | None = None) -> Guard:
+        served = [part.serves for part in self.parts if part.serves is not self.identity]
+        if served:
+            for part, notes in zip(self.parts, self._notes, strict=True):
+                part.serve(self, notes)
+                part.serves = self.identity
         if context is None:
             context = self.context
         self.context = context
         assert self._guard is not None
+        if served:
+            self.take_precision(self._guard.constraints.precision)
+            self._guard.disturbed = True
+            for before in listeners(self._guard.context):
+                if isinstance(before, ProjectedIntegrator) and any(before.identity is one for one in served):
+                    for part, notes in zip(before.parts, before._notes, strict=True):
+                        if any(part is own for own in self.parts):
+                            part.continue_from(before, notes, self.program)
         return self._guard
 
     def _failure(self, code: int, step: int) -> KconsError:

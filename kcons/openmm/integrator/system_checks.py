@@ -34,6 +34,10 @@ _FOREIGN = {
     "openmm.DrudeLangevinIntegrator or openmm.DrudeSCFIntegrator, which keep them cold",
     "RPMDMonteCarloBarostat": "ring polymers need openmm.RPMDIntegrator",
 }
+_ATOM_BY_ATOM = (
+    "MonteCarloFlexibleBarostat with scaleMoleculesAsRigid=False moves the atoms of a molecule apart and breaks what "
+    "is held; let it scale molecules as rigid"
+)
 #: Platforms that place virtual sites where a program ends. GPUs do so wherever positions are constrained.
 _LATE = ("Reference", "CPU")
 BAROSTATS = frozenset(
@@ -229,12 +233,12 @@ def check_system(system: openmm.System) -> None:
         name = type(force).__name__
         if name in _FOREIGN:
             raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
-        scales_atoms = name == "MonteCarloFlexibleBarostat" and not force.getScaleMoleculesAsRigid()
-        if scales_atoms and system.getNumConstraints():
-            raise UnsupportedError(
-                "MonteCarloFlexibleBarostat with scaleMoleculesAsRigid=False moves the atoms of a molecule apart and "
-                "breaks the constraints; let it scale molecules as rigid"
-            )
+        if system.getNumConstraints() and _scales_atoms(force):
+            raise UnsupportedError(f"the System has constraints, and {_ATOM_BY_ATOM}")
+
+
+def _scales_atoms(force: openmm.Force) -> bool:
+    return isinstance(force, openmm.MonteCarloFlexibleBarostat) and not force.getScaleMoleculesAsRigid()
 
 
 def virtual_sites(system: openmm.System) -> list[int]:
@@ -295,6 +299,9 @@ def refuse_barostat(context: openmm.Context, rows: Iterable[Sequence[int]], kind
     names = {type(force).__name__ for force in forces_of(context.getSystem())} & BAROSTATS
     if not names:
         return
+    rows = list(rows)
+    if rows and any(_scales_atoms(force) for force in forces_of(context.getSystem())):
+        raise UnsupportedError(f"{kind} is held, and {_ATOM_BY_ATOM}")
     molecule = np.empty(context.getSystem().getNumParticles(), dtype=np.int64)
     for number, members in enumerate(context.getMolecules()):
         molecule[list(members)] = number

@@ -28,7 +28,7 @@ _STARTS: dict[str, FloatArray] = {}
 
 
 class CompiledQuadricRows(QuadricRows):
-    """As `QuadricRows`; the drift calls compiled code.
+    """As `QuadricRows`; the drift calls compiled code, where it is that of `SurfaceIntegrator` at constant energy.
 
     Parameters
     ----------
@@ -64,6 +64,7 @@ class CompiledQuadricRows(QuadricRows):
         self._order = order
 
     def _declare_solution(self, p: Program) -> None:
+        super()._declare_solution(p)  # for drifts beside which there is more than surfaces
         p.number("s_seen", "0; its computation notes where the drift begins")
         p.number("s_failed", "1 more than the place of a particle without landing, 0 for none")
         if self._others:
@@ -84,10 +85,10 @@ class CompiledQuadricRows(QuadricRows):
         p.each("x", landing, "onto the surface")
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
-        if self.circles:
+        place = 0 if self.circles else int(integrator.getGlobalVariableByName("s_failed"))
+        if not place:
             return super().failure(integrator, step)
         solved = np.ones(len(self.atoms))
-        place = int(integrator.getGlobalVariableByName("s_failed"))
         solved[self._order[abs(place) - 1]] = -1.0 if place > 0 else np.nan
         return self._error(solved, step, np.full(len(self.atoms), np.nan))
 

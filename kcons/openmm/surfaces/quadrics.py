@@ -39,6 +39,9 @@ class QuadricRows(SurfaceRows):
     """
 
     circles = False
+    written = (*SurfaceRows.written, "circles", "_a")
+    #: Name of A in the program, the curvature along the kept gradient; where velocities are tangent, the level.
+    _a = "s_a"
 
     def __init__(self, rows: Sequence[Constraint], n_particles: int) -> None:
         super().__init__(rows, n_particles)
@@ -52,8 +55,6 @@ class QuadricRows(SurfaceRows):
         self._tilted = bool(np.any(self.matrices != diagonal[:, :, None] * np.eye(3)))
         self._flat = bool(np.any(self.flats))
         self._projectors = not any(isinstance(item, Ellipsoid) for item in self.rows)
-        #: Name of A in the program.
-        self._a = "s_a"
         self._others = len(self.atoms) < n_particles
         #: k in the program: each variable of all particles makes every scalar product slower.
         alike = not self._others and bool(np.all(self.levels == self.levels[0]))

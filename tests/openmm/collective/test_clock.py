@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import openmm
 
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
 from kcons.openmm.collective.clock import Clock
 from kcons.openmm.integrator.program import Program
 
@@ -60,3 +61,31 @@ def test_constraints_alone_take_no_time():
     found = step(first_stage=1)
     assert (clock.now(found), found["clock1"]) == (STEP, STEP)
     assert context.getStepCount() == 2
+
+
+def test_members_of_a_compound_integrator_pull_in_turn():
+    """One goes on where the other has ended, and each is judged by the time that has passed in all."""
+    system, springs, bond = openmm.System(), openmm.HarmonicBondForce(), openmm.CustomBondForce("r")
+    for mass in (12.0, 16.0, 14.0):
+        system.addParticle(mass)
+    springs.addBond(1, 2, 0.15, 1e4)
+    system.addForce(springs)
+    bond.addBond(0, 1)
+    rows = CollectiveRows(system, [Row(bond, 0.15, 0.5)])
+    members = [
+        ProjectedIntegrator(0.002, parts=[rows], check_every=3),
+        ProjectedIntegrator(0.002, "geodesic", parts=[rows], check_every=3),
+    ]
+    compound = openmm.CompoundIntegrator()
+    for member in members:
+        compound.addIntegrator(member)
+    context = openmm.Context(system, compound, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
+    steps = 0
+    for number, block in ((0, 5), (1, 20), (0, 5), (1, 10), (0, 1)):
+        compound.setCurrentIntegrator(number)
+        compound.step(block)
+        steps += block
+        members[number].check()
+        assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
+        assert abs(rows.targets(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import openmm
 import pytest
@@ -21,7 +23,17 @@ from openmm_systems import (
 
 from kcons.constraints import Dihedral, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
-from kcons.openmm import CollectiveRows, ProjectedIntegrator, RattleIntegrator, Row, surface_parts
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
+    NoseHoover,
+    ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    hold,
+    surface_parts,
+)
 from kcons.openmm.integrator import guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
@@ -323,3 +335,39 @@ def test_positions_rounded_to_single_numbers_are_excused_where_few_molecules_cro
             watch.check(given, 1)
     else:
         watch.check(given, 1)
+
+
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
+@pytest.mark.parametrize("kind", ["RattleIntegrator", "Isokinetic", "Langevin", "NoseHoover", "carried"])
+def test_a_motion_remover_meets_complete_velocities_beside_an_external_force(kind):
+    """Half a kick has momentum there, and how steps are divided into calls would decide what is removed."""
+    system, x, v = alanine()
+    pull = openmm.CustomExternalForce("50*((x-1)^2+y^2+z^2)")
+    for k in range(len(x)):
+        pull.addParticle(k, [])
+    system.addForce(pull)
+    assert openmm.CMMotionRemover in {type(force) for force in system.getForces()}
+    parts = [hold(carried := copy.deepcopy(system), [], x, take="all")] if kind == "carried" else []
+    ensemble = {
+        "Isokinetic": Isokinetic(300, momentum="free"),
+        "Langevin": Langevin(300, 0.0),
+        "NoseHoover": NoseHoover(300, 5.0, momentum="free"),
+    }.get(kind)
+    ends = []
+    for calls in ([12], [5, 7], [1] * 12):
+        if kind == "RattleIntegrator":
+            integrator = RattleIntegrator(1e-3, tolerance=1e-13)
+        else:
+            integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble, tolerance=1e-13)
+        context = started(carried if parts else system, integrator, x, v)
+        for steps in calls:
+            integrator.step(steps)
+        ends.append(state_of(context))
+    if parts:
+        context = started(system, plain := ProjectedIntegrator(1e-3, tolerance=1e-13), x, v)
+        for _ in range(12):
+            plain.step(1)
+        ends.append(state_of(context))
+    for places, speeds in ends[1:]:
+        np.testing.assert_allclose(places, ends[0][0], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-8)

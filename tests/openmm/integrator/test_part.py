@@ -6,7 +6,10 @@ import numpy as np
 import openmm
 import pytest
 from openmm_parts import HeldCoordinates
+from openmm_systems import started, state_of
 
+from kcons.constraints import Distance
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
 from kcons.openmm.integrator.part import Miss, Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.step_writer import StepWriter
@@ -66,3 +69,51 @@ def test_hooks_are_called_where_they_belong():
     assert "if moved+stale != 0:" in "".join(lines[begin - 4 : begin])
     assert not any(line.endswith("# early") for line in lines)
     assert isinstance(integrator._plan, StepWriter)
+
+
+def held(kind):
+    """Three particles in a chain, a distance of the first two held."""
+    system, springs = openmm.System(), openmm.HarmonicBondForce()
+    for mass in (12.0, 16.0, 14.0):
+        system.addParticle(mass)
+    springs.addBond(1, 2, 0.15, 1e4)
+    springs.addBond(0, 2, 0.2, 1e2)
+    system.addForce(springs)
+    x = np.array([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
+    if kind == "collective":
+        bond = openmm.CustomBondForce("r")
+        bond.addBond(0, 1)
+        return system, CollectiveRows(system, [Row(bond, 0.15)]), x
+    target = (lambda t: 0.15 + 0.03 * t) if kind == "moving" else 0.15
+    return system, hold(system, Distance([[0, 1]], target), x), x
+
+
+@pytest.mark.parametrize(
+    ("kind", "first", "second"),
+    [
+        ("carried", {"ensemble": Isokinetic(300, momentum="free")}, {"ensemble": Isokinetic(200, momentum="free")}),
+        ("carried", {"scheme": "leapfrog"}, {"scheme": "blanes-moan4"}),
+        ("moving", {"scheme": "blanes-moan4"}, {"scheme": "rattle"}),
+        ("moving", {"ensemble": Langevin(300, 0.0)}, {"scheme": "rattle"}),
+        ("collective", {"scheme": "blanes-moan4"}, {"scheme": "rattle"}),
+        ("collective", {"ensemble": Isokinetic(300, momentum="free")}, {"scheme": "rattle"}),
+    ],
+)
+def test_integrators_in_turn_hold_the_same_part(kind, first, second):
+    """As each does alone: to warm up with one and go on with another is what scripts do."""
+    v = np.array([[0.0, 0.3, 0.1], [0.1, -0.2, 0.3], [-0.1, 0.0, 0.2]])
+
+    def begun(made, options):
+        system, part, x = made
+        integrator = ProjectedIntegrator(0.002, parts=[part], **options)
+        return integrator, started(system, integrator, x, v)
+
+    together, alone = held(kind), [held(kind), held(kind)]
+    shared = [begun(together, options) for options in (first, second)]
+    single = [begun(made, options) for made, options in zip(alone, (first, second), strict=True)]
+    for steps in (3, 1, 4):
+        for integrator, _ in (*shared, *single):
+            integrator.step(steps)
+    # A few units of the last place of 1 nm/ps: where the part was another's, the start of a step is looked at anew.
+    for (_, one), (_, other) in zip(shared, single, strict=True):
+        np.testing.assert_allclose(state_of(one), state_of(other), rtol=0, atol=1e-15)

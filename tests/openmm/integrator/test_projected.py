@@ -141,8 +141,10 @@ def test_barostat_and_rows_between_molecules():
     system, x = water_box(64)
     system.addForce(flexible)
     context = started(system, loose := ProjectedIntegrator(1e-3), x)
-    with pytest.raises(UnsupportedError, match="MonteCarloFlexibleBarostat"):
+    with pytest.raises(UnsupportedError, match=r"has constraints, and MonteCarloFlexibleBarostat"):
         loose.step(1)
+    with pytest.raises(UnsupportedError, match=r"a distance is held, and MonteCarloFlexibleBarostat .*let it scale"):
+        refuse_barostat(context, [[0, 1]], "a distance")
 
 
 def test_centre_of_mass_motion():

@@ -7,14 +7,19 @@ import openmm
 import pytest
 from openmm_systems import context_of
 from surface_cases import (
+    POSITIONS,
     QUADRICS,
+    VELOCITIES,
     on_surface,
     state_of,
+    system_of,
     worst,
 )
 
 from kcons.constraints import Sphere
-from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
+from kcons.errors import ConvergenceError
+from kcons.openmm import Isokinetic, Langevin, NoseHooverMiddle, ProjectedIntegrator
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 
 
 @pytest.mark.parametrize("kind", QUADRICS)
@@ -27,6 +32,48 @@ def test_compiled_landing_is_the_same(kind, scheme):
     assert np.abs(x - x2).max() <= 1e-13
     assert np.abs(v - v2).max() <= 1e-13
     assert max(worst(*pair[1])) <= 1e-14
+
+
+@pytest.mark.parametrize("kind", [ProjectedIntegrator, SurfaceIntegrator])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"scheme": "leapfrog"},
+        {"ensemble": Langevin(300, 0.0)},
+        {"ensemble": Isokinetic(300, momentum="free")},
+        {"ensemble": NoseHooverMiddle(300, 5.0)},
+    ],
+    ids=repr,
+)
+def test_parts_that_are_compiled_go_where_the_others_go(kind, options):
+    """In any integrator and ensemble, also after an integrator whose drifts follow great circles."""
+    ends = []
+    for compiled in (False, True):
+        system = system_of()
+        spheres = [Sphere([k], [0.0, 0.0, 0.0], float(np.linalg.norm(POSITIONS[k]))) for k in (0, 2)]
+        parts = surface_parts(spheres, system=system, compiled=compiled)
+        if compiled:
+            SurfaceIntegrator(0.01, "geodesic", parts=parts)
+        context = context_of(system, integrator := kind(0.01, parts=parts, **options), "Reference")
+        context.setPositions(POSITIONS)
+        context.setVelocities(VELOCITIES)
+        integrator.applyVelocityConstraints(context)
+        integrator.step(20)
+        integrator.check()
+        ends.append(state_of(context))
+    assert np.abs(np.array(ends[1]) - ends[0]).max() <= 1e-13
+
+
+def test_a_step_without_landing_is_told_by_openmm_s_own_arithmetic_too():
+    system = system_of()
+    parts = surface_parts(Sphere([0], [0, 0, 0], float(np.linalg.norm(POSITIONS[0]))), system=system, compiled=True)
+    integrator = SurfaceIntegrator(1.0, parts=parts, ensemble=Langevin(300, 0.0))
+    context = context_of(system, integrator, "Reference")
+    context.setPositions(POSITIONS)
+    context.setVelocities(100 * VELOCITIES)
+    with pytest.raises(ConvergenceError, match=r"step 1: .*Sphere\(0\)"):
+        integrator.step(1)
 
 
 @pytest.mark.parametrize("compiled", [False, True])

@@ -19,6 +19,7 @@ from kcons.openmm import (
     CollectiveRows,
     Isokinetic,
     Langevin,
+    NoseHooverMiddle,
     ProjectedIntegrator,
     RattleIntegrator,
     Row,
@@ -79,18 +80,29 @@ KINDS = {
     "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),
 }
 kinds = pytest.mark.parametrize("kind", KINDS)
+#: Parts beside more ensembles and schemes: what each keeps between steps has to follow the state.
+PAIRS = {
+    f"{held}, {name}": functools.partial(make, **chosen)
+    for held, make in (("sphere", on_a_sphere), ("collective", row_at), ("carried", carried_at))
+    for name, chosen in {
+        "Isokinetic": {"ensemble": Isokinetic(300)},
+        "isokinetic4": {"ensemble": Isokinetic(300), "scheme": "isokinetic4"},
+        "NoseHooverMiddle": {"ensemble": NoseHooverMiddle(300, 5.0)},
+        "blanes-moan4": {"scheme": "blanes-moan4"},
+    }.items()
+}
 
 
 # -- a run goes on ------------------------------------------------------------------------------------
 
 
-@kinds
+@pytest.mark.parametrize("kind", KINDS | PAIRS)
 @pytest.mark.parametrize("way", ["State", "XML", "checkpoint"])
 def test_a_run_goes_on_bit_for_bit(kind, way):
-    """In another Context with an integrator of the same settings; noise aside, which a State does not carry."""
+    """In another Context with an integrator of the same settings, and again in its own; noise aside."""
     if "Langevin" in kind and way != "checkpoint":
         pytest.skip("a State does not carry random numbers")
-    made, other = KINDS[kind](), KINDS[kind]()
+    made, other = ((KINDS | PAIRS)[kind]() for _ in range(2))
     made.run(7)
     state, checkpoint = made.context.getState(**EVERYTHING), made.context.createCheckpoint()
     if way == "checkpoint":
@@ -108,7 +120,14 @@ def test_a_run_goes_on_bit_for_bit(kind, way):
     assert other.context.getStepCount() == 7
     made.run(5)
     other.run(5)
-    np.testing.assert_array_equal(state_of(other.context), state_of(made.context))
+    end = state_of(made.context)
+    np.testing.assert_array_equal(state_of(other.context), end)
+    if way == "checkpoint":
+        made.context.loadCheckpoint(checkpoint)
+    else:
+        made.context.setState(state)
+    made.run(5)
+    np.testing.assert_array_equal(state_of(made.context), end)
 
 
 # -- settings stay ------------------------------------------------------------------------------------
