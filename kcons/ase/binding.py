@@ -35,6 +35,8 @@ class Binding:
     given: tuple[Constraint, ...]
     touched: IntArray
     all_touched: bool
+    #: The atoms whose masses matter.
+    weighed: IntArray | slice
     n_atoms: int
     mass_array: str
     mass_values: NDArray[Any]
@@ -55,7 +57,7 @@ class Binding:
         name = "masses" if "masses" in arrays else "numbers"
         if name != self.mass_array:
             return False
-        values = arrays[name] if self.all_touched else arrays[name][self.touched]
+        values = arrays[name][self.weighed]
         if self.mass_bytes is not None:
             return bool(values.tobytes() == self.mass_bytes)
         return bool((values == self.mass_values).all())
@@ -82,9 +84,14 @@ class Binding:
 
 
 def bind(
-    given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["convert", "raise"], time: float = 0.0
+    given: Sequence[Constraint],
+    atoms: Atoms,
+    degenerate: Literal["convert", "raise"],
+    time: float = 0.0,
+    *,
+    all_masses: bool = False,
 ) -> Binding:
-    """A new engine for `given` on `atoms`."""
+    """A new engine for `given` on `atoms`; with `all_masses` it fits as long as masses of free atoms stay, too."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]
     held = ConstraintSet(
@@ -94,12 +101,14 @@ def bind(
     touched = touched_atoms(held.constraints)
     all_touched = len(touched) == len(atoms)
     name = "masses" if "masses" in atoms.arrays else "numbers"
-    values = atoms.arrays[name] if all_touched else atoms.arrays[name][touched]
+    weighed = slice(None) if all_masses or all_touched else touched
+    values = atoms.arrays[name][weighed]
     return Binding(
         motion=motion,
         given=held.constraints,
         touched=touched,
         all_touched=all_touched,
+        weighed=weighed,
         n_atoms=len(atoms),
         mass_array=name,
         mass_values=values.copy(),

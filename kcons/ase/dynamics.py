@@ -33,6 +33,9 @@ from kcons.thermostats.pressure.constant_pressure import in_cell
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 FAR = 128.0
 
+#: Arrays of atoms that calculators read beside positions.
+_READ = ("numbers", "initial_charges", "initial_magmoms")
+
 _FLOAT = np.dtype(np.float64)
 
 
@@ -112,12 +115,13 @@ class ConstrainedDynamics(MolecularDynamics):
         self._degenerate = degenerate
         self._friction = friction
         self._more = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        self._size = len(atoms)
         self._present: tuple[Any, ...] | None = None
         self._bound: Binding | None = None
         self._system: System | None = None
         self._state: State | None = None
         self._cell = b""
-        self._calculator = atoms.calc  # whose forces the state has
+        self._asked: tuple[Any, ...] = ()  # what has answered last
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
@@ -128,6 +132,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self.attach(log, kwargs.get("loginterval", 1))
         if state is not None:
             self._resume(state)
+        self._asked = self._answers()
         self._start(self._systems())
 
     # -- what a person asks for -----------------------------------------------------------------
@@ -163,6 +168,10 @@ class ConstrainedDynamics(MolecularDynamics):
         """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
         freedom = self.degrees_of_freedom
         return 2 * self.atoms.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
+
+    def applied_forces(self) -> FloatArray:
+        """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""
+        return self._systems().resisted(applied_forces(self.atoms), self.atoms.get_velocities())
 
     def todict(self) -> dict[str, Any]:
         """As ASE stores it in trajectories."""
@@ -207,8 +216,9 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time = after.time
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
+        self._asked = self._answers()
         if after.barostat is not None:
-            self._cell = _cell_of(self.atoms)
+            self._cell = self._surroundings()
 
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
@@ -219,6 +229,7 @@ class ConstrainedDynamics(MolecularDynamics):
             except Exception as error:
                 name_step(error, self.nsteps)
                 raise
+            self._asked = self._answers()
 
     def _put(self, positions: FloatArray, velocities: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give the atoms positions and momenta; returns the momenta, and the velocities that belong to them.
@@ -242,10 +253,11 @@ class ConstrainedDynamics(MolecularDynamics):
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        if last is not None and atoms.calc is not self._calculator:
-            last = self._state = replace(last, forces=None, thermostat=self._thermostat_after_change(last))
-        self._calculator = atoms.calc
-        cell = _cell_of(atoms)
+        if last is not None and not all(map(is_, self._answers(), self._asked)):
+            if not self._still_gives(last):
+                last = self._state = replace(last, forces=None, thermostat=self._thermostat_after_change(last))
+            self._asked = self._answers()
+        cell = self._surroundings()
         same = last is not None and cell == self._cell
         if last is not None and same:
             if _same(x, last.positions, p, self._momenta):
@@ -286,11 +298,39 @@ class ConstrainedDynamics(MolecularDynamics):
             self.time, self.nsteps = float(state.time), int(state.step)
             self._momenta, _ = self._put(x, v)
             self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
-            self._cell = _cell_of(self.atoms)
+            self._cell = self._surroundings()
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
         """What a thermostat goes on with where somebody moved the atoms."""
         return None
+
+    # -- what forces depend on besides positions ------------------------------------------------
+
+    def _answers(self) -> tuple[Any, ...]:
+        """The calculator, and where it keeps what it found: another object after `set`, and after other questions."""
+        calculator = self.atoms.calc
+        return calculator, getattr(calculator, "results", None)
+
+    def _still_gives(self, last: State) -> bool:
+        """Whether the calculator is the same and has the forces of `last`, for atoms that are where they were."""
+        if self.atoms.calc is not self._asked[0] or last.forces is None:
+            return False
+        if not np.array_equal(self.atoms.arrays["positions"], last.positions):
+            return False
+        try:
+            return np.array_equal(self._force(last.positions, last.time), last.forces)
+        except Exception as error:
+            name_step(error, self.nsteps + 1)
+            raise
+
+    def _surroundings(self) -> bytes:
+        """Cell and periodicity; elements, charges and moments that calculators read; forces that ASE objects add."""
+        atoms = self.atoms
+        parts = [atoms.cell.array.tobytes(), atoms.pbc.tobytes()]
+        parts += [atoms.arrays[name].tobytes() for name in _READ if name in atoms.arrays]
+        if self._only_forces:
+            parts += [repr(item.todict()).encode() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+        return b"".join(parts)
 
     # -- the system -----------------------------------------------------------------------------
 
@@ -303,8 +343,9 @@ class ConstrainedDynamics(MolecularDynamics):
             self._bound = None
         bound = self._bound
         if bound is None or not bound.fits(atoms):
+            self._refuse_fewer()
             rows = [*_rows(atoms, present), *self._more]
-            bound = bind(rows, atoms, self._degenerate, self.time)
+            bound = bind(rows, atoms, self._degenerate, self.time, all_masses=True)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
@@ -321,6 +362,18 @@ class ConstrainedDynamics(MolecularDynamics):
             bound.follow_cell(atoms, atoms.cell.array)
         assert self._system is not None
         return self._system
+
+    def _refuse_fewer(self) -> None:
+        """Refuse to go on where what was given by the numbers of atoms would mean others."""
+        before, self._size = self._size, len(self.atoms)
+        by_number = bool(self._more) or np.ndim(self._friction) or getattr(self.stepper, "atoms", None) is not None
+        if self._size < before and by_number:
+            self._size = before
+            raise InputError(
+                f"{before - len(self.atoms)} of {before} atoms were removed, and constraints, friction or indices that "
+                "the dynamics was given name atoms by their numbers, which are others now; make a new one",
+                item="atoms",
+            )
 
     def _made(self, motion: Motion) -> System:
         return System(motion, self._force, potential=self._energy, friction=self._friction, far=FAR)
@@ -367,10 +420,6 @@ def name_step(error: BaseException, number: int) -> None:
         with suppress(AttributeError):
             error.step = number  # type: ignore[attr-defined]
         error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
-
-
-def _cell_of(atoms: Atoms) -> bytes:
-    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes())
 
 
 def _same(x: FloatArray, y: FloatArray, p: FloatArray, q: FloatArray) -> bool:

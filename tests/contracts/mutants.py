@@ -996,4 +996,41 @@ MUTANTS = [
         "if any(name is None for name in wanted.shared):",
         "tests/free_energy/test_held_coordinates.py::test_formulas_on_the_same_atoms_are_told_apart",
     ),
+    # -- ASE: what changes between steps --
+    (
+        "ase/dynamics.py",
+        "self.time, all_masses=True)",
+        "self.time)",
+        "tests/ase/test_dynamics.py::test_masses_of_free_atoms_changed_between_steps_are_taken",
+    ),
+    (
+        "ase/dynamics.py",
+        "if not self._still_gives(last):",
+        "if self.atoms.calc is not self._asked[0]:",
+        "tests/ase/test_dynamics.py::test_forces_of_the_same_calculator_that_changed",
+    ),
+    (
+        "ase/dynamics.py",
+        '("numbers", "initial_charges", "initial_magmoms")',
+        '("numbers",)',
+        "tests/ase/test_dynamics.py::test_forces_of_the_same_calculator_that_changed",
+    ),
+    (
+        "ase/dynamics.py",
+        "if self._size < before and by_number:",
+        "if False:",
+        "tests/ase/test_dynamics.py::test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
+    ),
+    (
+        "ase/logger.py",
+        'dyn.applied_forces() if hasattr(dyn, "motion") else applied_forces(atoms)',
+        "applied_forces(atoms)",
+        "tests/ase/test_logger.py::test_a_rod_against_friction",
+    ),
+    (
+        "thermostats/pressure/measured.py",
+        "motion.multipliers(x, v, f, time)",
+        "motion.multipliers(x, v, f)",
+        "tests/thermostats/pressure/test_measured.py::test_a_rod_that_is_made_longer",
+    ),
 ]
