@@ -11,7 +11,7 @@ from ase import Atoms
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
-from ase.constraints import ExternalForce, FixAtoms, FixBondLengths, Hookean
+from ase.constraints import FixAtoms, FixBondLengths, Hookean
 from ase.io import read
 from ase.io.trajectory import Trajectory
 from ase.md.velocitydistribution import thermalize_momenta
@@ -19,7 +19,6 @@ from ase.md.verlet import VelocityVerlet
 from ase_systems import (
     FS,
     Field,
-    Free,
     equal,
     off,
     rigid,
@@ -408,69 +407,6 @@ def test_masses_of_free_atoms_changed_between_steps_are_taken(change):
     go_on(again, lambda atoms: ConstrainedDynamics(atoms, FS))
     for one, two in zip(state(atoms), state(again), strict=True):
         np.testing.assert_array_equal(one, two)
-
-
-class Settings(Field):
-    """A field whose stiffness `set` changes."""
-
-    discard_results_on_any_change = True
-
-    def __init__(self, **settings):
-        super().__init__()
-        self.set(**settings)
-
-    def calculate(self, *args, **kwargs):
-        self.stiffness = self.parameters["stiffness"]
-        super().calculate(*args, **kwargs)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda atoms: atoms.calc.set(stiffness=3.0),
-        lambda atoms: (atoms.calc.set(stiffness=3.0), atoms.get_potential_energy()),
-        lambda atoms: setattr(atoms.constraints[-1], "external_force", 4.0),
-        lambda atoms: atoms.set_initial_charges([2.0, 0.0, 0.0]),
-    ],
-    ids=["settings", "settings, and asked", "force of ase", "charges"],
-)
-def test_forces_of_the_same_calculator_that_changed(change):
-    """A step begins with the forces that there are now."""
-
-    class Charged(Settings):
-        def calculate(self, *args, **kwargs):
-            super().calculate(*args, **kwargs)
-            self.results["forces"] += self.atoms.get_initial_charges()[:, None]
-
-    atoms, _ = water(Charged(stiffness=0.05))
-    atoms.set_constraint([*atoms.constraints, ExternalForce(0, 1, 0.2)])
-    dyn = ConstrainedDynamics(atoms, FS)
-    dyn.run(2)
-    change(atoms)
-    again = atoms.copy()
-    again.calc = Charged(**atoms.calc.parameters)
-    dyn.run(1)
-    ConstrainedDynamics(again, FS).run(1)
-    for one, two in zip(state(atoms), state(again), strict=True):
-        np.testing.assert_array_equal(one, two)
-
-
-def test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these():
-    """All these lengths are 1, so that the rows that are meant cannot be told from their neighbours by length."""
-    line = Atoms("H5", positions=np.arange(5)[:, None] * [1.0, 0.0, 0.0], calculator=Free())
-    for options in ({"constraints": [Distance([[2, 3]])]}, {"friction": [1.0, 2.0, 3.0, 4.0, 5.0]}):
-        atoms = line.copy()
-        atoms.calc = Free()
-        dyn = ConstrainedDynamics(atoms, FS, **options)
-        dyn.run(1)
-        del atoms[0]
-        with pytest.raises(InputError, match=r"1 of 5 atoms were removed.*make a new one"):
-            dyn.run(1)
-    dyn = ConstrainedDynamics(line, FS)
-    dyn.run(1)
-    del line[0]
-    dyn.run(1)
-    assert dyn.degrees_of_freedom == 12
 
 
 @pytest.mark.parametrize(
