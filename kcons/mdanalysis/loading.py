@@ -135,7 +135,10 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
             "files of this format cannot be read at all when they were cut off; write DCD, XTC or TRR if that happens"
         )
     if Path(trajectory).suffix.lower() == ".traj":
-        advice = "that is ASE's own format: ase convert run.traj run.xyz, or write with kcons.mdanalysis.write_ase"
+        advice = (
+            "that is ASE's own format: write with kcons.mdanalysis.write_ase, or ase convert run.traj run.pdb (run.xyz has "
+            "more digits, and no cell)"
+        )
     # A file that begins as it should was cut off, or damaged later.
     kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
     raise kind(

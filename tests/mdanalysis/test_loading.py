@@ -54,7 +54,9 @@ def test_files_that_cannot_be_opened(tmp_path, ending):
 def test_files_of_ase_are_told_from_broken_ones(tmp_path):
     path = tmp_path / "run.traj"
     path.write_bytes(b"- of UlmASE-Trajectory" * 50)
-    with pytest.raises(InputError, match=r"ASE's own format: ase convert run\.traj run\.xyz"):
+    with pytest.raises(
+        InputError, match=r"ASE's own format: .*write_ase, or .* run\.traj run\.pdb \(run\.xyz .* no cell"
+    ):
         load_trajectory(files.universe(N), path)
 
 
