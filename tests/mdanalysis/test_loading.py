@@ -60,6 +60,23 @@ def test_files_of_ase_are_told_from_broken_ones(tmp_path):
         load_trajectory(files.universe(N), path)
 
 
+def test_a_format_whose_package_is_missing(tmp_path, monkeypatch):
+    """As mmCIF without gemmi."""
+
+    def missing(*args, **options):
+        raise ImportError("MMCIF: please install gemmi")
+
+    path = tmp_path / "a.pdb"
+    path.write_text("END\n")
+    made = files.universe(N)
+    monkeypatch.setattr(made, "load_new", missing)
+    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); install that package"):
+        load_trajectory(made, path)
+    monkeypatch.setattr("MDAnalysis.Universe", missing)
+    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); give a file such as"):
+        open_universe(path)
+
+
 def test_netcdf_that_was_cut_off_says_so(tmp_path, x):
     path = cut(files.write(tmp_path / "whole.nc", x), tmp_path / "cut.nc", -900)
     with pytest.raises(UnreadableError, match=r"cut\.nc.*cut off"):

@@ -127,7 +127,7 @@ def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
     try:
         return MDAnalysis.Universe(*files)
     except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(str(error).partition("\n   You can")[0].split()) or type(error).__name__
         raise InputError(
             f"{' with '.join(files)} cannot be read: {text}; give a topology, and with --coordinates a file of the "
             "same atoms",
