@@ -124,6 +124,9 @@ def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
     import MDAnalysis
 
     files = [str(path), *([str(coordinates)] if coordinates else [])]
+    for file in files:
+        if Path(file).is_file() and not Path(file).stat().st_size:
+            raise InputError(f"{file} is empty; give another file", item="file")
     try:
         return MDAnalysis.Universe(*files)
     except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
