@@ -1045,4 +1045,16 @@ MUTANTS = [
         "share = BALANCED",
         "tests/thermostats/test_freedom.py::test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster",
     ),
+    (
+        "steppers/state.py",
+        "return None if state.remainder is None or self._free_of_origin is None else state.remainder",
+        "return state.remainder",
+        "tests/steppers/test_state.py::test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place",
+    ),
+    (
+        "steppers/stepper.py",
+        "{name: None if name in found else value",
+        "{name: value",
+        "tests/steppers/test_stepper.py::test_copies_leave_behind_what_was_found_for_a_system",
+    ),
 ]
