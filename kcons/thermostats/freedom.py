@@ -270,8 +270,8 @@ def warn_of_conserved_momenta(system: System, velocities: FloatArray, free: Free
         )
     elif free.turns:
         warnings.warn(
-            "forces and rows exert no torque about some axis (a free cluster, particles on a sphere), so that angular "
-            "momentum is only scaled by the thermostat and never forgotten: configurations are not canonical. Use "
+            "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere), so that "
+            "angular momentum is only scaled by the thermostat and never forgotten: configurations are not canonical. Use "
             "Langevin",
             stacklevel=stacklevel,
         )
