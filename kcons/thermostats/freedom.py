@@ -270,9 +270,9 @@ def warn_of_conserved_momenta(system: System, velocities: FloatArray, free: Free
         )
     elif free.turns:
         warnings.warn(
-            "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere), so that "
-            "angular momentum is only scaled by the thermostat and never forgotten: configurations are not canonical. Use "
-            "Langevin",
+            "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere), so "
+            "that angular momentum is only scaled by the thermostat and never forgotten: configurations are not "
+            "canonical. Use Langevin",
             stacklevel=stacklevel,
         )
 
