@@ -186,7 +186,9 @@ def applied_forces(atoms: Atoms) -> FloatArray:
 
 
 class Answers:
-    """Calculators, and where each keeps what it found last: another object after `set`, and after other questions.
+    """Calculators, their settings, and where each keeps what it found last: another object after other questions.
+
+    A calculator whose settings were changed is reset: some of ASE forget to, and give what they found before.
 
     Parameters
     ----------
@@ -202,6 +204,7 @@ class Answers:
     def note(self) -> None:
         """What there is now is known."""
         self._known = self._now()
+        self._settings = [_settings(each) for each in (self._atoms.calc, *self._others)]
 
     def _now(self) -> tuple[Any, ...]:
         calculators = (self._atoms.calc, *self._others)
@@ -209,6 +212,10 @@ class Answers:
 
     def changed(self, last: State, force: Callable[[FloatArray, float], ArrayLike], step: int) -> bool:
         """Whether forces, if atoms are where they were in `last`, are others than these; asked for only in doubt."""
+        calculators = (self._atoms.calc, *self._others)
+        for each, before, settings in zip(calculators, self._known, self._settings, strict=False):
+            if each is before and not _same(_settings(each), settings):
+                each.reset()
         now, known = self._now(), self._known
         if all(map(is_, now, known)):
             return False
@@ -218,6 +225,15 @@ class Answers:
             found = force(last.positions, last.time) if same else None
         self.note()
         return found is None or last.forces is None or not np.array_equal(np.asarray(found), last.forces)
+
+
+def _settings(calculator: Any) -> tuple[Any, ...]:
+    found = getattr(calculator, "parameters", None)
+    return tuple(found.values()) if isinstance(found, dict) and hasattr(calculator, "reset") else ()
+
+
+def _same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 @contextmanager

@@ -370,9 +370,7 @@ def test_a_second_object_of_kcons_says_how_to_make_one():
 
 
 class Settings(Field):
-    """A field whose stiffness `set` changes."""
-
-    discard_results_on_any_change = True
+    """A field whose stiffness `set` changes, without forgetting what it found, as calculators of ASE do."""
 
     def __init__(self, **settings):
         super().__init__()
