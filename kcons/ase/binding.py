@@ -1,16 +1,18 @@
-"""The engine for one `Atoms`, and the tests whether it still fits."""
+"""The engine for one `Atoms`, and the tests whether it, and forces that are known, still fit."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import isfinite
+from operator import is_
 from typing import Any, Literal
 
 import ase.constraints
 import numpy as np
 from ase import Atoms
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
@@ -19,9 +21,13 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.steppers import State
 
 #: Arrays up to this length are compared fastest as bytes.
 _SHORT = 4096
+
+#: Arrays of atoms that calculators read.
+_READ = ("numbers", "initial_charges", "initial_magmoms")
 
 #: ASE objects that only add forces, so that they get along with any constraint.
 FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
@@ -35,6 +41,8 @@ class Binding:
     given: tuple[Constraint, ...]
     touched: IntArray
     all_touched: bool
+    #: The atoms whose masses matter.
+    weighed: IntArray | slice
     n_atoms: int
     mass_array: str
     mass_values: NDArray[Any]
@@ -55,7 +63,7 @@ class Binding:
         name = "masses" if "masses" in arrays else "numbers"
         if name != self.mass_array:
             return False
-        values = arrays[name] if self.all_touched else arrays[name][self.touched]
+        values = arrays[name][self.weighed]
         if self.mass_bytes is not None:
             return bool(values.tobytes() == self.mass_bytes)
         return bool((values == self.mass_values).all())
@@ -82,9 +90,14 @@ class Binding:
 
 
 def bind(
-    given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["convert", "raise"], time: float = 0.0
+    given: Sequence[Constraint],
+    atoms: Atoms,
+    degenerate: Literal["convert", "raise"],
+    time: float = 0.0,
+    *,
+    all_masses: bool = False,
 ) -> Binding:
-    """A new engine for `given` on `atoms`."""
+    """A new engine for `given` on `atoms`; with `all_masses` it fits as long as masses of free atoms stay, too."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]
     held = ConstraintSet(
@@ -94,12 +107,14 @@ def bind(
     touched = touched_atoms(held.constraints)
     all_touched = len(touched) == len(atoms)
     name = "masses" if "masses" in atoms.arrays else "numbers"
-    values = atoms.arrays[name] if all_touched else atoms.arrays[name][touched]
+    weighed = slice(None) if all_masses or all_touched else touched
+    values = atoms.arrays[name][weighed]
     return Binding(
         motion=motion,
         given=held.constraints,
         touched=touched,
         all_touched=all_touched,
+        weighed=weighed,
         n_atoms=len(atoms),
         mass_array=name,
         mass_values=values.copy(),
@@ -168,3 +183,92 @@ def applied_forces(atoms: Atoms) -> FloatArray:
             if isinstance(item, FORCES_ONLY):
                 item.adjust_forces(atoms, forces)
     return forces
+
+
+class Answers:
+    """Calculators, their settings, and where each keeps what it found last: another object after other questions.
+
+    A calculator whose settings were changed is reset: some of ASE forget to, and give what they found before.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+    others : sequence of ASE calculator
+        Besides that of the atoms.
+    """
+
+    def __init__(self, atoms: Atoms, others: Sequence[Any] = ()) -> None:
+        self._atoms, self._others = atoms, others
+        self.note()
+
+    def note(self) -> None:
+        """What there is now is known."""
+        self._known = self._now()
+        self._settings = [_settings(each) for each in (self._atoms.calc, *self._others)]
+
+    def _now(self) -> tuple[Any, ...]:
+        calculators = (self._atoms.calc, *self._others)
+        return (*calculators, *(getattr(each, "results", None) for each in calculators))
+
+    def changed(self, last: State, force: Callable[[FloatArray, float], ArrayLike], step: int) -> bool:
+        """Whether forces, if atoms are where they were in `last`, are others than these; asked for only in doubt."""
+        calculators = (self._atoms.calc, *self._others)
+        for each, before, settings in zip(calculators, self._known, self._settings, strict=False):
+            if each is before and not _same(_settings(each), settings):
+                each.reset()
+        now, known = self._now(), self._known
+        if all(map(is_, now, known)):
+            return False
+        there = np.array_equal(self._atoms.arrays["positions"], last.positions)
+        same = now[0] is known[0] and there
+        with in_step(step):
+            found = force(last.positions, last.time) if same else None
+        self.note()
+        return found is None or last.forces is None or not np.array_equal(np.asarray(found), last.forces)
+
+
+def _settings(calculator: Any) -> tuple[Any, ...]:
+    found = getattr(calculator, "parameters", None)
+    return tuple(found.values()) if isinstance(found, dict) and hasattr(calculator, "reset") else ()
+
+
+def _same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@contextmanager
+def in_step(number: int) -> Iterator[None]:
+    """Errors are noted to belong to this step."""
+    try:
+        yield
+    except Exception as error:
+        name_step(error, number)
+        raise
+
+
+def name_step(error: BaseException, number: int) -> None:
+    """Note in an error which step it belongs to."""
+    if getattr(error, "step", None) is None:
+        with suppress(AttributeError):
+            error.step = number  # type: ignore[attr-defined]
+        error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
+
+
+def surroundings(atoms: Atoms) -> bytes:
+    """The cell, what calculators read of atoms beside their positions, and what ASE objects add to forces."""
+    parts = [atoms.cell.array.tobytes(), atoms.pbc.tobytes()]
+    parts += [atoms.arrays[name].tobytes() for name in _READ if name in atoms.arrays]
+    parts += [repr(item.todict()).encode() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+    return b"".join(parts)
+
+
+def refuse_fewer(before: int, now: int, rows: Sequence[Constraint], friction: ArrayLike, stepper: Any) -> int:
+    """Refuse fewer atoms than before where something was given by their numbers; returns how many there are now."""
+    by_number = rows or np.ndim(friction) or getattr(stepper, "atoms", None) is not None
+    if now < before and by_number:
+        raise InputError(
+            f"{before - now} of {before} atoms were removed, and constraints, friction or indices that the dynamics "
+            "was given name atoms by their numbers, which are others now; make a new one",
+            item="atoms",
+        )
+    return now

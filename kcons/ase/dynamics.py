@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from operator import is_
 from typing import Any, Literal
@@ -15,7 +15,17 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
-from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
+from kcons.ase.binding import (
+    FORCES_ONLY,
+    Answers,
+    Binding,
+    applied_forces,
+    bind,
+    in_step,
+    name_step,
+    refuse_fewer,
+    surroundings,
+)
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
@@ -88,6 +98,9 @@ class ConstrainedDynamics(MolecularDynamics):
     times its size), from `state`, which knows what rounding took from time and positions.
     """
 
+    #: Besides that of the atoms.
+    _calculators: tuple[Any, ...] = ()
+
     def __init__(
         self,
         atoms: Atoms,
@@ -117,7 +130,8 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell = b""
-        self._calculator = atoms.calc  # whose forces the state has
+        self._answers = Answers(atoms, self._calculators)
+        self._size = len(atoms)
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
@@ -128,6 +142,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self.attach(log, kwargs.get("loginterval", 1))
         if state is not None:
             self._resume(state)
+        self._answers.note()
         self._start(self._systems())
 
     # -- what a person asks for -----------------------------------------------------------------
@@ -164,6 +179,10 @@ class ConstrainedDynamics(MolecularDynamics):
         freedom = self.degrees_of_freedom
         return 2 * self.atoms.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
 
+    def applied_forces(self) -> FloatArray:
+        """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""
+        return self._systems().resisted(applied_forces(self.atoms), self.atoms.get_velocities())
+
     def todict(self) -> dict[str, Any]:
         """As ASE stores it in trajectories."""
         return {**super().todict(), "stepper": repr(self.stepper)}
@@ -171,8 +190,7 @@ class ConstrainedDynamics(MolecularDynamics):
     def listing(self) -> str:
         """What a step consists of, a line for each operation; the name alone for steppers that have no list."""
         system = self._systems()
-        mover = self._mover
-        return mover.listing(system) if isinstance(mover, Listed) else repr(mover)
+        return self._mover.listing(system) if isinstance(self._mover, Listed) else repr(self._mover)
 
     @property
     def _mover(self) -> Stepper:
@@ -207,18 +225,17 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time = after.time
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
+        self._answers.note()
         if after.barostat is not None:
-            self._cell = _cell_of(self.atoms)
+            self._cell = surroundings(self.atoms)
 
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
         if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
             state = self._start(self._systems())
-            try:
+            with in_step(self.nsteps):
                 self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
-            except Exception as error:
-                name_step(error, self.nsteps)
-                raise
+            self._answers.note()
 
     def _put(self, positions: FloatArray, velocities: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give the atoms positions and momenta; returns the momenta, and the velocities that belong to them.
@@ -242,10 +259,9 @@ class ConstrainedDynamics(MolecularDynamics):
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        if last is not None and atoms.calc is not self._calculator:
+        if last is not None and self._answers.changed(last, self._force, self.nsteps + 1):
             last = self._state = replace(last, forces=None, thermostat=self._thermostat_after_change(last))
-        self._calculator = atoms.calc
-        cell = _cell_of(atoms)
+        cell = surroundings(atoms)
         same = last is not None and cell == self._cell
         if last is not None and same:
             if _same(x, last.positions, p, self._momenta):
@@ -286,7 +302,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self.time, self.nsteps = float(state.time), int(state.step)
             self._momenta, _ = self._put(x, v)
             self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
-            self._cell = _cell_of(self.atoms)
+            self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
         """What a thermostat goes on with where somebody moved the atoms."""
@@ -298,25 +314,20 @@ class ConstrainedDynamics(MolecularDynamics):
         """The system for the atoms as they are; built anew if masses, constraints or periodicity changed."""
         atoms = self.atoms
         present = tuple(atoms.constraints)
-        known = self._present
+        known, bound = self._present, self._bound
         if known is None or len(present) != len(known) or not all(map(is_, present, known)):
-            self._bound = None
-        bound = self._bound
+            bound = None
         if bound is None or not bound.fits(atoms):
+            self._size = refuse_fewer(self._size, len(atoms), self._more, self._friction, self.stepper)
             rows = [*_rows(atoms, present), *self._more]
-            bound = bind(rows, atoms, self._degenerate, self.time)
+            bound = bind(rows, atoms, self._degenerate, self.time, all_masses=True)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
             self._system = self._made(bound.motion)
             self._mover.check(self._system)
-            moving = self._system.inverse_masses > 0
-            shape = (len(atoms), 3)
-            self._weights = (
-                np.where(moving, bound.motion.masses[:, None], np.zeros(shape)),
-                np.where(moving, bound.motion.masses[:, None], np.full(shape, np.inf)),
-            )
+            self._weights = _weights(self._system)
         else:
             bound.follow_cell(atoms, atoms.cell.array)
         assert self._system is not None
@@ -335,6 +346,13 @@ class ConstrainedDynamics(MolecularDynamics):
         if self._only_forces:
             return applied_forces(self.atoms)
         return self.atoms.get_forces(apply_constraint=False)
+
+
+def _weights(system: System) -> tuple[FloatArray, FloatArray]:
+    """Masses to multiply by and to divide by, shape (n_atoms, 3): 0 and infinity for fixed atoms."""
+    masses = np.repeat(system.masses[:, None], 3, axis=1)
+    moving = system.inverse_masses > 0
+    return np.where(moving, masses, 0.0), np.where(moving, masses, np.inf)
 
 
 @contextmanager
@@ -359,18 +377,6 @@ def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:
             item.engine(atoms)  # settles targets that are open
         rows.extend(translated(atoms, [item]))
     return rows
-
-
-def name_step(error: BaseException, number: int) -> None:
-    """Note in an error which step it belongs to."""
-    if getattr(error, "step", None) is None:
-        with suppress(AttributeError):
-            error.step = number  # type: ignore[attr-defined]
-        error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
-
-
-def _cell_of(atoms: Atoms) -> bytes:
-    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes())
 
 
 def _same(x: FloatArray, y: FloatArray, p: FloatArray, q: FloatArray) -> bool:

@@ -30,7 +30,8 @@ class ConstraintLogger(MDLogger):
     logfile : path, text file or '-'
     coordinates : mapping of str to Constraint
         What is held, each named by an object of the same kind on the same atoms, whatever its target. Each row of it is
-        a column: its multiplier, in eV by angstrom or by radian, the force along the coordinate that holds it.
+        a column: its multiplier, in eV by angstrom or by radian, the force along the coordinate that holds it, against
+        friction too.
     **kwargs
         As for `ase.md.MDLogger`: header, stress, peratom, mode.
 
@@ -80,7 +81,8 @@ class ConstraintLogger(MDLogger):
             row += (atoms.get_stress(include_ideal_gas=True) / units.GPa).tolist()
         if self.coordinates:
             motion = _motion(dyn, atoms)
-            x, v, f = atoms.positions, atoms.get_velocities(), applied_forces(atoms)
+            x, v = atoms.positions, atoms.get_velocities()
+            f = dyn.applied_forces() if hasattr(dyn, "motion") else applied_forces(atoms)
             time = 0.0 if dyn is None else dyn.get_time()
             row += motion.multipliers(x, v, f, time)[self._rows(motion)].tolist()
         self.logfile.write(self.fmt % tuple(row))

@@ -9,8 +9,7 @@ import numpy as np
 from ase import Atoms, units
 from ase.calculators.mixing import SumCalculator
 
-from kcons.ase.binding import FORCES_ONLY
-from kcons.ase.dynamics import name_step
+from kcons.ase.binding import FORCES_ONLY, in_step
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
 from kcons.constraints.arguments import numbers, positive, seed_from
 from kcons.constraints.target import FloatArray
@@ -110,6 +109,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
             )
         for name, calculator in (("fast", fast), ("slow", slow)):
             _check(name, calculator, atoms)
+        self._calculators = fast, slow
         cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
         if difference:
             self.groups = ForceGroups.difference(cheap, expensive)
@@ -198,12 +198,10 @@ class MultipleTimeSteps(ThermostattedDynamics):
     def _refresh_properties(self) -> None:
         """A step ends with both forces where the atoms are, which are added up for someone who looks."""
         if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
-            try:
+            with in_step(self.nsteps):
                 self.atoms.get_potential_energy(apply_constraint=False)
                 self.atoms.get_forces(apply_constraint=False)
-            except Exception as error:
-                name_step(error, self.nsteps)
-                raise
+            self._answers.note()
 
 
 def _check(name: str, calculator: Any, atoms: Atoms) -> None:

@@ -54,6 +54,12 @@ def _main(arguments: Sequence[str] | None) -> int:
             raise
         print(f"kcons: {explained}", file=sys.stderr)
         return 2
+    except (FileExistsError, NotADirectoryError) as error:
+        print(
+            f"kcons: {error.filename}: there is a file where a folder has to be; give another folder (--out)",
+            file=sys.stderr,
+        )
+        return 2
     except (KconsError, OSError) as error:
         print(f"kcons: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -18,6 +18,8 @@ from kcons.errors import InputError, UnreadableError
 
 #: What MDAnalysis and the readers below it raise on a bad file.
 READ_ERRORS = (OSError, EOFError, ValueError, TypeError, RuntimeError, LookupError, StopIteration, struct.error)
+#: The same where a file is opened: of formats whose package is missing, and of readers that are not MDAnalysis' own.
+_OPEN_ERRORS = (*READ_ERRORS, ImportError, SyntaxError, AttributeError, NotImplementedError)
 
 _HDF5 = b"\x89HDF\r\n"
 #: How files begin, by the ending of their name.
@@ -86,7 +88,7 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
             # Without a format, MDAnalysis asks every package it can convert from whether a path is an object of its
             # own, which imports OpenMM with all its platforms: 80 MB, 70 of them the compiler of an OpenCL platform.
             universe = MDAnalysis.Universe(str(topology), **{"topology_format": guess_format(str(topology))} | options)
-        except READ_ERRORS as error:
+        except _OPEN_ERRORS as error:
             failures.append(_first_line(error))
     if failures:
         raise InputError(
@@ -121,7 +123,7 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
             universe.load_new(str(trajectory), format=guess_format(str(trajectory)))
             # Some readers look at the file only now.
             n_frames = universe.trajectory.n_frames
-        except READ_ERRORS as error:
+        except _OPEN_ERRORS as error:
             failures.append(_first_line(error))
             text = str(error)
     if not failures:
@@ -141,7 +143,12 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
             "files of this format cannot be read at all when they were cut off; write DCD, XTC or TRR if that happens"
         )
     if Path(trajectory).suffix.lower() == ".traj":
-        advice = "that is ASE's own format: ase convert run.traj run.xyz, or write with kcons.mdanalysis.write_ase"
+        advice = (
+            "that is ASE's own format: write with kcons.mdanalysis.write_ase, or ase convert run.traj run.pdb (run.xyz "
+            "has more digits, and no cell)"
+        )
+    if failures[0].startswith("ImportError"):
+        advice = "install that package, or give another format"
     # A file that begins as it should was cut off, or damaged later.
     kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
     raise kind(
@@ -183,6 +190,6 @@ def _stored_atoms(path: Path) -> int | None:
         try:
             reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=guess_format(str(path)))
             return int(reader.parse_n_atoms(str(path)))
-        except (*READ_ERRORS, NotImplementedError, AttributeError) as error:
+        except _OPEN_ERRORS as error:
             failures.append(_first_line(error))
             return None

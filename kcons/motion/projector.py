@@ -67,6 +67,12 @@ class Projector:
     def degrees_of_freedom(self) -> int:
         return 3 * self.constraint_set.n_moving - self.plan.rank
 
+    @property
+    def fixed_atoms(self) -> IntArray:
+        """Those that `FixedAtoms` hold."""
+        held = [c.atoms.ravel() for c in self.constraint_set.constraints if c.family == "FixedAtoms"]
+        return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)
+
     def took(self, iterations: int) -> None:
         """Remember, for reports, the iterations of a kernel that ran all solvers in one call."""
         self._solve.iterations[:] = [iterations] * len(self.plan.solvers)

@@ -246,9 +246,8 @@ class System:
         self.velocity_dependent = velocity_dependent and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses
-        fixed = _fixed_atoms(motion)
         bad = ~(np.isfinite(self.masses) & (self.masses > 0))
-        bad[fixed] = False
+        bad[motion.fixed_atoms] = False
         if bad.any():
             atom = int(np.argmax(bad))
             raise InputError(
@@ -260,7 +259,7 @@ class System:
         with np.errstate(divide="ignore"):
             #: 1/m, shape (n_atoms, 1); 0 for fixed atoms.
             self.inverse_masses: FloatArray = (1.0 / self.masses)[:, None]
-        self.inverse_masses[fixed] = 0.0
+        self.inverse_masses[motion.fixed_atoms] = 0.0
         #: The same for each coordinate, shape (n_atoms, 3).
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
         rates = Friction(friction, motion, self.inverse_masses)
@@ -488,12 +487,11 @@ class System:
             return None
         return np.unique(held.incidence.indices).astype(np.int64)
 
+    def remainder_of(self, state: State) -> FloatArray | None:
+        """What rounding took from the positions of a state; None where rows know a place in space, which take all."""
+        return None if state.remainder is None or self._free_of_origin is None else state.remainder
+
     def is_far(self, x: FloatArray) -> bool:
         """Whether what is held is so far from the origin that the rounding of its positions would show."""
         atoms = self._free_of_origin
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
-
-
-def _fixed_atoms(motion: Motion) -> IntArray:
-    held = [c.atoms.ravel() for c in motion.constraint_set.constraints if c.family == "FixedAtoms"]
-    return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)

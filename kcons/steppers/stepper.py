@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -47,7 +47,19 @@ class Stepper(Protocol):
         ...
 
 
-class Listed:
+class Portable:
+    """Base of those that remember what they found for a System: copies and other processes find it anew."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        found = {name for name, value in vars(self).items() if isinstance(value, tuple) and _is_of_a_system(value)}
+        return {name: None if name in found else value for name, value in vars(self).items()}
+
+
+def _is_of_a_system(value: tuple[Any, ...]) -> bool:
+    return bool(value) and isinstance(value[0], System)
+
+
+class Listed(Portable):
     """Base of those whose step is a list of operations."""
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:

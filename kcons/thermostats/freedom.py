@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -19,6 +21,8 @@ Momentum = Literal["auto", "conserved", "free"]
 
 #: Sum of all forces (or torques) over the sum of their sizes that is taken for rounding, single precision included.
 BALANCED = 1e-6
+#: The same where it holds in some directions only: near a symmetric place, forces that have no axis almost have one.
+EXACT = 1e-12
 #: Share of the kinetic energy above which total momentum is not zero.
 AT_REST = 1e-16
 #: How far the system is shifted, relative to its size, to see whether forces depend on its place.
@@ -43,7 +47,7 @@ class Freedom:
     directions : ndarray, shape (k, 3)
         Orthonormal directions in which total momentum is conserved, k <= 3.
     turns : bool
-        Whether the forces exert no torque, so that angular momentum is conserved too.
+        Whether neither forces nor rows exert a torque about some axis, about which angular momentum is conserved too.
     """
 
     count: int
@@ -68,7 +72,8 @@ def freedom(
     momentum : {'auto', 'conserved', 'free'}
         In which directions total momentum is conserved. 'auto' finds them: directions along which all rows may be
         shifted, and in which the forces add up to nothing, here and after a shift of the whole system (one force
-        evaluation more, at most three). 'conserved': in all directions that the rows allow. 'free': in none.
+        evaluation more, at most three; at most six where nothing is periodic, and rows leave some turn of the whole
+        system). 'conserved': in all directions that the rows allow. 'free': in none.
 
     Raises
     ------
@@ -167,32 +172,92 @@ def _conserved(system: System, state: State, forces: FloatArray) -> tuple[FloatA
     directions = open_directions(system.motion, state.positions, state.time)
     if system.force is None:
         return directions, False
-    rng = np.random.default_rng(0)
-    size = float(np.ptp(state.positions, axis=0).max(initial=0.0)) or 1.0
-    x, f = state.positions, forces
-    turns = True
-    for attempt in range(4):
-        turns = turns and _no_torque(x, f)
+    places, turns = _places(system, state, forces), _Turns(system, state)
+    for attempt, (x, f) in enumerate(places):
+        turns.see(x, f)
         total = directions @ f.sum(axis=0)
         if np.abs(total).max(initial=0.0) <= BALANCED * np.abs(f).sum():
             # At one place they may cancel by symmetry.
             if attempt or not len(directions):
-                return directions, turns and len(directions) == 3
+                break
         elif len(directions) == 1:
+            directions = np.zeros((0, 3))
             break
         else:
             directions = np.linalg.svd(total[None, :])[2][1:] @ directions
-        x = state.positions + SHIFT * size * rng.standard_normal(3)
-        x += SHAKE * size * rng.standard_normal(x.shape)
-        f = system.forces(x, state.velocities, state.time, state.step)
-    return np.zeros((0, 3)), False
+    while turns.open:
+        turns.see(*next(places))
+    return directions, turns.found
 
 
-def _no_torque(x: FloatArray, forces: FloatArray) -> bool:
-    arms = x - x.mean(axis=0)
-    torque = np.abs(np.cross(arms, forces).sum(axis=0)).max()
-    sizes = float((np.linalg.norm(arms, axis=1) * np.linalg.norm(forces, axis=1)).sum())
-    return bool(sizes > 0 and torque <= BALANCED * sizes)
+def _places(system: System, state: State, forces: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """The state, then places nearby, with their forces; fixed atoms stay."""
+    rng = np.random.default_rng(0)
+    size = float(np.ptp(state.positions, axis=0).max(initial=0.0)) or 1.0
+    moving = system.inverse_masses > 0
+    yield state.positions, forces
+    while True:
+        shift = SHIFT * size * rng.standard_normal(3)
+        x = state.positions + moving * (shift + SHAKE * size * rng.standard_normal(state.positions.shape))
+        yield x, system.forces(x, state.velocities, state.time, state.step)
+
+
+class _Turns:
+    """Motions of everything at once, shifts and turns about the middle, that change no row and meet no force.
+
+    Each place takes one of six away, unless forces do no work in any that is left. None in a cell, whose turn changes
+    what is meant, and where rows move.
+    """
+
+    def __init__(self, system: System, state: State) -> None:
+        x, motion = state.positions, system.motion
+        self._middle = x.mean(axis=0)
+        self._size = float(np.ptp(x, axis=0).max(initial=0.0)) or 1.0
+        self._seen, self._idle = 0, False
+        self._motions = np.zeros((0, 6))
+        if motion.lattice is None and not motion.plan.driven:
+            self._motions = np.eye(6)
+            rng = np.random.default_rng(0)
+            shaken = TURN * self._size * (system.inverse_masses > 0) * rng.standard_normal((3, *x.shape))
+            for place in x + shaken:
+                self._keep_rows(motion.constraint_set, place, state.time)
+
+    def _fields(self, x: FloatArray) -> FloatArray:
+        """How atoms move in each of three shifts and three turns, shape (3 n, 6)."""
+        arms = (x - self._middle) / self._size
+        turns = np.stack([np.cross(axis, arms).ravel() for axis in np.eye(3)], axis=1)
+        return np.hstack([np.tile(np.eye(3), (len(x), 1)), turns])
+
+    def _keep_rows(self, held: ConstraintSet, x: FloatArray, time: float) -> None:
+        with np.errstate(all="ignore"):
+            rows = held.jacobian(x, time)
+            lengths = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+        change = np.asarray(rows @ self._fields(x)) / np.where(lengths > 0, lengths, 1.0)[:, None]
+        if not np.isfinite(change).all():
+            change = np.eye(6)  # a surface that is not defined nearby
+        _, values, axes = np.linalg.svd(np.linalg.qr(change @ self._motions.T, mode="r"), full_matrices=True)
+        self._motions = axes[int((values > 1e-9).sum()) :] @ self._motions
+
+    def see(self, x: FloatArray, forces: FloatArray) -> None:
+        """Leave out a motion in which the forces of this place do work."""
+        work = self._motions @ (self._fields(x).T @ forces.ravel())
+        self._seen += 1
+        share = BALANCED if len(self._motions) == 6 else EXACT
+        self._idle = bool(np.abs(work).max(initial=0.0) <= share * np.abs(forces).sum())
+        if not forces.any():
+            self._motions = np.zeros((0, 6))
+        elif not self._idle:
+            self._motions = np.linalg.svd(work[None, :])[2][1:] @ self._motions
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a turn among those that are left."""
+        return bool(np.abs(self._motions[:, 3:]).max(initial=0.0) > BALANCED)
+
+    @property
+    def open(self) -> bool:
+        """Whether another place has to tell: at one, forces may cancel by symmetry."""
+        return self.found and not (self._idle and self._seen > 1)
 
 
 def warn_of_conserved_momenta(system: System, velocities: FloatArray, free: Freedom, stacklevel: int = 4) -> None:
@@ -205,8 +270,9 @@ def warn_of_conserved_momenta(system: System, velocities: FloatArray, free: Free
         )
     elif free.turns:
         warnings.warn(
-            "the forces exert no torque (a free cluster), so that angular momentum is only scaled by the thermostat "
-            "and never forgotten: configurations are not canonical. Use Langevin",
+            "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere), so "
+            "that angular momentum is only scaled by the thermostat and never forgotten: configurations are not "
+            "canonical. Use Langevin",
             stacklevel=stacklevel,
         )
 

@@ -8,6 +8,7 @@ from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.constraints import (
+    ExternalForce,
     FixAtoms,
     FixBondLengths,
     FixCartesian,
@@ -20,14 +21,18 @@ from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import FIRE
 from ase_systems import (
+    FS,
+    Field,
     Free,
     loose_waters,
     off,
     rigid,
     slip,
+    state,
+    water,
 )
 
-from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
+from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics, MultipleTimeSteps, constrain, rigid_water
 from kcons.constraints import (
     Angle,
     Distance,
@@ -359,3 +364,103 @@ def test_a_second_object_of_kcons_says_how_to_make_one():
     with pytest.raises(UnsupportedError, match=r"Constraints acts on atom 0.*\[\*old\.constraints, \*new\]"):
         constrain(atoms, Distance([[0, 2]]))
     assert atoms.constraints == [first]
+
+
+# -- forces that are known --------------------------------------------------------------------------
+
+
+class Settings(Field):
+    """A field whose stiffness `set` changes, without forgetting what it found, as calculators of ASE do."""
+
+    def __init__(self, **settings):
+        super().__init__()
+        self.set(**settings)
+
+    def calculate(self, *args, **kwargs):
+        self.stiffness = self.parameters["stiffness"]
+        super().calculate(*args, **kwargs)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda atoms: atoms.calc.set(stiffness=3.0),
+        lambda atoms: (atoms.calc.set(stiffness=3.0), atoms.get_potential_energy()),
+        lambda atoms: setattr(atoms.constraints[-1], "external_force", 4.0),
+        lambda atoms: atoms.set_initial_charges([2.0, 0.0, 0.0]),
+    ],
+    ids=["settings", "settings, and asked", "force of ase", "charges"],
+)
+def test_forces_of_the_same_calculator_that_changed(change):
+    """A step begins with the forces that there are now."""
+
+    class Charged(Settings):
+        def calculate(self, *args, **kwargs):
+            super().calculate(*args, **kwargs)
+            self.results["forces"] += self.atoms.get_initial_charges()[:, None]
+
+    atoms, _ = water(Charged(stiffness=0.05))
+    atoms.set_constraint([*atoms.constraints, ExternalForce(0, 1, 0.2)])
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(2)
+    change(atoms)
+    again = atoms.copy()
+    again.calc = Charged(**atoms.calc.parameters)
+    dyn.run(1)
+    ConstrainedDynamics(again, FS).run(1)
+    for one, two in zip(state(atoms), state(again), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these():
+    """All these lengths are 1, so that the rows that are meant cannot be told from their neighbours by length."""
+    line = Atoms("H5", positions=np.arange(5)[:, None] * [1.0, 0.0, 0.0], calculator=Free())
+    for options in ({"constraints": [Distance([[2, 3]])]}, {"friction": [1.0, 2.0, 3.0, 4.0, 5.0]}):
+        atoms = line.copy()
+        atoms.calc = Free()
+        dyn = ConstrainedDynamics(atoms, FS, **options)
+        dyn.run(1)
+        del atoms[0]
+        with pytest.raises(InputError, match=r"1 of 5 atoms were removed.*make a new one"):
+            dyn.run(1)
+    dyn = ConstrainedDynamics(line, FS)
+    dyn.run(1)
+    del line[0]
+    dyn.run(1)
+    assert dyn.degrees_of_freedom == 12
+
+
+def test_other_questions_to_the_calculator_change_nothing():
+    """Results in another place whose forces are the same: the variables of a thermostat go on."""
+    runs = []
+    for asked in (False, True):
+        atoms, _ = water(Settings(stiffness=0.05))
+        dyn = IsokineticDynamics(atoms, FS, 300, momentum="free")
+        if asked:
+            dyn.attach(lambda atoms=atoms: (atoms.calc.reset(), atoms.get_potential_energy()))
+        dyn.run(20)
+        runs.append((*state(atoms), dyn.state.thermostat))
+    for one, two in zip(*runs, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert runs[0][2][1] != 0
+
+
+@pytest.mark.parametrize("changed", ["fast", "slow"])
+def test_each_calculator_of_several_time_steps(changed):
+    def made(atoms, fast, slow):
+        return MultipleTimeSteps(
+            atoms, FS, fast=fast, slow=slow, temperature_K=300, friction=0.01 / FS, fast_steps=2, seed=1
+        )
+
+    atoms, _ = water()
+    given = {"fast": Settings(stiffness=0.05), "slow": Settings(stiffness=0.02)}
+    dyn = made(atoms, **given)
+    dyn.run(2)
+    given[changed].set(stiffness=3.0)
+    again = atoms.copy()
+    dyn.run(1)
+    other = made(again, **{name: Settings(**each.parameters) for name, each in given.items()})
+    other.nsteps = 2
+    other.run(1)
+    for one, two in zip(state(atoms), state(again), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-13)

@@ -386,6 +386,29 @@ def test_masses_changed_between_steps_are_taken():
     assert off(atoms, held) <= 1e-13
 
 
+@pytest.mark.parametrize("change", ["masses", "elements"])
+def test_masses_of_free_atoms_changed_between_steps_are_taken(change):
+    """No row touches them, and the engine of the rows still fits; the steps do not."""
+
+    def go_on(atoms, dyn):
+        if change == "masses":
+            atoms.set_masses([1.0, 2.0, 30.0, 1.0])
+        else:
+            atoms.numbers[2] = 18
+        return dyn(atoms).run(3)
+
+    atoms, again = (Atoms("H4", positions=np.diag([1.0, 2.0, 3.0, 4.0])[:, :3], calculator=Field()) for _ in "ab")
+    for each in (atoms, again):
+        if change == "masses":
+            each.set_masses([1.0, 2.0, 3.0, 1.0])
+        constrain(each, Distance([[0, 1]]))
+    dyn = ConstrainedDynamics(atoms, FS)
+    go_on(atoms, lambda atoms: dyn)
+    go_on(again, lambda atoms: ConstrainedDynamics(atoms, FS))
+    for one, two in zip(state(atoms), state(again), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
 @pytest.mark.parametrize(
     "made",
     [

@@ -89,6 +89,16 @@ def test_a_rod_in_tension():
     assert columns(log)[0, -1] == pytest.approx(-mass * 0.1**2 / 1.0, rel=1e-5)
 
 
+def test_a_rod_against_friction():
+    """Half of the drag on one atom is carried to the other by the rod."""
+    atoms, log = Atoms("Ar2", positions=[[0, 0, 0], [2.0, 0, 0]], calculator=Free()), io.StringIO()
+    atoms.set_velocities([[0.1, 0, 0], [0.1, 0, 0]])
+    rod, mass = Distance([[0, 1]]), atoms.get_masses()[0]
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=[rod], friction=[0.0, 0.3])
+    ConstraintLogger(dynamics, atoms, log, {"rod": rod})()
+    assert columns(log)[0, -1] == pytest.approx(0.5 * 0.3 * mass * 0.1, rel=1e-5)
+
+
 def test_what_is_not_held_is_refused():
     atoms = moving()
     with pytest.raises(InputError, match=r"carry no constraints.*constrain"):

@@ -166,6 +166,13 @@ def test_unreadable_arguments_leave_with_status_2(arguments, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("place", ["taken", "taken/below"])
+def test_a_file_where_a_folder_has_to_be(place, tmp_path, capsys):
+    (tmp_path / "taken").touch()
+    assert run("compare", "chain", "--size", 4, "--methods", "rattle", "--dt", 10, "--out", tmp_path / place) == 2
+    assert "there is a file where a folder has to be; give another folder (--out)" in capsys.readouterr().err
+
+
 def test_interrupt(monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt

@@ -54,8 +54,27 @@ def test_files_that_cannot_be_opened(tmp_path, ending):
 def test_files_of_ase_are_told_from_broken_ones(tmp_path):
     path = tmp_path / "run.traj"
     path.write_bytes(b"- of UlmASE-Trajectory" * 50)
-    with pytest.raises(InputError, match=r"ASE's own format: ase convert run\.traj run\.xyz"):
+    with pytest.raises(
+        InputError, match=r"ASE's own format: .*write_ase, or .* run\.traj run\.pdb \(run\.xyz .* no cell"
+    ):
         load_trajectory(files.universe(N), path)
+
+
+def test_a_format_whose_package_is_missing(tmp_path, monkeypatch):
+    """As mmCIF without gemmi."""
+
+    def missing(*args, **options):
+        raise ImportError("MMCIF: please install gemmi")
+
+    path = tmp_path / "a.pdb"
+    path.write_text("END\n")
+    made = files.universe(N)
+    monkeypatch.setattr(made, "load_new", missing)
+    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); install that package"):
+        load_trajectory(made, path)
+    monkeypatch.setattr("MDAnalysis.Universe", missing)
+    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); give a file such as"):
+        open_universe(path)
 
 
 def test_netcdf_that_was_cut_off_says_so(tmp_path, x):

@@ -13,7 +13,7 @@ import pytest
 from stepper_systems import SYMMETRIC, gravity, rotor, spherical_pendulum, system_of
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import Distance, FixedAtoms, MovingTarget
+from kcons.constraints import Distance, FixedAtoms, MovingTarget, Plane, Sphere
 from kcons.errors import InputError
 from kcons.steppers import (
     BlanesMoan6,
@@ -278,6 +278,7 @@ def pendulum(g: float) -> tuple[System, State, list[float]]:
 STEPPERS = [Rattle(), BlanesMoan6(), Geodesic(), ProjectedVerlet(), ProjectedRungeKutta4()]
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
 @pytest.mark.parametrize("stepper", [*STEPPERS, Langevin(1.0, 1.0, 5), NoseHooverChain(1.0, 5.0)], ids=repr)
 def test_forces_of_another_system_are_not_taken(stepper) -> None:
     here, start, asked = pendulum(1.0)
@@ -310,6 +311,7 @@ def test_forces_are_kept_at_their_positions_only(stepper) -> None:
     assert len(asked) == once + first
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
 def test_another_system_begins_a_thermostat_anew() -> None:
     here, start, _ = pendulum(1.0)
     there = pendulum(7.0)[0]
@@ -365,6 +367,25 @@ def test_a_body_that_flies_away_is_as_accurate_as_one_at_home() -> None:
     bond = np.diff(far.positions + far.remainder, axis=0) - np.diff(near.positions, axis=0)
     # Rounding at 1000 is 1e-13; without the remainder a thousand steps add up to 1e-10.
     assert np.abs(bond).max() <= 3e-12
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Geodesic(), BlanesMoan6(), Langevin(1.0, 0.5, 1)], ids=repr)
+@pytest.mark.parametrize(
+    "rows",
+    [[Sphere(0, [1e5 - 2.0, 1e5, 1e5], None), Distance([0, 1])], [FixedAtoms([0])], [Plane([1], [0, 0, 1.0])], []],
+    ids=["sphere", "fixed atom", "plane", "none"],
+)
+def test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place(stepper, rows) -> None:
+    """Of a state that comes from another System: steps relative to an atom would look for the surface at the origin."""
+    there, state = rotor(omega=1.0, offset=1e5)
+    state = run(there, state, 0.05, 3)
+    assert state.remainder is not None
+    here = system_of(rows, state.positions, there.masses, gravity(there.masses))
+    v = here.motion.project_velocities(state.positions, state.velocities)
+    found = run(here, replace(state, velocities=v), 0.05, 4, stepper=stepper)
+    expected = run(here, State(state.positions, v, state.time, None, state.step), 0.05, 4, stepper=stepper)
+    np.testing.assert_array_equal(found.positions, expected.positions)
+    np.testing.assert_array_equal(found.velocities, expected.velocities)
 
 
 def test_far_may_be_switched_off() -> None:

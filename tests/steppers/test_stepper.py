@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from stepper_systems import (
@@ -24,6 +26,7 @@ from kcons.steppers import (
     System,
     run,
 )
+from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpheres, Langevin
 
 ALL = pytest.mark.parametrize("stepper", EVERY, ids=repr)
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
@@ -104,6 +107,26 @@ def test_force_evaluations_are_as_declared(stepper) -> None:
 
 
 # -- purity and failure -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "stepper",
+    [
+        Langevin(1.0, 0.5, 1, conserve_momentum=True),
+        Isokinetic(1.0),
+        HamiltonianMonteCarlo(1.0, 2, 3),
+        IsokineticSpheres(1.0, 0.5, 2),
+    ],
+    ids=lambda stepper: type(stepper).__name__,
+)
+def test_copies_leave_behind_what_was_found_for_a_system(stepper) -> None:
+    """Whose functions need not be any that pickle knows."""
+    system, state = rotor(force=lambda x, t: -x * [1.0, 2.0, 3.0], potential=lambda x, t: float((x**2).sum()))
+    state = run(system, state, 0.01, 2, stepper=stepper)
+    again = pickle.loads(pickle.dumps(stepper))
+    np.testing.assert_array_equal(
+        run(system, state, 0.01, 3, stepper=stepper).positions, run(system, state, 0.01, 3, stepper=again).positions
+    )
 
 
 @ALL

@@ -13,7 +13,9 @@ from kcons.constraints import (
     CenterOfMass,
     Cylinder,
     Distance,
+    Ellipsoid,
     FixedAtoms,
+    Formula,
     ImplicitSurface,
     LinearVelocity,
     Plane,
@@ -21,7 +23,8 @@ from kcons.constraints import (
 )
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.steppers import State
+from kcons.motion import Motion
+from kcons.steppers import State, System
 from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
 from kcons.thermostats.freedom import drift_velocity, open_directions
 
@@ -193,6 +196,41 @@ def test_angular_momentum_of_a_free_cluster_is_said():
         with pytest.warns(UserWarning, match="exert no torque"):
             thermostat.start(held, state)
     Isokinetic().start(held, state)  # no temperature is asked for
+
+
+@pytest.mark.parametrize(
+    ("rows", "axes"),
+    [
+        ([Sphere([0, 1, 2, 3], [0, 0, 0], 1.0)], 3),
+        ([Plane([0, 1, 2, 3], [0, 0.6, 0.8], 0.0)], 1),
+        ([Cylinder([0, 1, 2, 3], [0, 0, 0], [0, 0, 1.0], 1.0)], 1),
+        ([FixedAtoms([0], [0.5, 0.0, 0.2]), Distance([[1, 2]])], 3),
+        ([Ellipsoid([0, 1, 2, 3], [0, 0, 0], [1.0, 1.2, 1.5])], 0),
+        ([Distance([[0, 1]]), Formula("x1**2 + y1**2 + z1**2 - 1", [[3]])], 3),
+        ([FixedAtoms([0, 1, 2])], 0),
+    ],
+    ids=["sphere", "plane", "cylinder", "fixed atom", "ellipsoid", "formula", "three fixed atoms"],
+)
+def test_angular_momentum_about_the_axes_of_what_is_held_is_said(rows, axes):
+    """Pairs that repel exert no torque, and rows none about some axis; a field across it does."""
+    x = np.random.default_rng(3).standard_normal((4, 3))
+    motion = Motion(ConstraintSet(rows, x, np.ones(4)), x)
+    x = motion.restore_positions(x, bonds=[])
+    calls = []
+
+    def force(x, t):
+        calls.append(t)
+        return repelling(x)
+
+    for field in (0.0, np.array([[0.3, -0.7, 1.1]])):
+        held = System(motion, lambda x, t, field=field: force(x, t) + field * x[:, [1, 2, 0]])
+        state = held.initial_state(x, thermal_velocities(held, x, 1.0, 0), project=True)
+        calls.clear()
+        found = freedom(held, state, held.forces(x, x, 0.0, 0))
+        assert found.turns == bool(axes and np.ndim(field) == 0)
+        assert len(calls) <= 7
+    cell = Motion(ConstraintSet([Plane([0, 1], [0, 0, 1.0])], x, np.ones(4), cell=[9.0] * 3), x)
+    assert not freedom(System(cell, force), state, force(x, 0.0)).turns
 
 
 def test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster():

@@ -117,7 +117,7 @@ def test_steps_that_cannot_be():
     with pytest.raises(InputError, match="step 1: a chain of period 1 cannot follow a time step of 90"):
         thermostat.step(held, begun, 90.0)
     with pytest.raises(NonFiniteError, match="non-finite force at step 1"):
-        thermostat.step(System(held.motion, lambda x, t: x * (1.0 if t == 0 else np.nan)), begun, 0.1)
+        thermostat.step(System(held.motion, lambda x, t: x * [1.0, 2.0, 3.0 if t == 0 else np.nan]), begun, 0.1)
     for now, before in zip((begun.positions, begun.velocities, begun.thermostat), copies, strict=True):
         assert np.array_equal(now, before)
     with pytest.raises(InputError, match="variables of another thermostat"):

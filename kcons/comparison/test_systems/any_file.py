@@ -124,10 +124,13 @@ def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
     import MDAnalysis
 
     files = [str(path), *([str(coordinates)] if coordinates else [])]
+    for file in files:
+        if Path(file).is_file() and not Path(file).stat().st_size:
+            raise InputError(f"{file} is empty; give another file", item="file")
     try:
         return MDAnalysis.Universe(*files)
     except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(str(error).partition("\n   You can")[0].split()) or type(error).__name__
         raise InputError(
             f"{' with '.join(files)} cannot be read: {text}; give a topology, and with --coordinates a file of the "
             "same atoms",

@@ -79,6 +79,11 @@ def concluded(
     units = by_unit(table, part, np.where(untold, 0.0, rows.of_targets), rounding, rows.tolerance)
     order = np.lexsort((-np.where(violated, found.margins, found.largest), ~violated))
     worst = [row_result(table, asked.labels, int(row), part) for row in order[: max(asked.worst, 1)]]
+    if held.lattice is None and (violated & (table.units == 0) & (found.largest > table.sizes)).any():
+        asked.remarks.append(
+            f"lengths are off by more than themselves, and frames of {asked.names[0]} have no cell: molecules cut by a "
+            "face of one look like this. Give a format that has the cell (not XYZ), or whole molecules"
+        )
     in_frame = (found.excess > 0).any(axis=0)
     frames = part.frames[in_frame]
     status = "tolerated" if beyond_file.any() else "kept"

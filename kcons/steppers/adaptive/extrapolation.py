@@ -145,7 +145,8 @@ class _Table:
 
     def __init__(self, scheme: Extrapolation, system: System, start: State, size: float, speed: float) -> None:
         self.scheme, self.system, self.start, self.size = scheme, system, start, size
-        x = start.positions if start.remainder is None else start.positions - start.positions[system.anchor]
+        far = system.remainder_of(start) is not None
+        x = start.positions - start.positions[system.anchor] if far else start.positions
         self._tolerated = scheme.tolerance * np.array([scheme.length, speed])
         self._rounding = EPS * np.array([rms(x, system), rms(start.velocities, system)])
         self._line: list[FloatArray] = []

@@ -32,9 +32,10 @@ class Frame:
         x, self.v, self.forces = system.taken(start)
         self.shift: FloatArray | None = None
         self.x: FloatArray = x
-        if start.remainder is not None:
+        remainder = system.remainder_of(start)
+        if remainder is not None:
             self.shift = x[system.anchor]
-            self.x = (x - self.shift) + start.remainder
+            self.x = (x - self.shift) + remainder
 
     def at(self, end: float) -> float:
         """The time at the fraction `end` of the step."""

@@ -46,9 +46,9 @@ def fused_steps(
     force, number, stage = system.force, start.step, drifts[0]
     x, v, f = system.taken(start)
     shape, shift = x.shape, None
-    if start.remainder is not None:
+    if (remainder := system.remainder_of(start)) is not None:
         shift = x[system.anchor]
-        x = (x - shift) + start.remainder
+        x = (x - shift) + remainder
     if force is None or f is None:
         kicks, f = (0.0,) * len(kicks), system.weights  # any finite numbers
     first, last, fractions = kicks[0] * dt, kicks[-1] * dt, stage.lengths

@@ -21,7 +21,7 @@ from kcons.errors import (
 )
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.executors.frame import Frame
-from kcons.steppers.stepper import stays
+from kcons.steppers.stepper import Portable, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
@@ -90,7 +90,7 @@ class Counts:
         return cls(accepted, energy, irreversible, unsolved, not_finite, change, square)
 
 
-class HamiltonianMonteCarlo:
+class HamiltonianMonteCarlo(Portable):
     """Canonical sampling on constraints without any error of the time step.
 
     A step draws velocities in the tangent plane, makes a trajectory with a reversible stepper, and accepts its end

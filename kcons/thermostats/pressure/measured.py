@@ -23,7 +23,7 @@ STRAIN = 1e-4
 Virial = Literal["molecular", "atomic", "difference"]
 
 
-def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArray) -> FloatArray:
+def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArray, time: float = 0.0) -> FloatArray:
     """sum_i r_i (x) z_i over the rows that hold the system together, symmetric, shape (3, 3).
 
     z is the instantaneous constraint force, the velocity-dependent part of b included. Rows that depend on
@@ -36,13 +36,13 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
     Notes, eqs. 101-104. Atomic virial with constraints: Ciccotti and Ryckaert, Comput. Phys. Rep. 4, 345 (1986).
     """
     held = motion.constraint_set
-    lam = motion.multipliers(x, v, f)
+    lam = motion.multipliers(x, v, f, time)
     virial = np.zeros((3, 3))
     for item, start in zip(held.constraints, held.starts, strict=False):
         if not (item.holonomic and item.translation_invariant and item.n_rows):
             continue
         r = held.gather(item, x)
-        push = lam[start : start + item.n_rows, None, None] * item.gradient(r, 0.0)
+        push = lam[start : start + item.n_rows, None, None] * item.gradient(r, time)
         virial += np.einsum("kai,kaj->ij", r - r[:, :1], push)
     return 0.5 * (virial + virial.T)
 
@@ -90,7 +90,7 @@ def instantaneous_pressure(
         stress = system.stress(x, state.time)
         f = system.with_forces(state).forces
         assert f is not None
-        return ((masses * v).T @ v + constraint_virial(system.motion, x, v, f)) / volume - stress
+        return ((masses * v).T @ v + constraint_virial(system.motion, x, v, f, state.time)) / volume - stress
     if pieces is None:
         pieces = find_pieces(system, x, np.ones(3, dtype=bool), time=state.time)
     if thermal_energy is None:

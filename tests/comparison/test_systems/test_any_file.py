@@ -91,6 +91,12 @@ def test_unreadable_files_and_unknown_names(tmp_path, capsys):
     status, _, err = plan(broken, capsys=capsys)
     assert status == 2
     assert f"{broken} cannot be read" in " ".join(err.split())
+    (tmp_path / "empty.xyz").touch()
+    assert "empty.xyz is empty" in plan(tmp_path / "empty.xyz", capsys=capsys)[2]
+    (tmp_path / "run.odd").write_text("nothing")
+    assert "can be minimally inferred.; give a topology" in " ".join(
+        plan(tmp_path / "run.odd", capsys=capsys)[2].split()
+    )
     assert plan("missing.gro", capsys=capsys)[2] == "kcons: there is no file missing.gro\n"
     assert "there is no test system 'watr'" in plan("watr", capsys=capsys)[2]
     assert "--forces is for files" in plan("ethanol", "--forces", "emt", capsys=capsys)[2]

@@ -27,6 +27,7 @@ def sampler(**more):
     return AseWindows(molecule("CH3OH"), CALCULATOR, {"turn": TURN}, **{"held": [PIECES], **more})
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")  # about the fixed atom
 @pytest.mark.parametrize("thermostat", ["langevin", "nose-hoover", "isokinetic"])
 def test_a_window_far_from_the_structure(tmp_path, thermostat):
     """From 180 to 60 degrees in one go; the same file whenever it is made."""
@@ -35,7 +36,7 @@ def test_a_window_far_from_the_structure(tmp_path, thermostat):
     settings = Settings(**{**SHORT.__dict__, "thermostat": thermostat})
     window = Window(0, "up", (1.0,), (np.pi / 3,), 5)
     atoms = molecule("CH3OH")
-    atoms.set_constraint(FixAtoms([0]))  # so that the thermostats are not those of a free cluster
+    atoms.set_constraint(FixAtoms([0]))
     held = pickle.loads(pickle.dumps(AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])))
     for name in ("one", "two"):
         held.sample(window, settings, tmp_path / name)

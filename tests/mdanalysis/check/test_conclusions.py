@@ -56,6 +56,12 @@ def test_a_break_is_no_verdict_but_a_violation_is():
     assert conclusion(0.5, broken=broken).status == "violated"
 
 
+def test_molecules_cut_where_no_cell_is_known_are_told_of():
+    """A length off by more than itself; less is a violation like any other."""
+    assert any("no cell" in remark and "whole molecules" in remark for remark in conclusion(7.0).remarks)
+    assert conclusion(0.9).remarks == ["said before"]
+
+
 def test_what_is_told_besides():
     result = conclusion(0.01, worst=0, rank=None)
     assert result.worst == [] and result.rank is None and result.degrees_of_freedom is None

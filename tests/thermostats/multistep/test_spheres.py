@@ -185,7 +185,7 @@ def test_what_has_no_spheres():
     held, state = molecules("bent", 2)
     stepper = IsokineticSpheres(0.5, 1.0, 3)
     with pytest.raises(InputError, match="variables of another thermostat, not of IsokineticSpheres"):
-        stepper.step(held, Isokinetic(0.5).start(held, state), 0.1)
+        stepper.step(held, Isokinetic().start(held, state), 0.1)
     with pytest.raises(UnsupportedError, match="depend on the velocities"):
         stepper.check(System(held.motion, lambda x, v, t: -v, velocity_dependent=True))
     with pytest.raises(UnsupportedError, match="System with friction"):

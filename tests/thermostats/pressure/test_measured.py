@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pressure_systems import METHANE, TRIANGLE, gas
 
-from kcons.constraints import Distance
+from kcons.constraints import Distance, MovingTarget
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
@@ -69,6 +69,18 @@ def test_three_ways_to_one_pressure(shape):
     assert abs(atomic - molecular).max() > 1e-4  # in single directions they are equal in the mean only
     assert molecular == pytest.approx(molecular.T, abs=1e-14)
     assert system.cell == pytest.approx(SIDE * np.eye(3), abs=0)
+
+
+def test_a_rod_that_is_made_longer():
+    """At rest but for that: 3 P V = mu (L'^2 + L L'') by the time of the state, the second of which the rod pushes."""
+    time, mu = 0.7, 2.0 * 3.0 / 5.0
+    rod = MovingTarget(lambda t: 2.0 + np.sin(t), np.cos, lambda t: -np.sin(t))
+    length, rate, acceleration = rod.value(time), rod.rate(time), rod.acceleration(time)
+    x = np.array([[5.0, 5.0, 5.0], [5.0 + length, 5.0, 5.0]])
+    held = ConstraintSet(Distance([[0, 1]], rod), x, [2.0, 3.0], cell=np.full(3, SIDE), time=time)
+    system = CellSystem(Motion(held, x, time=time), **springs(0.0)(1))
+    found = instantaneous_pressure(system, system.initial_state(x, time=time), "atomic")
+    assert np.trace(found) * SIDE**3 == pytest.approx(mu * (rate**2 + length * acceleration), rel=1e-12)
 
 
 def test_means_agree():
