@@ -15,9 +15,10 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numba
 import numpy as np
@@ -142,12 +143,14 @@ class Method:
     damp: float = 0.0
     seed: int = 1
     waters: int = 64
+    #: What the name tells where it is unusual.
+    NAMED: ClassVar = ("inner", "order", "auxiliary", "substeps", "switch", "screen", "damp", "middle", "seed")
 
     @property
     def name(self) -> str:
         text = f"{self.bath} {self.friction:g}/ps, {self.outer:g} fs"
-        usual = Method(self.bath, self.friction, self.outer)
-        for key in ("inner", "order", "auxiliary", "substeps", "switch", "screen", "damp", "middle", "seed"):
+        usual = type(self)(self.bath, self.friction, self.outer)
+        for key in self.NAMED:
             if getattr(self, key) != getattr(usual, key):
                 text += f", {key} {getattr(self, key)}"
         return text + (", halfway" if self.halfway else "")
@@ -155,6 +158,11 @@ class Method:
     @property
     def file(self) -> str:
         return "".join(c if c.isalnum() or c in ".-" else "_" for c in self.name)
+
+    def near(self, box: float) -> Callable[[np.ndarray, float], np.ndarray]:
+        """The fast forces."""
+        given = (box, *self.switch, self.screen, self.damp, COULOMB, CHARGES, SIGMA, EPSILON)
+        return lambda x, time: near_forces(np.array(x), *given)
 
     def stepper(self) -> Stepper:
         friction = self.friction / (1000 * units.fs)
@@ -178,13 +186,9 @@ class Water:
         self.potential = scene.potential
         self.motion = scene.motion
 
-        def near(x: np.ndarray, time: float) -> np.ndarray:
-            given = (self.box, *method.switch, method.screen, method.damp, COULOMB, CHARGES, SIGMA, EPSILON)
-            return near_forces(np.array(x), *given)
-
         force: Any = self.potential.forces
         if method.bath != "plain":
-            force = ForceGroups.difference(near, self.potential.forces)
+            force = ForceGroups.difference(method.near(self.box), self.potential.forces)
         self.system = System(self.motion, force)
         self.start = self.system.initial_state(
             scene.positions, thermal_velocities(self.system, scene.positions, KT, np.random.default_rng(7))
@@ -347,11 +351,7 @@ def summary(method: Method, folder: Path, samples: int) -> dict[str, Any] | None
     slow = 1000 / method.outer
     turning = dipole_time(frames, gap)
     row = {
-        **{name: getattr(method, name) for name in ("bath", "friction", "outer", "inner", "order", "auxiliary")},
-        **{
-            name: getattr(method, name)
-            for name in ("substeps", "switch", "screen", "middle", "halfway", "damp", "seed")
-        },
+        **asdict(method),
         "name": method.name,
         "ps": len(u) * gap,
         "energy": list(mean(u)),

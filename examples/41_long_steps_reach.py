@@ -12,11 +12,15 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import sys
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
+import numba
+import numpy as np
 from ase import units
 
 from kcons import run
@@ -26,12 +30,64 @@ spec = importlib.util.spec_from_file_location("long_steps_water", Path(__file__)
 assert spec is not None and spec.loader is not None
 water = sys.modules["long_steps_water"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(water)
-Method = partial(water.Method, waters=216)
+
+
+@numba.njit(nogil=True)
+def wave_forces(x, box, damp, most, coulomb, charges):  # type: ignore[no-untyped-def]
+    """The reciprocal part of an Ewald sum, of the waves h with h.h <= `most` only."""
+    n, reach, unit = len(x), int(math.sqrt(most)), 2 * math.pi / box
+    f = np.zeros_like(x)
+    powers = np.ones((3, 2 * reach + 1, n), np.complex128)
+    for k in range(3):
+        for i in range(n):
+            turn = np.exp(1j * unit * x[i, k])
+            for p in range(1, reach + 1):
+                powers[k, reach + p, i] = powers[k, reach + p - 1, i] * turn
+                powers[k, reach - p, i] = np.conj(powers[k, reach + p, i])
+    wave = np.empty(n, np.complex128)
+    for a in range(reach + 1):
+        for b in range(-reach, reach + 1):
+            for c in range(-reach, reach + 1):
+                square = a * a + b * b + c * c
+                # One of each pair h, -h.
+                if square > most or (a, b, c) <= (0, 0, 0):
+                    continue
+                kk = unit * unit * square
+                strength = 8 * math.pi * coulomb / box**3 * math.exp(-kk / (4 * damp * damp)) / kk
+                total = 0j
+                for i in range(n):
+                    wave[i] = powers[0, a + reach, i] * powers[1, b + reach, i] * powers[2, c + reach, i]
+                    total += charges[i] * wave[i]
+                for i in range(n):
+                    push = strength * unit * charges[i] * (wave[i] * total.conjugate()).imag
+                    f[i, 0] += a * push
+                    f[i, 1] += b * push
+                    f[i, 2] += c * push
+    return f
+
+
+@dataclass(frozen=True)
+class Method(water.Method):  # type: ignore[name-defined,misc]
+    """With `waves`, the longest waves of an Ewald sum are fast, too, up to this square of their whole numbers."""
+
+    waters: int = 216
+    waves: int = 0
+    NAMED: ClassVar = (*water.Method.NAMED, "waves")
+
+    def near(self, box: float) -> Callable[[np.ndarray, float], np.ndarray]:
+        near, charges = super().near(box), np.tile(water.CHARGES, self.waters)
+        if not self.waves:
+            return near
+        given = (box, self.damp, self.waves, water.COULOMB, charges)
+        return lambda x, time: near(x, time) + wave_forces(np.array(x), *given)
+
 
 #: Splittings: near pairs as they are, with a reaction field, and damped as in an Ewald sum.
 NEAR = {"switch": (4.0, 6.0)}
 PLAIN, FIELD = {"switch": (7.0, 9.0)}, {"switch": (7.0, 9.0), "screen": True}
-SOFT, EWALD = {"switch": (7.0, 9.0), "damp": 0.15}, {"switch": (7.0, 9.0), "damp": 0.35}
+EWALD = {"switch": (7.0, 9.0), "damp": 0.35}
+#: The same with the longest waves of the rest.
+WAVES, SHORT = ({"switch": (5.0, 7.0), "damp": 0.35, "waves": 20}, {"switch": (4.0, 6.0), "damp": 0.4, "waves": 30})
 #: What is run; the first is the reference.
 METHODS = (
     Method("plain", 5, 2),
@@ -43,7 +99,7 @@ METHODS = (
     *(Method("split", 20, dt, auxiliary=0, **FIELD) for dt in (24, 32, 48, 64)),
     *(
         method
-        for other in (PLAIN, SOFT, EWALD, NEAR)
+        for other in (PLAIN, WAVES, SHORT, EWALD, NEAR)
         for method in (
             Method("langevin", 5, 16, halfway=True, **other),
             Method("langevin", 20, 24, halfway=True, **other),
