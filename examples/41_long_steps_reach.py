@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numba
 import numpy as np
@@ -25,6 +25,7 @@ from ase import units
 
 from kcons import run
 from kcons.comparison import environment, json_files
+from kcons.thermostats import slow_share
 
 spec = importlib.util.spec_from_file_location("long_steps_water", Path(__file__).with_name("39_long_steps_water.py"))
 assert spec is not None and spec.loader is not None
@@ -82,36 +83,83 @@ class Method(water.Method):  # type: ignore[name-defined,misc]
         return lambda x, time: near(x, time) + wave_forces(np.array(x), *given)
 
 
-#: Splittings: near pairs as they are, with a reaction field, and damped as in an Ewald sum.
-NEAR = {"switch": (4.0, 6.0)}
-PLAIN, FIELD = {"switch": (7.0, 9.0)}, {"switch": (7.0, 9.0), "screen": True}
-EWALD = {"switch": (7.0, 9.0), "damp": 0.35}
-#: The same with the longest waves of the rest.
-WAVES, SHORT = ({"switch": (5.0, 7.0), "damp": 0.35, "waves": 20}, {"switch": (4.0, 6.0), "damp": 0.4, "waves": 30})
-#: What is run; the first is the reference.
-METHODS = (
-    Method("plain", 5, 2),
-    *(Method("langevin", g, dt, halfway=True, **FIELD) for dt in (16, 24, 32) for g in (2, 5, 20)),
-    *(Method("split", g, dt, halfway=True, **FIELD) for dt in (24, 32, 48, 64) for g in (5, 20)),
-    *(Method("split", 20, dt, halfway=True, auxiliary=0, **FIELD) for dt in (24, 32, 48, 64)),
-    *(Method("langevin", g, 24, **FIELD) for g in (5, 20)),
-    *(Method("split", 5, dt, **FIELD) for dt in (24, 32)),
-    *(Method("split", 20, dt, auxiliary=0, **FIELD) for dt in (24, 32, 48, 64)),
-    *(
-        method
-        for other in (PLAIN, WAVES, SHORT, EWALD, NEAR)
-        for method in (
-            Method("langevin", 5, 16, halfway=True, **other),
-            Method("langevin", 20, 24, halfway=True, **other),
-            Method("split", 20, 32, halfway=True, auxiliary=0, **other),
-        )
+#: What is fast, by splitting: near pairs as they are, with a reaction field, as in the direct part of an Ewald sum,
+#: and this with the longest waves of the rest.
+SPLITTINGS: dict[str, dict[str, Any]] = {
+    "pairs to 6 A": {"switch": (4.0, 6.0)},
+    "pairs to 9 A": {"switch": (7.0, 9.0)},
+    "reaction field to 9 A": {"switch": (7.0, 9.0), "screen": True},
+    "direct part to 9 A": {"switch": (7.0, 9.0), "damp": 0.35},
+    "pairs to 6 A, long waves": {"switch": (4.0, 6.0), "damp": 0.4, "waves": 30},
+    "pairs to 7 A, long waves": {"switch": (5.0, 7.0), "damp": 0.35, "waves": 20},
+}
+#: What is run with each: bath, friction in 1/ps, step in fs, auxiliary variables, seed; at the kicks where it says so.
+RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
+    "pairs to 6 A": (("langevin", 20, 24),),
+    "pairs to 9 A": (("langevin", 20, 24),),
+    "reaction field to 9 A": (
+        *(("langevin", friction, 16) for friction in (2, 5, 20)),
+        *(("langevin", friction, 24) for friction in (5, 20)),
+        ("split", 5, 32),
+        ("split", 20, 32, 0),
     ),
-)
+    "direct part to 9 A": (("langevin", 20, 24),),
+    "pairs to 6 A, long waves": (("langevin", 20, 24),),
+    "pairs to 7 A, long waves": (
+        *(("langevin", 5, step) for step in (24, 32, 48)),
+        ("langevin", 10, 32),
+        *(("split", 5, step) for step in (48, 64)),
+        *(("split", 20, step, 0) for step in (32, 64)),
+        ("langevin", 5, 24, 1, 2),
+        ("split", 5, 48, 1, 2),
+        *(("split", 20, step, 0, 2) for step in (32, 64)),
+    ),
+}
+REFERENCE = Method("plain", 5, 2)
+METHODS = {
+    label: tuple(
+        Method(
+            *given[:3], halfway=True, **dict(zip(("auxiliary", "seed"), given[3:], strict=False)), **SPLITTINGS[label]
+        )
+        for given in runs
+    )
+    for label, runs in RUNS.items()
+}
+
+
+def short_name(method: Method) -> str:
+    """Without what the splitting says."""
+    bare = water.Method(method.bath, method.friction, method.outer, auxiliary=method.auxiliary, seed=method.seed)
+    return replace(bare, halfway=method.halfway).name
+
+
+def collect(folder: Path, samples: int) -> dict[str, Any]:
+    """What the runs have shown, and the share of the stiffness that is slow, on ten frames of the reference."""
+    flat = (REFERENCE, *(method for methods in METHODS.values() for method in methods))
+    rows = {row.pop("name"): row for row in water.collect(folder, samples, flat)}
+    frames = np.load(folder / f"{REFERENCE.file}.frames.npz")["x"][100:300:20]
+    result: dict[str, Any] = {"reference": rows[REFERENCE.name] | {"name": REFERENCE.name}, "splittings": []}
+    for label, methods in METHODS.items():
+        box = water.Water(Method("langevin", 5, 16, **SPLITTINGS[label]))
+        share = slow_share(box.system, [box.motion.restore_positions(x.astype(float)) for x in frames])
+        found = [rows[m.name] | {"name": short_name(m)} for m in methods if m.name in rows]
+        result["splittings"].append({"name": label, **SPLITTINGS[label], "share": share, "water": found})
+    return result | {"environment": environment()}
+
+
+def show(result: dict[str, Any]) -> str:
+    """Averages by splitting."""
+    head, first = water.show_water({"water": [result["reference"]]}).split("\n")
+    lines = [head, first]
+    for part in result["splittings"]:
+        lines += [f"fast: {part['name']}; slow forces have {part['share']:.3f} of the stiffness"]
+        lines += water.show_water({"water": part["water"]}).split("\n")[1:]
+    return "\n".join(lines)
 
 
 def quick() -> None:
-    """Some steps on spheres."""
-    method = replace(METHODS[-1], waters=27, switch=(3.5, 4.5))
+    """Some steps."""
+    method = replace(METHODS["pairs to 6 A, long waves"][0], waters=27, switch=(3.5, 4.5))
     box = water.Water(method)
     end = run(box.system, box.start, method.outer * units.fs, 4, stepper=method.stepper())
     print(f"{method.name}: {end.step} steps, evaluations {box.system.force.evaluations}")
@@ -122,20 +170,17 @@ def main() -> None:
     parser.add_argument("--full", type=Path, metavar="FOLDER")
     parser.add_argument("--collect", type=Path, metavar="FOLDER")
     parser.add_argument("--show", type=Path, metavar="FILE")
-    parser.add_argument("--only", default="", metavar="TEXT", help="with --full: methods whose names have it")
     parser.add_argument("--hours", type=float, default=2.0, help="with --full: when to stop")
     parser.add_argument("--samples", type=int, default=1000, help="with --collect: frames for temperatures")
     given = parser.parse_args()
     if given.show:
-        print(water.show_water(json_files.read(given.show)["reach"]))
+        print(show(json_files.read(given.show)["reach"]))
     elif given.full:
-        water.full(given.full, tuple(m for m in METHODS if given.only in m.name), given.hours)
+        water.full(given.full, (REFERENCE, *(m for methods in METHODS.values() for m in methods)), given.hours)
     elif given.collect:
-        rows = water.collect(given.collect, given.samples, METHODS)
-        result = json_files.read(water.RESULT)
-        result["reach"] = {"water": rows, "environment": environment()}
+        result = json_files.read(water.RESULT) | {"reach": collect(given.collect, given.samples)}
         json_files.write(water.RESULT, result)
-        print(water.show_water(result["reach"]))
+        print(show(result["reach"]))
     else:
         quick()
 
