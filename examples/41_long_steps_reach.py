@@ -92,6 +92,7 @@ SPLITTINGS: dict[str, dict[str, Any]] = {
     "direct part to 9 A": {"switch": (7.0, 9.0), "damp": 0.35},
     "pairs to 6 A, long waves": {"switch": (4.0, 6.0), "damp": 0.4, "waves": 30},
     "pairs to 7 A, long waves": {"switch": (5.0, 7.0), "damp": 0.35, "waves": 20},
+    "pairs to 9 A, long waves": {"switch": (7.0, 9.0), "damp": 0.3, "waves": 14},
 }
 #: What is run with each: bath, friction in 1/ps, step in fs, auxiliary variables, seed; at the kicks where it says so.
 RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
@@ -107,13 +108,13 @@ RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
     "pairs to 6 A, long waves": (("langevin", 20, 24),),
     "pairs to 7 A, long waves": (
         *(("langevin", 5, step) for step in (24, 32, 48)),
-        ("langevin", 10, 32),
         *(("split", 5, step) for step in (48, 64)),
         *(("split", 20, step, 0) for step in (32, 64)),
-        ("langevin", 5, 24, 1, 2),
-        ("split", 5, 48, 1, 2),
-        *(("split", 20, step, 0, 2) for step in (32, 64)),
+        *(("langevin", 5, step, 1, 2) for step in (24, 32)),
+        *(("split", 5, step, 1, 2) for step in (48, 64)),
+        ("split", 20, 64, 0, 2),
     ),
+    "pairs to 9 A, long waves": (("langevin", 5, 32), ("langevin", 5, 64), ("split", 5, 64)),
 }
 REFERENCE = Method("plain", 5, 2)
 METHODS = {
@@ -171,7 +172,7 @@ def main() -> None:
     parser.add_argument("--collect", type=Path, metavar="FOLDER")
     parser.add_argument("--show", type=Path, metavar="FILE")
     parser.add_argument("--hours", type=float, default=2.0, help="with --full: when to stop")
-    parser.add_argument("--samples", type=int, default=1000, help="with --collect: frames for temperatures")
+    parser.add_argument("--samples", type=int, default=250, help="with --collect: frames for temperatures")
     given = parser.parse_args()
     if given.show:
         print(show(json_files.read(given.show)["reach"]))
