@@ -94,7 +94,7 @@ SPLITTINGS: dict[str, dict[str, Any]] = {
     "pairs to 7 A, long waves": {"switch": (5.0, 7.0), "damp": 0.35, "waves": 20},
     "pairs to 9 A, long waves": {"switch": (7.0, 9.0), "damp": 0.3, "waves": 14},
 }
-#: What is run with each: bath, friction in 1/ps, step in fs, auxiliary variables, seed; at the kicks where it says so.
+#: What is run with each, looked at halfway: bath, friction in 1/ps, step in fs, auxiliary variables, seed.
 RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
     "pairs to 6 A": (("langevin", 20, 24),),
     "pairs to 9 A": (("langevin", 20, 24),),
