@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from committed_pages import page, printed
 
+from kcons.thermostats import slow_share
+
 ROOT = Path(__file__).parents[2]
 RESULT = json.loads((ROOT / "docs" / "results" / "long_steps.json").read_text(encoding="utf-8"))
 SMALL = {(row["spheres"], row["auxiliary"], row["wrong"]): row for row in RESULT["small"]["runs"]}
@@ -145,14 +147,30 @@ def test_baths_cost_little():
     assert all(value <= 100 for value in RESULT["cost"]["over_constant_energy_us"].values())
 
 
+def script(name):
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    example = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    return example
+
+
+def test_long_waves_are_what_pairs_leave():
+    """Of all the stiffness: less than a twentieth is left by both, a tenth and more by damped pairs alone."""
+    example = script("41_long_steps_reach")
+    left = []
+    for waves in (0, 14):
+        method = example.Method("langevin", 5, 16, waters=64, switch=(4.0, 6.0), damp=0.4, waves=waves)
+        box = example.water.Water(method)
+        left.append(slow_share(box.system, [box.start.positions]))
+    assert left[0] > 0.1 and left[1] < 0.05
+
+
 @pytest.mark.validation
 @pytest.mark.parametrize("kind", ["split", "axes", "cluster"])
 def test_spheres_against_metropolis(kind):
     """As the example does, shorter; the wrong radius is far off."""
-    spec = importlib.util.spec_from_file_location("long_steps", ROOT / "examples" / "31_long_steps.py")
-    example = importlib.util.module_from_spec(spec)
-    sys.modules["long_steps"] = example
-    spec.loader.exec_module(example)
+    example = script("31_long_steps")
     known = example.metropolis(1000, 2000)
     for wrong in (False, True):
         found = example.small_run(kind, 1, 64, wrong, 6000)
