@@ -96,8 +96,9 @@ TABLE = {
         (
             *script("31_long_steps", "--small", "--cost"),
             *script("39_long_steps_water", "--full long-steps", "--collect long-steps", "--fresh"),
+            *script("41_long_steps_reach", "--full long-steps-reach", "--collect long-steps-reach"),
         ),
-        500,
+        620,
     ),
     "long_steps_xtb.json": Measurement((*BATHS, "ase", "comparison/averages"), script("36_xtb_steps"), 30),
     "monte_carlo.json": Measurement(

@@ -15,9 +15,10 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numba
 import numpy as np
@@ -54,10 +55,11 @@ TURN, SKIPPED, FRAME = 60.096, 12.0, 0.192
 
 
 @numba.njit(nogil=True)
-def near_forces(x, box, inner, outer, screen, coulomb, charges, sigma, epsilon):  # type: ignore[no-untyped-def]
+def near_forces(x, box, inner, outer, screen, damp, coulomb, charges, sigma, epsilon):  # type: ignore[no-untyped-def]
     """Forces of molecule pairs, switched off while oxygens part from `inner` to `outer`.
 
-    With `screen` their charges feel the reaction field of a conductor beyond `outer`.
+    With `screen` their charges feel the reaction field of a conductor beyond `outer`; with `damp`, in 1/angstrom, they
+    act as in the direct part of an Ewald sum.
     """
     n = len(x) // 3
     f = np.zeros_like(x)
@@ -88,6 +90,10 @@ def near_forces(x, box, inner, outer, screen, coulomb, charges, sigma, epsilon):
                     strength = coulomb * charges[i] * charges[j]
                     e = strength / distance
                     push = e / square
+                    if damp > 0:
+                        e *= math.erfc(damp * distance)
+                        push = e + strength * 2 * damp / math.sqrt(math.pi) * math.exp(-((damp * distance) ** 2))
+                        push /= square
                     if screen:
                         e += strength * (0.5 * square / outer**3 - 1.5 / outer)
                         push -= strength / outer**3
@@ -134,12 +140,17 @@ class Method:
     screen: bool = False
     middle: bool = False
     halfway: bool = False
+    damp: float = 0.0
+    seed: int = 1
+    waters: int = 64
+    #: What the name tells where it is unusual.
+    NAMED: ClassVar = ("inner", "order", "auxiliary", "substeps", "switch", "screen", "damp", "middle", "seed")
 
     @property
     def name(self) -> str:
         text = f"{self.bath} {self.friction:g}/ps, {self.outer:g} fs"
-        usual = Method(self.bath, self.friction, self.outer)
-        for key in ("inner", "order", "auxiliary", "substeps", "switch", "screen", "middle"):
+        usual = type(self)(self.bath, self.friction, self.outer)
+        for key in self.NAMED:
             if getattr(self, key) != getattr(usual, key):
                 text += f", {key} {getattr(self, key)}"
         return text + (", halfway" if self.halfway else "")
@@ -148,35 +159,36 @@ class Method:
     def file(self) -> str:
         return "".join(c if c.isalnum() or c in ".-" else "_" for c in self.name)
 
+    def near(self, box: float) -> Callable[[np.ndarray, float], np.ndarray]:
+        """The fast forces."""
+        given = (box, *self.switch, self.screen, self.damp, COULOMB, CHARGES, SIGMA, EPSILON)
+        return lambda x, time: near_forces(np.array(x), *given)
+
     def stepper(self) -> Stepper:
         friction = self.friction / (1000 * units.fs)
         if self.bath == "plain":
-            return Langevin(KT, friction, 1)
+            return Langevin(KT, friction, self.seed)
         steps = {"slow": 1, "fast": round(self.outer / self.inner)}
         own = {"steps": steps, "order": self.order, "substeps": self.substeps}
         own["slow_kicks"] = "middle" if self.halfway else "ends"
         if self.bath == "langevin":
-            return LangevinRespa(KT, friction, 1, **own)  # type: ignore[arg-type]
+            return LangevinRespa(KT, friction, self.seed, **own)  # type: ignore[arg-type]
         kind = BathInTheMiddle if self.middle else IsokineticSpheres
-        return kind(KT, friction, 1, spheres=self.bath, auxiliary=self.auxiliary, **own)  # type: ignore[arg-type]
+        return kind(KT, friction, self.seed, spheres=self.bath, auxiliary=self.auxiliary, **own)  # type: ignore[arg-type]
 
 
 class Water:
-    """64 rigid TIP3P waters, their forces by groups, and their energy."""
+    """Rigid TIP3P waters, their forces by groups, and their energy."""
 
-    def __init__(self, method: Method, size: int = 64) -> None:
-        scene = test_systems.build("water", size=size)
+    def __init__(self, method: Method) -> None:
+        scene = test_systems.build("water", size=method.waters)
         self.box = float(scene.cell[0])
         self.potential = scene.potential
         self.motion = scene.motion
 
-        def near(x: np.ndarray, time: float) -> np.ndarray:
-            given = (self.box, *method.switch, method.screen, COULOMB, CHARGES, SIGMA, EPSILON)
-            return near_forces(np.array(x), *given)
-
         force: Any = self.potential.forces
         if method.bath != "plain":
-            force = ForceGroups.difference(near, self.potential.forces)
+            force = ForceGroups.difference(method.near(self.box), self.potential.forces)
         self.system = System(self.motion, force)
         self.start = self.system.initial_state(
             scene.positions, thermal_velocities(self.system, scene.positions, KT, np.random.default_rng(7))
@@ -250,7 +262,7 @@ def advance(method: Method, folder: Path, turn: float = TURN) -> float:
     def look(now: State) -> None:
         if now.step != state.step:
             frames.append(now.positions.astype(np.float32))
-            energies.append(water.potential.watched_energy(now.positions) / KJ / 64)
+            energies.append(water.potential.watched_energy(now.positions) / KJ / method.waters)
 
     dt = method.outer * units.fs
     steps = round(turn * 1000 / method.outer)
@@ -339,8 +351,7 @@ def summary(method: Method, folder: Path, samples: int) -> dict[str, Any] | None
     slow = 1000 / method.outer
     turning = dipole_time(frames, gap)
     row = {
-        **{name: getattr(method, name) for name in ("bath", "friction", "outer", "inner", "order", "auxiliary")},
-        **{name: getattr(method, name) for name in ("substeps", "switch", "screen", "middle", "halfway")},
+        **asdict(method),
         "name": method.name,
         "ps": len(u) * gap,
         "energy": list(mean(u)),
@@ -355,9 +366,9 @@ def summary(method: Method, folder: Path, samples: int) -> dict[str, Any] | None
     return row
 
 
-def collect(folder: Path, samples: int) -> list[dict[str, Any]]:
+def collect(folder: Path, samples: int, methods: tuple[Method, ...] = (*METHODS, *TRIED)) -> list[dict[str, Any]]:
     """All methods, their energies beside that of the first."""
-    rows = [row for method in (*METHODS, *TRIED) if (row := summary(method, folder, samples)) is not None]
+    rows = [row for method in methods if (row := summary(method, folder, samples)) is not None]
     known = rows[0]["energy"]
     for row in rows:
         value, error = row["energy"]
@@ -375,14 +386,7 @@ def fresh() -> list[dict[str, Any]]:
     found = []
     for method in LATER:
         for seed in SEEDS:
-            water, own = Water(method), method.stepper()
-            stepper = IsokineticSpheres(
-                KT,
-                own.friction,
-                seed,
-                steps={"slow": 1, "fast": round(method.outer / method.inner)},  # type: ignore[attr-defined]
-                auxiliary=method.auxiliary,
-            )
+            water, stepper = Water(method), replace(method, seed=seed).stepper()
             energies: list[float] = []
             dt = method.outer * units.fs
             state = run(water.system, water.start, dt, round(10_000 / method.outer), stepper=stepper)
@@ -424,8 +428,8 @@ def show_water(result: dict[str, Any]) -> str:
 
 def quick() -> None:
     """Some steps, looked at halfway between slow kicks."""
-    method = Method("langevin", 5, 16, halfway=True)
-    water = Water(method, QUICK)
+    method = Method("langevin", 5, 16, halfway=True, waters=QUICK)
+    water = Water(method)
     print(method.stepper().listing())  # type: ignore[attr-defined]
     end = run(water.system, water.start, method.outer * units.fs, 25, stepper=method.stepper())
     energy = water.potential.watched_energy(end.positions) / KJ / QUICK

@@ -7,6 +7,7 @@
 - `monte_carlo`: without any error of the time step
 - `multistep`: several time steps, and isokinetic spheres
 - `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
+- `slow_share`: the stiffness that slow forces carry
 """
 
 from kcons.thermostats.configurational_temperature import (
@@ -39,6 +40,7 @@ from kcons.thermostats.pressure import (
     find_pieces,
     instantaneous_pressure,
 )
+from kcons.thermostats.slow_share import slow_share
 from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
@@ -72,6 +74,7 @@ __all__ = [
     "freedom",
     "instantaneous_pressure",
     "mean",
+    "slow_share",
     "thermal_velocities",
     "tune",
 ]

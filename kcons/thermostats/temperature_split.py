@@ -259,22 +259,9 @@ class TemperatureSplit:
         NonFiniteError
             Forces that are not finite.
         """
-        system, shape = self._system, (self._system.n_atoms, 3)
-        x = as_array(positions, shape, "positions")
-        bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
-        if len(bad):
-            raise InputError(f"positions of atom {bad[0]} are not finite; leave this frame out", atoms=[int(bad[0])])
-        held = system.motion.constraint_set
-        miss = np.abs(held.value(x, 0.0)) / held.scale
-        if not np.all(miss <= OFF):
-            row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss)))
-            raise InputError(
-                f"positions are off row {held.row_name(row)} by {miss[row]:.3g} of its size; bring them onto the "
-                "constraints with Motion.restore_positions",
-                item="positions",
-                atoms=held.row_atoms(row),
-            )
-        f = self._forces(x) if forces is None else as_array(forces, shape, "forces")
+        system = self._system
+        x = configuration(system, positions)
+        f = self._forces(x) if forces is None else as_array(forces, x.shape, "forces")
         check_finite(f, "force", len(self._series))
         if self._clusters is None:
             self._begin(x)
@@ -338,7 +325,7 @@ class TemperatureSplit:
         moving = system.inverse_masses[:, 0] > 0
         if not moving.any():
             raise InputError("all atoms are fixed: nothing has a temperature", item="atoms")
-        move = self._displacement or MOVE * _spacing(x)
+        move = self._displacement or MOVE * spacing(x)
         self._flight = move / math.sqrt(3.0 * float(system.inverse_masses[moving].mean()))
         clusters = Clusters(system.motion, x, moving)
         first = np.full(clusters.count, system.n_atoms)
@@ -432,6 +419,31 @@ class TemperatureSplit:
         return notes
 
 
+def configuration(system: System, positions: ArrayLike) -> FloatArray:
+    """Positions that are on the constraints.
+
+    Raises
+    ------
+    InputError
+        Another shape, NaN or infinity; off the constraints.
+    """
+    x = as_array(positions, (system.n_atoms, 3), "positions")
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if len(bad):
+        raise InputError(f"positions of atom {bad[0]} are not finite; leave this frame out", atoms=[int(bad[0])])
+    held = system.motion.constraint_set
+    miss = np.abs(held.value(x, 0.0)) / held.scale
+    if not np.all(miss <= OFF):
+        row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss)))
+        raise InputError(
+            f"positions are off row {held.row_name(row)} by {miss[row]:.3g} of its size; bring them onto the "
+            "constraints with Motion.restore_positions",
+            item="positions",
+            atoms=held.row_atoms(row),
+        )
+    return x
+
+
 def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:
     """Arms after a turn by h spin (Rodrigues)."""
     angle = h * np.sqrt((spin * spin).sum(axis=1))[:, None]
@@ -441,7 +453,7 @@ def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:
     return np.asarray(arms + sine * across + versed * np.cross(spin, across))
 
 
-def _spacing(x: FloatArray) -> float:
+def spacing(x: FloatArray) -> float:
     """Distance from an atom to the next, the median."""
     from scipy.spatial import cKDTree
 

@@ -686,6 +686,18 @@ MUTANTS = [
         "tests/thermostats/test_temperature_split.py::test_frames_off_the_constraints",
     ),
     (
+        "thermostats/slow_share.py",
+        "paced(system, point.x, f, 0.0)",
+        "f * system.weights",
+        "tests/thermostats/test_slow_share.py::test_a_rigid_pair_turns_freely_in_a_trap",
+    ),
+    (
+        "thermostats/slow_share.py",
+        "np.array([name == group, True])",
+        "np.array([name == group, name != group])",
+        "tests/thermostats/test_slow_share.py::test_springs_of_free_atoms",
+    ),
+    (
         "constraints/arguments.py",
         'if array.dtype.kind == "c":',
         "if False:",

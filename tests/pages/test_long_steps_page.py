@@ -6,21 +6,27 @@ import importlib.util
 import json
 import math
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from committed_pages import page, printed
 
+from kcons.thermostats import slow_share
+
 ROOT = Path(__file__).parents[2]
 RESULT = json.loads((ROOT / "docs" / "results" / "long_steps.json").read_text(encoding="utf-8"))
 SMALL = {(row["spheres"], row["auxiliary"], row["wrong"]): row for row in RESULT["small"]["runs"]}
 WATER = {row["name"]: row for row in RESULT["water"]}
+REACH = {part["name"]: part for part in RESULT["reach"]["splittings"]}
+FAR = {row["name"]: row for row in REACH["pairs to 7 A, long waves"]["water"]}
 
 
 def test_page_shows_the_committed_results():
     small, cost = printed("31_long_steps.py", "long_steps.json").split("\n\n")
     for part in (small, cost, *printed("39_long_steps_water.py", "long_steps.json").split("\n\n")):
         assert part in page("long_steps.md")
+    assert printed("41_long_steps_reach.py", "long_steps.json") in page("long_steps.md")
 
 
 @pytest.mark.parametrize("key", [key for key in SMALL if not key[2]], ids=lambda key: f"{key[0]} {key[1]}")
@@ -83,19 +89,88 @@ def test_halfway_between_slow_kicks_langevin_is_right_at_16_fs():
     assert known["slow_per_turning"] >= 8 * row["slow_per_turning"]
 
 
+def test_the_share_of_the_stiffness_foretells_how_hot_turns_are():
+    """At 24 fs and 20/ps, halfway; the direct part of an Ewald sum, whose slow rest is as stiff as any, explodes."""
+    found = {}
+    for name, part in REACH.items():
+        row = next((row for row in part["water"] if row["name"] == "langevin 20/ps, 24 fs, halfway"), None)
+        if row is not None:
+            found[name] = (part["share"], row["turn"], row["bias"])
+    share, turn, bias = found.pop("direct part to 9 A")
+    assert share > 0.1 and turn[0] > 2 and bias[0] > 10
+    assert len(found) == 4
+    ordered = sorted(found.values())
+    assert all(softer[1][0] < stiffer[1][0] for softer, stiffer in pairwise(ordered))
+    assert ordered[1][1][0] - ordered[0][1][0] > 2 * math.hypot(ordered[1][1][1], ordered[0][1][1])
+    assert ordered[0][0] < 0.03 and abs(ordered[0][1][0] - 1) <= 0.02
+    assert ordered[-1][0] > 0.1 and ordered[-1][1][0] > 1.3
+
+
+def pooled(name, key):
+    """The mean of both seeds and its error."""
+    first, second = (FAR[f"{name}{seed}, halfway"][key] for seed in ("", ", seed 2"))
+    return (first[0] + second[0]) / 2, math.hypot(first[1], second[1]) / 2
+
+
+@pytest.mark.parametrize(
+    ("name", "energy", "turn"),
+    [
+        ("langevin 5/ps, 24 fs", 0.3, 0.015),
+        ("split 5/ps, 48 fs", 0.3, 0.03),
+        ("split 5/ps, 64 fs", 0.5, 0.04),
+        ("split 20/ps, 64 fs, auxiliary 0", 0.3, 0.03),
+    ],
+)
+def test_with_long_waves_inside(name, energy, turn):
+    """Bias of the energy in percent, and of the temperature of turns, of two seeds."""
+    value, error = pooled(name, "bias")
+    assert abs(value) <= energy and error <= 0.25
+    value, error = pooled(name, "turn")
+    assert abs(value - 1) <= turn and error <= 0.01
+
+
+def test_spheres_at_32_fs_are_right_with_long_waves_inside():
+    """The energy to 0.5 %, both temperatures to 1 %."""
+    row = FAR["split 20/ps, 32 fs, auxiliary 0, halfway"]
+    assert abs(row["bias"][0]) <= 0.5 and max(abs(row[kind][0] - 1) for kind in ("shift", "turn")) <= 0.01
+
+
+def test_what_spheres_gain_with_long_waves_inside():
+    """Slow evaluations while a dipole turns, where turns are equally hot: half as many again for Langevin dynamics."""
+    spheres, langevin = FAR["split 5/ps, 64 fs, halfway"], FAR["langevin 5/ps, 32 fs, halfway"]
+    assert abs(spheres["turn"][0] - langevin["turn"][0]) <= 2 * math.hypot(spheres["turn"][1], langevin["turn"][1])
+    assert langevin["slow_per_turning"] >= 1.5 * spheres["slow_per_turning"]
+
+
 def test_baths_cost_little():
     """At most a tenth of a step with forces of 1 ms."""
     assert all(value <= 100 for value in RESULT["cost"]["over_constant_energy_us"].values())
+
+
+def script(name):
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    example = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    return example
+
+
+def test_long_waves_are_what_pairs_leave():
+    """Of all the stiffness: less than a twentieth is left by both, a tenth and more by damped pairs alone."""
+    example = script("41_long_steps_reach")
+    left = []
+    for waves in (0, 14):
+        method = example.Method("langevin", 5, 16, waters=64, switch=(4.0, 6.0), damp=0.4, waves=waves)
+        box = example.water.Water(method)
+        left.append(slow_share(box.system, [box.start.positions]))
+    assert left[0] > 0.1 and left[1] < 0.05
 
 
 @pytest.mark.validation
 @pytest.mark.parametrize("kind", ["split", "axes", "cluster"])
 def test_spheres_against_metropolis(kind):
     """As the example does, shorter; the wrong radius is far off."""
-    spec = importlib.util.spec_from_file_location("long_steps", ROOT / "examples" / "31_long_steps.py")
-    example = importlib.util.module_from_spec(spec)
-    sys.modules["long_steps"] = example
-    spec.loader.exec_module(example)
+    example = script("31_long_steps")
     known = example.metropolis(1000, 2000)
     for wrong in (False, True):
         found = example.small_run(kind, 1, 64, wrong, 6000)

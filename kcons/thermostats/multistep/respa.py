@@ -37,8 +37,9 @@ class LangevinRespa(Langevin):
 
     Each group of forces kicks at the ends of its own step, and the fastest one moves the atoms by geodesic BAOAB, with
     friction and noise in the middle of each of its steps. Slow forces in steps of half a period of the fastest motion,
-    or of its multiples, drive it (resonance): with bonds to hydrogen or whole molecules held, 8 to 16 fs are safe, and
-    more fail. `IsokineticSpheres` takes longer steps.
+    or of its multiples, drive it (resonance), by the share of its stiffness that they have (`slow_share`): with bonds
+    to hydrogen or whole molecules held and near pairs as fast forces, 8 to 16 fs are safe. `IsokineticSpheres` takes
+    longer steps.
 
     Parameters
     ----------

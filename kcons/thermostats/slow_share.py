@@ -1,0 +1,88 @@
+"""What share of the stiffness slow forces carry, by which a splitting is judged before any run with long steps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.arguments import generator_of, numbers, positive, refuse_other
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import System
+from kcons.steppers.stages.compensated_steps import Point, check_finite
+from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.multistep import ForceGroups
+from kcons.thermostats.temperature_split import configuration, spacing
+from kcons.thermostats.thermal_velocities import thermal_velocities
+
+#: Typical move for a difference, as a share of the distance to the next atom.
+REACH = 0.03
+
+
+def slow_share(
+    system: System, frames: ArrayLike, group: str = "slow", *, seed: int = 0, displacement: float | None = None
+) -> float:
+    """Share of the stiffness that one group of forces carries along the constraints, root mean square.
+
+    With the second derivatives H of an energy along the constraints in the metric of the masses, the square root of
+    <tr H_slow^2>/<tr H^2>: fast motions count most, and no signs cancel. Kicks of slow forces drive fast motions by
+    about this share; of two splittings the one with the smaller share bears longer steps.
+
+    Parameters
+    ----------
+    system : System
+        Its forces are `ForceGroups`.
+    frames : array_like, shape (n_frames, n_atoms, 3)
+        Configurations on the constraints: ten of a short run for large systems, more for small ones.
+    group : str
+        The slow forces.
+    seed : int
+        Of the random moves, one a frame, which costs two evaluations of every group.
+    displacement : float, optional
+        Typical move of an atom for differences of forces; 0.03 of the distance to the next atom by default, as in a
+        small step, so that jumps of forces at a cutoff count little.
+
+    Raises
+    ------
+    UnsupportedError
+        Targets move, rows hold velocities, or forces come in no groups.
+    InputError
+        No such group; no frames, or of another shape, or off the constraints; a displacement that is not positive;
+        forces that do not change with the positions.
+    NonFiniteError
+        Forces that are not finite.
+    """
+    refuse_other(system, System, "system", "a kcons.steppers.System")
+    if system.motion.plan.driven or not system.motion.constraint_set.holonomic.all():
+        raise UnsupportedError("slow_share needs targets that rest and rows that hold positions; leave the others out")
+    force = system.force
+    if not isinstance(force, ForceGroups):
+        raise UnsupportedError("the System has no groups of forces; make it with System(motion, ForceGroups({...}))")
+    if group not in force.groups:
+        raise InputError(f"there is no group {group!r} of forces; there are {', '.join(force.groups)}", item="group")
+    x = numbers(frames, "frames")
+    if x.ndim != 3 or not len(x):
+        raise InputError(f"frames have shape {x.shape}; give (n_frames, n_atoms, 3)", item="frames")
+    rng = generator_of(seed, "seed")
+    slow, whole, flight = 0.0, 0.0, 0.0
+    for number, frame in enumerate(x):
+        here = configuration(system, frame)
+        if not flight:
+            move = REACH * spacing(here) if displacement is None else positive(displacement, "displacement")
+            flight = move / math.sqrt(3.0 * float(system.inverse_masses.mean()))
+        v = thermal_velocities(system, here, 1.0, rng)
+        changes = np.zeros((2, *here.shape))
+        for way in (flight, -flight):
+            point = Point(here, v, system.weights, exact=False)
+            system.drift.move(point, np.empty_like(here), 0.0, 0.0, way)
+            for name in force.groups:
+                f = system.accepted(force.of(name, point.x, 0.0), number, True)
+                check_finite(f, "force", number)
+                pace = math.copysign(1.0, way) * paced(system, point.x, f, 0.0)
+                changes += np.array([name == group, True])[:, None, None] * pace
+        squares = [system.motion.project_velocities(here, c) ** 2 * system.masses[:, None] for c in changes]
+        slow, whole = slow + float(squares[0].sum()), whole + float(squares[1].sum())
+    if not whole > 0:
+        raise InputError("the forces do not change with the positions: nothing is stiff", item="forces")
+    return math.sqrt(slow / whole)

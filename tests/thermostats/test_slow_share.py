@@ -1,0 +1,82 @@
+"""The share of slow forces in the stiffness: closed forms, and what must not count."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from thermostat_systems import dumbbells, system
+
+from kcons.constraints import Distance
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import System
+from kcons.thermostats import ForceGroups, slow_share
+
+K = 3.0
+
+
+def grouped(rows, x, masses, **forces) -> System:
+    return system(rows, x, masses, ForceGroups(forces))
+
+
+def test_springs_of_free_atoms():
+    """k/m of each: 9 and 1 in the squares of H, whose traces are 3 (81 + 1) and 3; normal moves of many frames."""
+    x = np.array([[0.0, 0, 0], [5.0, 0, 0]])
+    fast, slow = np.array([[9.0], [0.0]]), np.array([[0.0], [4.0]])
+    held = grouped([], x, [1.0, 4.0], fast=lambda x, t: -fast * x, slow=lambda x, t: -slow * x)
+    share = slow_share(held, np.tile(x, (4000, 1, 1)))
+    assert share == pytest.approx(np.sqrt(1 / 82), rel=0.05)
+    other = slow_share(held, np.tile(x, (4000, 1, 1)), "fast")
+    assert share**2 + other**2 == pytest.approx(1, rel=1e-6)
+
+
+def test_signs_do_not_cancel():
+    """A saddle without a trace, beside a trap of the same size."""
+    saddle = np.diag([1.0, 1.0, -2.0])
+    held = grouped([], [[1.0, 2, 3]], [1.0], fast=lambda x, t: -x - x @ saddle, slow=lambda x, t: x @ saddle)
+    frames = np.tile([[1.0, 2, 3]], (4000, 1, 1))
+    assert slow_share(held, frames, displacement=0.01) == pytest.approx(np.sqrt(2), rel=0.05)
+
+
+def test_a_rigid_pair_turns_freely_in_a_trap():
+    """All of the stiffness is that of its centre; what pulls along the pair does nothing, wherever it has turned to."""
+    x = np.array([[0.3, -0.2, 0.1], [0.3, -0.2, 1.5]])
+
+    def along(x, t):
+        d = x[1] - x[0]
+        return 50 * np.array([d, -d])
+
+    def held(**more):
+        return grouped([Distance([[0, 1]])], x, [2.0, 2.0], fast=lambda x, t: -K * x, **more)
+
+    frames = np.tile(x, (20, 1, 1))
+    assert slow_share(held(slow=along), frames, displacement=1e-3) < 1e-6
+    assert slow_share(held(slow=lambda x, t: -2 * K * x), frames) == pytest.approx(2 / 3, rel=1e-6)
+
+
+def test_bad_input():
+    held, x = dumbbells(2, force=ForceGroups({"fast": lambda x, t: -x, "slow": lambda x, t: -2 * x}))
+    off = x.copy()
+    off[3] += 0.01 * (x[3] - x[2])
+    for given, match in (
+        ((held, [x], "medium"), "no group 'medium' of forces; there are fast, slow"),
+        ((held, x), r"frames have shape \(4, 3\); give \(n_frames"),
+        ((held, np.zeros((0, 4, 3))), r"frames have shape \(0, 4, 3\)"),
+        ((held, [x, off]), "off row #1 .* Motion.restore_positions"),
+        ((held, [x[:3]]), "positions"),
+    ):
+        with pytest.raises(InputError, match=match):
+            slow_share(*given)
+    with pytest.raises(InputError, match="displacement"):
+        slow_share(held, [x], displacement=0.0)
+    with pytest.raises(UnsupportedError, match="no groups of forces"):
+        slow_share(dumbbells(2)[0], [x])
+    constant = ForceGroups({"fast": lambda x, t: np.ones_like(x), "slow": lambda x, t: np.ones_like(x) / 2})
+    with pytest.raises(InputError, match="nothing is stiff"):
+        slow_share(system([], x, np.ones(4), constant), [x])
+    with pytest.raises(InputError, match=r"must return \(4, 3\)"):
+        slow_share(dumbbells(2, force=ForceGroups({"slow": lambda x, t: np.zeros((1, 3))}))[0], [x])
+    with pytest.raises(NonFiniteError):
+        slow_share(dumbbells(2, force=ForceGroups({"slow": lambda x, t: x * np.nan}))[0], [x])
+    moving = [Distance([[0, 1]], lambda t: np.array([1.0 + t]))]
+    with pytest.raises(UnsupportedError, match="targets that rest"):
+        slow_share(grouped(moving, [[0.0, 0, 0], [1.0, 0, 0]], [1.0, 1.0], slow=lambda x, t: -x), np.zeros((1, 2, 3)))
