@@ -94,7 +94,7 @@ SPLITTINGS: dict[str, dict[str, Any]] = {
     "pairs to 7 A, long waves": {"switch": (5.0, 7.0), "damp": 0.35, "waves": 20},
     "pairs to 9 A, long waves": {"switch": (7.0, 9.0), "damp": 0.3, "waves": 14},
 }
-#: What is run with each, looked at halfway: bath, friction in 1/ps, step in fs, auxiliary variables, seed.
+#: What is run with each, looked at halfway: bath, friction in 1/ps, step in fs, auxiliary variables, seed, inner step.
 RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
     "pairs to 6 A": (("langevin", 20, 24),),
     "pairs to 9 A": (("langevin", 20, 24),),
@@ -114,14 +114,25 @@ RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
         *(("langevin", 5, step, 1, 2) for step in (24, 32)),
         *(("split", 5, step, 1, 2) for step in (48, 64)),
         ("split", 20, 64, 0, 2),
+        *(("langevin", 5, step, 1, 1, 2) for step in (24, 32)),
+        *(("split", 5, step, 1, 1, 2) for step in (32, 48, 64)),
     ),
-    "pairs to 9 A, long waves": (("langevin", 5, 32), ("langevin", 5, 64), ("split", 5, 64)),
+    "pairs to 9 A, long waves": (
+        ("langevin", 5, 32),
+        ("langevin", 5, 64),
+        ("split", 5, 64),
+        ("langevin", 5, 64, 1, 1, 2),
+        ("split", 5, 64, 1, 1, 2),
+    ),
 }
 REFERENCE = Method("plain", 5, 2)
 METHODS = {
     label: tuple(
         Method(
-            *given[:3], halfway=True, **dict(zip(("auxiliary", "seed"), given[3:], strict=False)), **SPLITTINGS[label]
+            *given[:3],
+            halfway=True,
+            **dict(zip(("auxiliary", "seed", "inner"), given[3:], strict=False)),
+            **SPLITTINGS[label],
         )
         for given in runs
     )
@@ -132,7 +143,7 @@ METHODS = {
 def short_name(method: Method) -> str:
     """Without what the splitting says."""
     bare = water.Method(method.bath, method.friction, method.outer, auxiliary=method.auxiliary, seed=method.seed)
-    return replace(bare, halfway=method.halfway).name
+    return replace(bare, halfway=method.halfway, inner=method.inner).name
 
 
 def collect(folder: Path, samples: int) -> dict[str, Any]:
