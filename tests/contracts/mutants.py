@@ -26,7 +26,7 @@ MUTANTS = [
     ),
     (
         "solvers/general_clusters.py",
-        '(np.einsum("nkc,nkc->nk", b, b0) > 0)',
+        '(np.einsum("nkc,nkc->nk", b, b0) > least)',
         '(np.einsum("nkc,nkc->nk", b, b0) > -np.inf)',
         "tests/solvers/test_general_clusters.py::test_the_other_side_is_no_solution",
     ),
@@ -173,6 +173,12 @@ MUTANTS = [
         "put(solution, k, last + 0.5 * (lam - last))",
         "put(solution, k, lam)",
         "tests/solvers/test_single_rows.py::test_steps_that_overshoot_are_halved",
+    ),
+    (
+        "solvers/single_rows.py",
+        "slope < FLAT * size",
+        "slope < 0.0 * size",
+        "tests/solvers/test_single_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",
     ),
     (
         "constraints/functions/expressions.py",
