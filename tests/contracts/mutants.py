@@ -32,6 +32,12 @@ MUTANTS = [
     ),
     (
         "solvers/general_clusters.py",
+        "taken += ~done",
+        "taken += 1",
+        "tests/solvers/test_general_clusters.py::test_what_many_iterations_ask_for_is_asked_of_the_clusters_that_took_them",
+    ),
+    (
+        "solvers/general_clusters.py",
         'wanted = wanted - np.einsum("nkc,nc->nk", gradient,',
         'wanted = wanted + np.einsum("nkc,nc->nk", gradient,',
         "tests/solvers/test_general_clusters.py::test_atoms_of_infinite_mass_move_as_prescribed",
