@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
+from kcons.ase.topology import require_atoms
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
@@ -53,6 +54,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
+        require_atoms(atoms)
         self.barostat = None if barostat is None else require_barostat(barostat)
         if restart is not None:
             if "state" in kwargs:
@@ -354,6 +356,7 @@ def draw_velocities(
     UnsupportedError
         `zero_momentum` where atoms are held in space.
     """
+    require_atoms(atoms)
     thermal = units.kB * positive(temperature_K, "temperature_K")
     momenta = atoms.get_momenta()
     try:

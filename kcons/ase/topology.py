@@ -21,13 +21,14 @@ from kcons.topology.topology import (
     Snapshot,
     Topology,
     elements_of,
+    require_kind,
     selected_numbers,
     sorted_pairs,
     split_residues,
     whole_numbers,
 )
 
-__all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "named_rows", "snapshot_of"]
+__all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "named_rows", "require_atoms", "snapshot_of"]
 
 #: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
 BONDS = "bonds"
@@ -49,8 +50,9 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     atoms : ase.Atoms
     **options
     """
+    snapshot = snapshot_of(atoms)
     numbers = partial(selected_numbers, n=len(atoms))
-    return rows_of(snapshot_of(atoms), Holding(constrain, **options), numbers, _REMEDY)
+    return rows_of(snapshot, Holding(constrain, **options), numbers, _REMEDY)
 
 
 def named_rows(atoms: Atoms, name: str) -> HeldRows:
@@ -58,6 +60,16 @@ def named_rows(atoms: Atoms, name: str) -> HeldRows:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"\d+ bonds were guessed")
         return constraints_of(atoms, name)
+
+
+def require_atoms(atoms: object) -> None:
+    """Refuse anything else, such as the list that ``ase.io.read`` gives of several frames.
+
+    Raises
+    ------
+    InputError
+    """
+    require_kind(atoms, Atoms, "atoms", "an ase.Atoms object, as ase.io.read(file) gives it")
 
 
 def snapshot_of(atoms: Atoms) -> Snapshot:
@@ -69,8 +81,9 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     Raises
     ------
     InputError
-        Bonds that name atoms which do not exist.
+        No `Atoms`; bonds that name atoms which do not exist.
     """
+    require_atoms(atoms)
     n = len(atoms)
     arrays = atoms.arrays
     symbols = np.array(chemical_symbols)[atoms.numbers]

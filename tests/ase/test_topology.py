@@ -9,7 +9,13 @@ import pytest
 from ase import Atoms
 from ase.build import molecule
 
-from kcons.ase import constrain, constraints_of
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    constrain,
+    constraints_of,
+    draw_velocities,
+)
 from kcons.ase.topology import atoms_of, bonds_of, mend_elements, snapshot_of
 from kcons.errors import InputError
 
@@ -29,6 +35,24 @@ def test_bonds_are_guessed_where_none_are_given():
     atoms.info["bonds"] = [[0, 2]]
     assert bonds_of(atoms).tolist() == [[0, 2]]
     assert bonds_of(Atoms("X2", positions=[[0, 0, 0], [1, 0, 0]])).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        constraints_of,
+        lambda atoms: constrain(atoms, "hbonds"),
+        lambda atoms: constrain(atoms, []),
+        lambda atoms: ConstrainedDynamics(atoms, 1.0),
+        lambda atoms: ConstrainedLangevin(atoms, 1.0, temperature_K=300, friction=0.01),
+        lambda atoms: draw_velocities(atoms, temperature_K=300),
+    ],
+    ids=["constraints_of", "by name", "rows", "dynamics", "thermostat", "velocities"],
+)
+def test_a_list_of_frames_is_no_atoms(call):
+    with pytest.raises(InputError, match=r"atoms must be an ase.Atoms .* not list; of several, give one") as caught:
+        call([molecule("H2O")])
+    assert caught.value.item == "atoms"
 
 
 def test_atoms_without_a_place_have_no_bonds():

@@ -886,6 +886,12 @@ MUTANTS = [
         "FLAT = 0.0",
         "tests/solvers/sparse/test_mixed_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",
     ),
+    (
+        "topology/topology.py",
+        "if not isinstance(given, kind):",
+        "if given is None:",
+        "tests/openmm/test_topology.py::test_what_is_no_topology_is_refused",
+    ),
     # -- studies: what is kept, and what is shown --
     (
         "comparison/study/study.py",
