@@ -29,7 +29,7 @@ from kcons.ase.binding import (
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
-from kcons.ase.topology import require_atoms
+from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
@@ -178,11 +178,11 @@ class ConstrainedDynamics(MolecularDynamics):
     def get_temperature(self) -> float:
         """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
         freedom = self.degrees_of_freedom
-        return 2 * self.atoms.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
+        return 2 * kinetic_energy_of(self.atoms) / (freedom * units.kB) if freedom else 0.0
 
     def applied_forces(self) -> FloatArray:
         """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""
-        return self._systems().resisted(applied_forces(self.atoms), self.atoms.get_velocities())
+        return self._systems().resisted(applied_forces(self.atoms), velocities_of(self.atoms))
 
     def todict(self) -> dict[str, Any]:
         """As ASE stores it in trajectories."""

@@ -892,6 +892,12 @@ MUTANTS = [
         "if given is None:",
         "tests/openmm/test_topology.py::test_what_is_no_topology_is_refused",
     ),
+    (
+        "ase/topology.py",
+        "where=(masses != 0.0) | (momenta != 0.0)",
+        "where=masses != -1.0",
+        "tests/ase/test_logger.py::test_a_fixed_atom_needs_no_mass",
+    ),
     # -- studies: what is kept, and what is shown --
     (
         "comparison/study/study.py",
