@@ -898,6 +898,12 @@ MUTANTS = [
         "where=masses != -1.0",
         "tests/ase/test_logger.py::test_a_fixed_atom_needs_no_mass",
     ),
+    (
+        "openmm/collective/context_rows.py",
+        "self._clock == 0.0",
+        "self._clock >= 0.0",
+        "tests/openmm/collective/test_clock.py::test_a_state_of_another_program_has_no_time_of_targets",
+    ),
     # -- studies: what is kept, and what is shown --
     (
         "comparison/study/study.py",
