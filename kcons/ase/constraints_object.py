@@ -17,7 +17,7 @@ from kcons.ase.binding import Binding, applied_forces, bind, check_company, touc
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface, warn_of_displacements
-from kcons.ase.topology import BONDS, bonds_of, named_rows
+from kcons.ase.topology import BONDS, bonds_of, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_form
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
@@ -332,7 +332,7 @@ class Constraints(FixConstraint):
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
-        velocities = atoms.get_velocities() if "momenta" in atoms.arrays else None
+        velocities = velocities_of(atoms) if "momenta" in atoms.arrays else None
         return self.engine(atoms).report(atoms.arrays["positions"], velocities)
 
 
@@ -417,6 +417,7 @@ def constrain(
     UnsupportedError
         Another ASE constraint acts on the same atoms.
     """
+    require_atoms(atoms)
     named = None
     if isinstance(constraints, str):
         constraints = named = named_rows(atoms, constraints)

@@ -29,6 +29,7 @@ from kcons.ase.binding import (
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
+from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
@@ -116,14 +117,14 @@ class ConstrainedDynamics(MolecularDynamics):
         friction: ArrayLike = 0.0,
         **kwargs: Any,
     ) -> None:
+        require_atoms(atoms)
         _check_timestep(timestep)
         self._check_every, self._spare = checked_every(check_every)
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         self.time = float(time)
-        self._degenerate = degenerate
-        self._friction = friction
+        self._degenerate, self._friction = degenerate, friction
         self._more = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
         self._present: tuple[Any, ...] | None = None
         self._bound: Binding | None = None
@@ -177,11 +178,11 @@ class ConstrainedDynamics(MolecularDynamics):
     def get_temperature(self) -> float:
         """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
         freedom = self.degrees_of_freedom
-        return 2 * self.atoms.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
+        return 2 * kinetic_energy_of(self.atoms) / (freedom * units.kB) if freedom else 0.0
 
     def applied_forces(self) -> FloatArray:
         """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""
-        return self._systems().resisted(applied_forces(self.atoms), self.atoms.get_velocities())
+        return self._systems().resisted(applied_forces(self.atoms), velocities_of(self.atoms))
 
     def todict(self) -> dict[str, Any]:
         """As ASE stores it in trajectories."""

@@ -7,9 +7,11 @@ from typing import IO, Any
 
 from ase import Atoms, units
 from ase.md.logger import MDLogger
+from ase.stress import full_3x3_to_voigt_6_stress
 
 from kcons.ase.binding import applied_forces
 from kcons.ase.constraints_object import Constraints
+from kcons.ase.topology import kinetic_energy_of, velocities_of
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import rows_like
 from kcons.errors import InputError
@@ -73,15 +75,20 @@ class ConstraintLogger(MDLogger):
         atoms: Atoms = self.atoms
         dyn: Any = self.dyn
         count = len(atoms) if self.peratom else 1
-        potential, kinetic = atoms.get_potential_energy() / count, atoms.get_kinetic_energy() / count
+        whole = kinetic_energy_of(atoms)
+        potential, kinetic = atoms.get_potential_energy() / count, whole / count
         row = [] if dyn is None else [dyn.get_time() / (1000 * units.fs)]
         row += [potential + kinetic, potential, kinetic]
-        row.append(dyn.get_temperature() if hasattr(dyn, "degrees_of_freedom") else atoms.get_temperature())
+        if hasattr(dyn, "degrees_of_freedom"):
+            row.append(dyn.get_temperature())
+        else:
+            row.append(2 * whole / (atoms.get_number_of_degrees_of_freedom() * units.kB))
         if self.stress:
-            row += (atoms.get_stress(include_ideal_gas=True) / units.GPa).tolist()
+            gas = atoms.get_momenta().T @ velocities_of(atoms) / atoms.get_volume()
+            row += ((atoms.get_stress() - full_3x3_to_voigt_6_stress(gas)) / units.GPa).tolist()
         if self.coordinates:
             motion = _motion(dyn, atoms)
-            x, v = atoms.positions, atoms.get_velocities()
+            x, v = atoms.positions, velocities_of(atoms)
             f = dyn.applied_forces() if hasattr(dyn, "motion") else applied_forces(atoms)
             time = 0.0 if dyn is None else dyn.get_time()
             row += motion.multipliers(x, v, f, time)[self._rows(motion)].tolist()

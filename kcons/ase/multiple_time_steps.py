@@ -11,6 +11,7 @@ from ase.calculators.mixing import SumCalculator
 
 from kcons.ase.binding import FORCES_ONLY, in_step
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
+from kcons.ase.topology import kinetic_energy_of
 from kcons.constraints.arguments import numbers, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
@@ -177,7 +178,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         if not isinstance(stepper, IsokineticSpheres):
             return super().get_temperature()
         expected = stepper.kinetic_energy(self._systems(), self.atoms.positions)
-        return float(self.atoms.get_kinetic_energy() / expected * stepper.thermal_energy / units.kB)
+        return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
 
     def get_conserved_energy(self) -> float:
         """Total energy less the heat in eV, for Langevin dynamics.

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
+from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
@@ -53,6 +54,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
+        require_atoms(atoms)
         self.barostat = None if barostat is None else require_barostat(barostat)
         if restart is not None:
             if "state" in kwargs:
@@ -119,7 +121,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
     def get_temperature(self) -> float:
         """Kinetic temperature in K by the degrees of freedom that the thermostat acts on."""
         count = self.thermostat_degrees_of_freedom
-        return 2 * self.atoms.get_kinetic_energy() / (count * units.kB) if count else 0.0
+        return 2 * kinetic_energy_of(self.atoms) / (count * units.kB) if count else 0.0
 
     def get_conserved_energy(self) -> float:
         """The quantity in eV that the exact motion conserves, where targets rest; see the thermostat in the core."""
@@ -354,6 +356,7 @@ def draw_velocities(
     UnsupportedError
         `zero_momentum` where atoms are held in space.
     """
+    require_atoms(atoms)
     thermal = units.kB * positive(temperature_K, "temperature_K")
     momenta = atoms.get_momenta()
     try:

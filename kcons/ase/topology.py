@@ -12,6 +12,7 @@ from ase.data import atomic_masses, atomic_numbers, chemical_symbols
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.holding import Holding, Options, with_options
@@ -21,13 +22,24 @@ from kcons.topology.topology import (
     Snapshot,
     Topology,
     elements_of,
+    require_kind,
     selected_numbers,
     sorted_pairs,
     split_residues,
     whole_numbers,
 )
 
-__all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "named_rows", "snapshot_of"]
+__all__ = [
+    "atoms_of",
+    "bonds_of",
+    "constraints_of",
+    "kinetic_energy_of",
+    "mend_elements",
+    "named_rows",
+    "require_atoms",
+    "snapshot_of",
+    "velocities_of",
+]
 
 #: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
 BONDS = "bonds"
@@ -49,8 +61,9 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     atoms : ase.Atoms
     **options
     """
+    snapshot = snapshot_of(atoms)
     numbers = partial(selected_numbers, n=len(atoms))
-    return rows_of(snapshot_of(atoms), Holding(constrain, **options), numbers, _REMEDY)
+    return rows_of(snapshot, Holding(constrain, **options), numbers, _REMEDY)
 
 
 def named_rows(atoms: Atoms, name: str) -> HeldRows:
@@ -58,6 +71,27 @@ def named_rows(atoms: Atoms, name: str) -> HeldRows:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"\d+ bonds were guessed")
         return constraints_of(atoms, name)
+
+
+def require_atoms(atoms: object) -> None:
+    """Refuse anything else, such as the list that ``ase.io.read`` gives of several frames.
+
+    Raises
+    ------
+    InputError
+    """
+    require_kind(atoms, Atoms, "atoms", "an ase.Atoms object, as ase.io.read(file) gives it")
+
+
+def velocities_of(atoms: Atoms) -> FloatArray:
+    """As ``atoms.get_velocities()``, but 0 for fixed atoms without mass, where ASE divides 0 by 0."""
+    momenta, masses = atoms.get_momenta(), atoms.get_masses()[:, np.newaxis]
+    return np.divide(momenta, masses, out=np.zeros_like(momenta), where=(masses != 0.0) | (momenta != 0.0))
+
+
+def kinetic_energy_of(atoms: Atoms) -> float:
+    """As ``atoms.get_kinetic_energy()``, but with `velocities_of`."""
+    return 0.5 * float(np.vdot(atoms.get_momenta(), velocities_of(atoms)))
 
 
 def snapshot_of(atoms: Atoms) -> Snapshot:
@@ -69,8 +103,9 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     Raises
     ------
     InputError
-        Bonds that name atoms which do not exist.
+        No `Atoms`; bonds that name atoms which do not exist.
     """
+    require_atoms(atoms)
     n = len(atoms)
     arrays = atoms.arrays
     symbols = np.array(chemical_symbols)[atoms.numbers]
@@ -107,7 +142,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residues_known=known,
     )
     cell = atoms.cell.array.copy() if atoms.pbc.any() else None
-    velocities = atoms.get_velocities() * PS if "momenta" in arrays else None
+    velocities = velocities_of(atoms) * PS if "momenta" in arrays else None
     return Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
 
 

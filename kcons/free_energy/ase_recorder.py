@@ -9,7 +9,7 @@ from ase.md.md import MolecularDynamics
 
 from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics
 from kcons.ase.binding import applied_forces
-from kcons.ase.topology import bonds_of
+from kcons.ase.topology import bonds_of, velocities_of
 from kcons.constraints import Constraint, Dihedral
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates, Sample, named
@@ -94,7 +94,7 @@ class AseRecorder:
             forces = applied_forces(atoms)
         if isinstance(self.dynamics, IsokineticDynamics):  # known once it runs
             self.series.isokinetic_degrees_of_freedom = self.dynamics.thermostat_degrees_of_freedom
-        x, v = atoms.positions, atoms.get_velocities()
+        x, v = atoms.positions, velocities_of(atoms)
         self.last = self._held.sample(x, v, forces, time)
         self.series.append(self.last)
         for k, name in enumerate(self._held.names):

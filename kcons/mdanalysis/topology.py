@@ -13,7 +13,16 @@ from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
-from kcons.topology.topology import Snapshot, Topology, as_written, elements_of, listed, near_misses, sorted_pairs
+from kcons.topology.topology import (
+    Snapshot,
+    Topology,
+    as_written,
+    elements_of,
+    listed,
+    near_misses,
+    require_kind,
+    sorted_pairs,
+)
 
 __all__ = ["constraints_of", "selected", "snapshot_of"]
 
@@ -30,6 +39,7 @@ def constraints_of(universe: Any, constrain: str | None = "hbonds", **options: U
         Atoms of a group are counted within the group; those of a Universe as it counts them.
     **options
     """
+    _require_atoms(universe)
     group = universe.atoms
     local = not isinstance(universe, MDAnalysis.Universe)
 
@@ -85,8 +95,9 @@ def snapshot_of(universe: Any) -> Snapshot:
     Raises
     ------
     InputError
-        No coordinates; an atom that is twice in a group.
+        No Universe or AtomGroup; no coordinates; an atom that is twice in a group.
     """
+    _require_atoms(universe)
     group = universe.atoms
     whole = group.universe
     if not len(group):
@@ -114,6 +125,12 @@ def snapshot_of(universe: Any) -> Snapshot:
         cell = _cell(step)
     velocities = as_written(group.velocities) if step.has_velocities else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, f"topology {_file(whole)}")
+
+
+def _require_atoms(universe: Any) -> None:
+    if not isinstance(getattr(universe, "atoms", None), MDAnalysis.AtomGroup):
+        wanted = "a Universe or AtomGroup, as MDAnalysis.Universe(topology, coordinates) gives it"
+        require_kind(universe, MDAnalysis.Universe, "universe", wanted)
 
 
 def topology_of(universe: Any) -> Topology:

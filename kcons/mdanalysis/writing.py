@@ -373,6 +373,8 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     TrajectoryWriter
         Attached to the dynamics; close it at the end.
     """
+    from kcons.ase.topology import velocities_of
+
     atoms = dynamics.atoms
     if interval < 1:
         raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
@@ -395,7 +397,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
             forces = atoms.get_forces(apply_constraint=False)
         writer.write(
             atoms.positions,
-            atoms.get_velocities(),
+            velocities_of(atoms),
             time=float(dynamics.get_time()),
             cell=cell,
             forces=forces,

@@ -8,7 +8,7 @@ from typing import Any, Unpack
 import numpy as np
 import openmm
 from numpy.typing import ArrayLike
-from openmm import unit
+from openmm import app, unit
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -16,7 +16,14 @@ from kcons.errors import InputError
 from kcons.openmm.quantities import array, masses_of
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
-from kcons.topology.topology import Snapshot, Topology, require_standard_form, selected_numbers, sorted_pairs
+from kcons.topology.topology import (
+    Snapshot,
+    Topology,
+    require_kind,
+    require_standard_form,
+    selected_numbers,
+    sorted_pairs,
+)
 
 __all__ = ["bonds_of", "constraints_of", "openmm_topology", "snapshot_of"]
 
@@ -72,8 +79,9 @@ def snapshot_of(
     Raises
     ------
     InputError
-        Different numbers of atoms.
+        No Topology; different numbers of atoms.
     """
+    require_kind(topology, app.Topology, "topology", "an openmm.app.Topology, such as PDBFile(file).topology")
     atoms = list(topology.atoms())
     n = len(atoms)
     x = array(positions, unit.nanometer, "positions")
@@ -127,8 +135,6 @@ def snapshot_of(
 
 def openmm_topology(snapshot: Snapshot) -> tuple[Any, unit.Quantity]:
     """An `openmm.app.Topology` with residues, bonds and box, and the positions."""
-    from openmm import app
-
     snapshot = snapshot.in_unit(ANGSTROM)
     described = snapshot.topology
     topology = app.Topology()

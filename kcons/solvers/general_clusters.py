@@ -208,6 +208,7 @@ class GeneralClusters:
         error = _rms(sigma / scale)
         done = np.zeros(len(batch.rows), dtype=bool)
         polished = np.zeros(len(batch.rows), dtype=bool)
+        taken = np.zeros(len(batch.rows))
         for iteration in range(1, MAX_ITERATIONS + 1):
             data = self._data(state, time, flight)
             b = self._weighted(batch, data)
@@ -215,8 +216,9 @@ class GeneralClusters:
             rounding = self._rounding(batch, data, state)
             settled = _each(relative <= rounding)
             done |= settled & (polished | (error == 0.0))
+            taken += ~done
             if done.all():
-                least = FLAT * size0**2 if iteration > MANY_ITERATIONS else np.zeros(size0.shape)
+                least = np.where(taken < MANY_ITERATIONS, 0.0, FLAT)[:, None] * size0**2
                 turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > least)
                 if turned.any():
                     return _failed(batch, turned, iteration)

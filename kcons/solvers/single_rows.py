@@ -25,7 +25,7 @@ from kcons.solvers.sparse.mixed_rows import SPEED_TOLERANCE
 from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
 from kcons.solvers.sparse.row_values import cell_of, miss, near
 from kcons.solvers.sparse.rows_at_once import BLOCK, call_rows
-from kcons.solvers.sparse.step_control import MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
+from kcons.solvers.sparse.step_control import FLAT, MANY_ITERATIONS, MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
 
 _EPS = float(np.finfo(float).eps)
 #: What is known of one of them: the error that is rounding, the last one, the multiplier that had it, and how
@@ -129,6 +129,17 @@ def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignor
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
+    """Whether a gradient has less than `FLAT` of that at the reference along it; `slope` is their product."""
+    size = 0.0
+    for i in range(count):
+        push = number(pushes, 3 * slot + i)
+        if push != 0.0:
+            size += push * push / number(masses, slot + i // 3)
+    return slope < FLAT * size
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -216,7 +227,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 rounding = number(state, at + ROUNDING)
                 if error <= rounding and (error <= NEWTON_TOLERANCE * whole or error > 0.1 * previous):
                     # A gradient must not have turned by 90 degrees or more within the step.
-                    if not (slope > 0.0):
+                    if not (slope > 0.0) or (iteration > MANY_ITERATIONS and _flat(slope, slot, count, masses, pushes)):
                         return False, np.inf, iteration, k
                     put(state, at + HALVINGS, -1.0)
                     if error >= worst * whole:

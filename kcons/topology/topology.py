@@ -10,6 +10,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import UnionType
 from typing import Any
 
 import numpy as np
@@ -390,6 +391,18 @@ def require_standard_form(cell: FloatArray, engine: str, positive: bool = False)
 
 
 # -- messages -------------------------------------------------------------------------------------
+
+
+def require_kind(given: Any, kind: type | UnionType, item: str, wanted: str) -> None:
+    """Refuse what is no `kind`; `wanted` says of such a one what it is and where it comes from.
+
+    Raises
+    ------
+    InputError
+    """
+    if not isinstance(given, kind):
+        each = "; of several, give one at a time" if isinstance(given, list | tuple) else ""
+        raise InputError(f"{item} must be {wanted}, not {type(given).__name__}{each}", item=item)
 
 
 def near_misses(name: str, known: Iterable[str]) -> str:

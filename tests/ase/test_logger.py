@@ -9,12 +9,13 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
 from ase.md.logger import MDLogger
 from ase.md.verlet import VelocityVerlet
 from ase_systems import Free
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, ConstraintLogger, constrain, draw_velocities
-from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms
 from kcons.errors import InputError
 from kcons.free_energy import AseRecorder
 
@@ -97,6 +98,32 @@ def test_a_rod_against_friction():
     dynamics = ConstrainedDynamics(atoms, units.fs, constraints=[rod], friction=[0.0, 0.3])
     ConstraintLogger(dynamics, atoms, log, {"rod": rod})()
     assert columns(log)[0, -1] == pytest.approx(0.5 * 0.3 * mass * 0.1, rel=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:Zero mass encountered")
+def test_a_fixed_atom_needs_no_mass():
+    """ASE divides 0 by 0 for its velocity. What is logged is the same whatever the mass of one that does not move."""
+    found = []
+    for mass in (40.0, 0.0):
+        atoms, ours, theirs = Atoms("Ar3", 4 * np.eye(3), cell=[20.0] * 3, pbc=True), io.StringIO(), io.StringIO()
+        atoms.calc = LennardJones(epsilon=0.01, sigma=3.4, rc=9.0)
+        atoms.set_masses([40.0, 40.0, mass])
+        rod, anchor = Distance([[0, 1]]), FixedAtoms([2])
+        held = constrain(atoms, [rod, anchor])
+        draw_velocities(atoms, 300, rng=1)
+        dynamics = ConstrainedDynamics(atoms, units.fs, friction=0.01)
+        recorder = AseRecorder(dynamics, {"rod": rod})
+        dynamics.attach(recorder)
+        dynamics.attach(ConstraintLogger(dynamics, atoms, ours, {"rod": rod}, stress=True))
+        if mass:
+            dynamics.attach(MDLogger(dynamics, atoms, theirs, stress=True))
+        dynamics.run(2)
+        if mass:
+            assert np.array_equal(columns(ours)[:, 5:11], columns(theirs)[:, 5:])
+            assert np.abs(columns(ours)[:, 5:11]).max() > 0.0
+        found.append((ours.getvalue(), recorder.series.multiplier, held.report(atoms).velocity_residual))
+    assert found[0][0] == found[1][0] and "nan" not in found[0][0]
+    assert np.array_equal(found[0][1], found[1][1]) and found[0][2] == found[1][2]
 
 
 def test_what_is_not_held_is_refused():

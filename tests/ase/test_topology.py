@@ -9,8 +9,14 @@ import pytest
 from ase import Atoms
 from ase.build import molecule
 
-from kcons.ase import constrain, constraints_of
-from kcons.ase.topology import atoms_of, bonds_of, mend_elements, snapshot_of
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    constrain,
+    constraints_of,
+    draw_velocities,
+)
+from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, mend_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
 
 
@@ -29,6 +35,24 @@ def test_bonds_are_guessed_where_none_are_given():
     atoms.info["bonds"] = [[0, 2]]
     assert bonds_of(atoms).tolist() == [[0, 2]]
     assert bonds_of(Atoms("X2", positions=[[0, 0, 0], [1, 0, 0]])).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        constraints_of,
+        lambda atoms: constrain(atoms, "hbonds"),
+        lambda atoms: constrain(atoms, []),
+        lambda atoms: ConstrainedDynamics(atoms, 1.0),
+        lambda atoms: ConstrainedLangevin(atoms, 1.0, temperature_K=300, friction=0.01),
+        lambda atoms: draw_velocities(atoms, temperature_K=300),
+    ],
+    ids=["constraints_of", "by name", "rows", "dynamics", "thermostat", "velocities"],
+)
+def test_a_list_of_frames_is_no_atoms(call):
+    with pytest.raises(InputError, match=r"atoms must be an ase.Atoms .* not list; of several, give one") as caught:
+        call([molecule("H2O")])
+    assert caught.value.item == "atoms"
 
 
 def test_atoms_without_a_place_have_no_bonds():
@@ -95,6 +119,19 @@ def test_sites_without_a_number_have_no_mass():
     assert topology.masses[3] == 0.0 and topology.elements[3] == ""
     atoms.set_masses([16.0, 1.0, 1.0, 2.0])
     assert snapshot_of(atoms).topology.masses[3] == 2.0
+
+
+def test_velocities_of_atoms_without_mass():
+    """0 where they are at rest, where ASE divides 0 by 0; ASE's own for all others, and infinite where it is."""
+    atoms = Atoms("ArXAr", np.zeros((3, 3)), momenta=[[1.0, -0.0, 3.0], [0.0, 0.0, 0.0], [0.3, 0.2, 0.1]])
+    atoms.set_masses([40.0, 0.0, 3.0])
+    v = velocities_of(atoms)
+    assert np.array_equal(v[1], np.zeros(3)) and np.array_equal(v[::2], atoms[::2].get_velocities())
+    assert kinetic_energy_of(atoms) == atoms[::2].get_kinetic_energy()
+    assert np.isfinite(snapshot_of(atoms).velocities).all()
+    atoms.arrays["momenta"][1, 2] = 1.0
+    with pytest.warns(RuntimeWarning, match="divide by zero"):
+        assert np.isinf(velocities_of(atoms)[1, 2])
 
 
 def test_held_by_name_warns_once_and_keeps_the_bonds():

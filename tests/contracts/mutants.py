@@ -26,9 +26,15 @@ MUTANTS = [
     ),
     (
         "solvers/general_clusters.py",
-        '(np.einsum("nkc,nkc->nk", b, b0) > 0)',
+        '(np.einsum("nkc,nkc->nk", b, b0) > least)',
         '(np.einsum("nkc,nkc->nk", b, b0) > -np.inf)',
         "tests/solvers/test_general_clusters.py::test_the_other_side_is_no_solution",
+    ),
+    (
+        "solvers/general_clusters.py",
+        "taken += ~done",
+        "taken += 1",
+        "tests/solvers/test_general_clusters.py::test_what_many_iterations_ask_for_is_asked_of_the_clusters_that_took_them",
     ),
     (
         "solvers/general_clusters.py",
@@ -173,6 +179,12 @@ MUTANTS = [
         "put(solution, k, last + 0.5 * (lam - last))",
         "put(solution, k, lam)",
         "tests/solvers/test_single_rows.py::test_steps_that_overshoot_are_halved",
+    ),
+    (
+        "solvers/single_rows.py",
+        "slope < FLAT * size",
+        "slope < 0.0 * size",
+        "tests/solvers/test_single_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",
     ),
     (
         "constraints/functions/expressions.py",
@@ -885,6 +897,24 @@ MUTANTS = [
         "FLAT = 0.01",
         "FLAT = 0.0",
         "tests/solvers/sparse/test_mixed_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",
+    ),
+    (
+        "topology/topology.py",
+        "if not isinstance(given, kind):",
+        "if given is None:",
+        "tests/openmm/test_topology.py::test_what_is_no_topology_is_refused",
+    ),
+    (
+        "ase/topology.py",
+        "where=(masses != 0.0) | (momenta != 0.0)",
+        "where=masses != -1.0",
+        "tests/ase/test_logger.py::test_a_fixed_atom_needs_no_mass",
+    ),
+    (
+        "openmm/collective/context_rows.py",
+        "self._clock == 0.0",
+        "self._clock >= 0.0",
+        "tests/openmm/collective/test_clock.py::test_a_state_of_another_program_has_no_time_of_targets",
     ),
     # -- studies: what is kept, and what is shown --
     (

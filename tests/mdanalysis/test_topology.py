@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ase
 import MDAnalysis as mda
 import numpy as np
 import pytest
@@ -81,6 +82,17 @@ def test_a_universe_without_coordinates_or_masses():
         constraints_of(bare)
     with pytest.raises(InputError, match=r"OW of SOL 1 \(atom 0\) has no mass"):
         constraints_of(waters(2), "none")
+
+
+@pytest.mark.parametrize("call", [constraints_of, snapshot_of, to_ase])
+def test_what_is_no_universe_is_refused(villin, call):
+    for given in ([villin], None, villin.atoms[0], ase.Atoms("H2")):
+        said = f"must be a Universe or AtomGroup, .* not {type(given).__name__}"
+        with pytest.raises(InputError, match=said) as caught:
+            call(given)
+        assert caught.value.item == "universe"
+    part = villin.residues[:2]
+    assert snapshot_of(part).topology.n_atoms == len(part.atoms)
 
 
 @pytest.mark.parametrize("taken", [constraints_of, to_ase, snapshot_of])

@@ -6,7 +6,7 @@ import pytest
 from openmm import app, unit
 
 from kcons.errors import InputError
-from kcons.openmm.topology import bonds_of, openmm_topology, reduced, snapshot_of
+from kcons.openmm.topology import bonds_of, constraints_of, openmm_topology, reduced, snapshot_of
 
 
 def waters():
@@ -48,6 +48,16 @@ def test_what_does_not_fit_is_refused():
     system.addParticle(1.0)
     with pytest.raises(InputError, match="the Topology has 6 atoms, the System 1 particles"):
         snapshot_of(topology, x, system=system)
+
+
+@pytest.mark.parametrize("call", [constraints_of, snapshot_of])
+def test_what_is_no_topology_is_refused(call):
+    for given in ([app.Topology()], None, openmm.System()):
+        with pytest.raises(
+            InputError, match=f"must be an openmm.app.Topology, .* not {type(given).__name__}"
+        ) as caught:
+            call(given, np.zeros((0, 3)))
+        assert caught.value.item == "topology"
 
 
 def test_masses_and_box_of_the_system():

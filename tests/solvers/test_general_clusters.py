@@ -10,6 +10,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.sparse.step_control import MANY_ITERATIONS
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 
@@ -227,6 +228,20 @@ def test_the_other_side_is_no_solution() -> None:
     solver, _ = solver_of([ellipsoid(np.array([0]))], x)
     new = np.array([[-1.05, 0.0, 0]])
     assert not positions(solver, new, x).converged
+
+
+def test_what_many_iterations_ask_for_is_asked_of_the_clusters_that_took_them() -> None:
+    """The first row has flattened out on its way, after few; the second takes many, and has not."""
+    square = held.Custom([0], lambda r: r[0, 0] ** 2, lambda r: np.array([[2 * r[0, 0], 0, 0]]), target=0.005**2)
+    arctan = held.Custom(
+        [1], lambda r: np.arctan(r[0, 0]), lambda r: np.array([[1 / (1 + r[0, 0] ** 2), 0, 0]]), target=0.0
+    )
+    x = np.array([[1.0, 0, 0], [0, 0, 0]])
+    solver, _ = solver_of([square, arctan], x, labels=[0, 1])
+    new = np.array([[0.0051, 0, 0], [30.0, 0, 0]])
+    outcome = positions(solver, new, x)
+    assert outcome.converged and outcome.iterations > MANY_ITERATIONS
+    np.testing.assert_allclose(new[:, 0], [0.005, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -9,7 +9,7 @@ import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import CenterDistance, Custom, Ellipsoid, FixedAtoms, RowKind, Sphere, Torus
+from kcons.constraints import CenterDistance, Custom, Dihedral, Ellipsoid, FixedAtoms, RowKind, Sphere, Torus
 from kcons.errors import ConvergenceError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -76,6 +76,24 @@ def test_steps_that_overshoot_are_halved():
     new = np.array([[30.0, 0.0, 0.0]])
     assert solver.positions(Request(new, x)).converged
     assert abs(new[0, 0]) < 1e-14
+
+
+@pytest.mark.parametrize("seed", [154, 1285, 1370, 2917])
+def test_a_dihedral_that_turns_over_has_no_solution_far_away(seed):
+    """Nearly straight at both ends it is flat 10 to 2000 displacements away, and would be right again."""
+    rng = np.random.default_rng(seed)
+    middle = rng.normal(size=3)
+    sides = np.cross(middle, rng.normal(size=(2, 3)))
+    sides *= 0.01 * np.linalg.norm(middle) / np.linalg.norm(sides, axis=1)[:, None]
+    ends = 10 ** rng.uniform(-1, 1, (2, 1)) * (middle + sides)
+    x = np.cumsum([np.zeros(3), ends[0], middle, ends[1]], axis=0)
+    new = x.copy()
+    new[3] = x[2] + np.linalg.norm(ends[1]) / np.linalg.norm(middle + sides[1]) * (middle - sides[1])
+    inverse_masses = 10 ** rng.uniform(0, 1, 4)
+    whole = ConstraintSet(Dihedral([[0, 1, 2, 3]]), x, 1 / inverse_masses)
+    kept = new.copy()
+    assert not SingleRows(whole, np.arange(1), inverse_masses).positions(Request(new, x)).converged
+    assert np.array_equal(new, kept)
 
 
 def test_what_cannot_move_is_not_counted_or_moved():

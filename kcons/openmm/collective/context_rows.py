@@ -157,7 +157,14 @@ class ContextRows(MeasuredRows):
             refuse_motion_remover(system, "a collective row")
         miss = self.worst_miss(velocities)
         if miss is not None:
-            raise ConstraintError(f"the {miss}; call restore(context)", rows=[miss.row], atoms=miss.atoms)
+            remedy = "call restore(context)"
+            moves = isinstance(rows._targets[miss.row], float) and rows._rates[miss.row] != 0.0
+            if moves and miss.what == "positions" and self._clock == 0.0:
+                remedy += (
+                    ", or where the target has moved before, with another integrator, go on from there: "
+                    f"set_target(integrator, {miss.row}, {self.values()[miss.row]:.12g})"
+                )
+            raise ConstraintError(f"the {miss}; {remedy}", rows=[miss.row], atoms=miss.atoms)
 
     def worst_miss(self, velocities: bool = True) -> Miss | None:
         """Energies of the Forces less the targets, and their gradients times v."""

@@ -37,8 +37,9 @@ class Row:
         stands for a context parameter.
     rate : float, Quantity or str
         Change of the target in a ps. With a number or None as target, the target is that + rate t, t the time
-        since the integrator was made. With a name as target whoever sets that changes it; the rate (a number or
-        another name) then says how fast, so that velocities follow.
+        since the integrator was made, which States and checkpoints with the integrator's parameters carry to another
+        one with the same program, and to no other. With a name as target whoever sets that changes it; the rate (a
+        number or another name) then says how fast, so that velocities follow.
     period : float or Quantity, optional
         Period of q; differences are taken to the nearest image. Found where the coordinate is a plain dihedral.
     scale : float or Quantity, optional

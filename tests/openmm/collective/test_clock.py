@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import openmm
+import pytest
 
+from kcons.errors import ConstraintError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
 from kcons.openmm.collective.clock import Clock
 from kcons.openmm.integrator.program import Program
@@ -63,14 +65,20 @@ def test_constraints_alone_take_no_time():
     assert context.getStepCount() == 2
 
 
-def test_members_of_a_compound_integrator_pull_in_turn():
-    """One goes on where the other has ended, and each is judged by the time that has passed in all."""
+def molecule():
+    """A System of three particles, and a Force that is the distance of two of them."""
     system, springs, bond = openmm.System(), openmm.HarmonicBondForce(), openmm.CustomBondForce("r")
     for mass in (12.0, 16.0, 14.0):
         system.addParticle(mass)
     springs.addBond(1, 2, 0.15, 1e4)
     system.addForce(springs)
     bond.addBond(0, 1)
+    return system, bond
+
+
+def test_members_of_a_compound_integrator_pull_in_turn():
+    """One goes on where the other has ended, and each is judged by the time that has passed in all."""
+    system, bond = molecule()
     rows = CollectiveRows(system, [Row(bond, 0.15, 0.5)])
     members = [
         ProjectedIntegrator(0.002, parts=[rows], check_every=3),
@@ -89,3 +97,26 @@ def test_members_of_a_compound_integrator_pull_in_turn():
         members[number].check()
         assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
         assert abs(rows.targets(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
+
+
+def test_a_state_of_another_program_has_no_time_of_targets():
+    """The pull begins anew there; the error says how to go on instead, and that way ends where one run would."""
+    states = []
+    for scheme in ("rattle", "geodesic"):
+        system, bond = molecule()
+        rows = CollectiveRows(system, [Row(bond, 0.15, 0.5)])
+        integrator = ProjectedIntegrator(0.002, scheme, parts=[rows])
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+        context.setPositions([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
+        if states:
+            context.setState(states[0])
+            with pytest.raises(ConstraintError, match=r"call restore.*set_target\(integrator, 0, 0\.17\)"):
+                integrator.step(1)
+            rows.set_target(integrator, 0, 0.17)
+        integrator.step(20)
+        states.append(context.getState(positions=True, velocities=True, integratorParameters=True))
+    assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * 40)) < 1e-12
+    context.setPositions([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.15, 0.0]])
+    with pytest.raises(ConstraintError) as caught:  # the time of these targets is known
+        rows.check(context)
+    assert "call restore" in str(caught.value) and "set_target" not in str(caught.value)
