@@ -214,8 +214,8 @@ MUTANTS = [
     ),
     (
         "openmm/ensembles/isokinetic_ensemble.py",
-        'program.set("exact", float(precision == "double"))',
-        'program.set("exact", 0.0)',
+        'program.write("exact", float(precision == "double"))',
+        'program.write("exact", 0.0)',
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
     ),
     (

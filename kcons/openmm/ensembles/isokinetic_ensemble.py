@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -153,7 +154,7 @@ class Isokinetic(Value):
     def declare(self, program: Program) -> None:
         p = program
         p.number("two_k", "2K, kept; 0 until the first step")
-        p.setting("exact", "whether 2K is summed before each kick: in double precision", 0.0)
+        p.number("exact", "whether 2K is summed before each kick: in double precision")
         p.remember("growth", "integral of alpha over time")
         p.number("lost", "kicks that turned velocities round and lost digits")
         p.vector("w", "velocities before a kick")
@@ -258,7 +259,7 @@ class Isokinetic(Value):
             integrator.setPerDofVariableByName("share", share.tolist())
         precision = Precision.of(context).name
         integrator.program.write("two_k", twice)
-        integrator.program.set("exact", float(precision == "double"))
+        integrator.program.write("exact", float(precision == "double"))
         if abs(found / twice - 1) > ROUNDING[precision]:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
@@ -352,16 +353,16 @@ def _sum_lengths(program: Program, of: str, unseen: bool) -> None:
     """
     p = program
     p.sum("wq", f"{of}m*w*v", "along the kick")
-    if not unseen:
+    with p.when("exact != 0", "sums are cheap") if unseen else nullcontext():
         p.sum("ww", f"{of}m*w*w", "2K before")
         p.sum("qq", f"{of}m*v*v", "size of the kick")
-        return
-    p.let("near", "0.5*wq/two_k+sqrt(1+(0.5*wq/two_k)^2)", "push/keep of weak kicks")
-    p.sum("qq", f"{of}m*(w+near*v)^2", "2K before and the size of the kick")
-    with p.when("exact != 0", "sums are cheap, or rounding is far below what drifts change"):
-        p.sum("ww", f"{of}m*w*w", "2K before")
-    p.let("ww", "select(exact, ww, two_k)", "2K before, as drifts keep it")
-    p.let("qq", "max((qq-ww-2*near*wq)/near^2, wq^2/ww)", "size of the kick")
+    if unseen:
+        with p.when("exact = 0", "the host waits for each sum"):
+            p.let("ww", "two_k", "2K before, as drifts keep it")
+            p.let("near", "0.5*abs(wq)/ww+sqrt(1+(0.5*wq/ww)^2)", "push/keep of weak kicks, or its inverse")
+            p.let("near", "select(step(wq), near, 1/near)", "push/keep of weak kicks")
+            p.sum("qq", f"{of}m*(w+near*v)^2", "2K before and the size of the kick")
+            p.let("qq", "max((qq-ww-2*near*wq)/near^2, wq^2/ww)", "size of the kick")
 
 
 def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np.ndarray:

@@ -159,6 +159,8 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         """
         lean = {"between": float(not seen), "lean": 1.0}
         known = {name: value for name, value in lean.items() if name in self.program.numbers}
+        if "exact" in self.program.numbers:
+            known["exact"] = self.getGlobalVariableByName("exact")
         return count_step(self.program, iterations=iterations, **known)
 
     # -- running --------------------------------------------------------------------------------

@@ -243,7 +243,7 @@ def unlike(dt):
         integrator = ProjectedIntegrator(dt, tolerance=1e-13, ensemble=Isokinetic(300.0))
         context = started(system, integrator, x, v)
         integrator.step(1)
-        integrator.program.set("exact", exact)
+        integrator.program.write("exact", exact)
         integrator.step(round(0.1 / dt) - 1)
         off = abs(integrator.getGlobalVariableByName("ww") / integrator.getGlobalVariableByName("two_k") - 1)
         ends.append(state_of(context)[0])
