@@ -298,6 +298,13 @@ MUTANTS = [
     ),
     (
         "openmm/ensembles/conserved_momenta.py",
+        "context.setParameter(name, given.getParameter(name))",
+        "pass",
+        "tests/openmm/ensembles/test_conserved_momenta.py"
+        "::test_forces_are_looked_at_with_the_parameters_of_the_context",
+    ),
+    (
+        "openmm/ensembles/conserved_momenta.py",
         "turns.keep(turns.fields(x[fixed]))",
         "pass",
         "tests/openmm/ensembles/test_conserved_momenta.py::test_particles_without_mass_leave_turns_about_them",

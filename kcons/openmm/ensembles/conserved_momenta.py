@@ -83,12 +83,12 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     for force in forces_of(system):
         if force.getForceGroup() in integrator.row_groups:
             if not _carries(force):
-                broken.append(_totals(system, force, x, fixed, turns))
+                broken.append(_totals(context, force, x, fixed, turns))
         elif momentum == "auto" and knows_a_place(force):
             if not removed:
-                broken.append(_totals(system, force, x, fixed, turns))
+                broken.append(_totals(context, force, x, fixed, turns))
             elif turns.found and not _carries(force):  # what Python computes is taken for forces between particles
-                _totals(system, force, x, fixed, turns)
+                _totals(context, force, x, fixed, turns)
     if removed:  # the centre of mass rests
         turns.keep(np.tensordot(masses, turns.fields(x).reshape(-1, 3, 6), 1) / masses.sum())
     directions = np.eye(3)
@@ -106,16 +106,18 @@ def _carries(force: openmm.Force) -> bool:
 
 
 def _totals(
-    system: openmm.System, force: openmm.Force, x: FloatArray, fixed: list[int], turns: RigidMotions
+    given: openmm.Context, force: openmm.Force, x: FloatArray, fixed: list[int], turns: RigidMotions
 ) -> FloatArray:
     """Sum of one force over the particles, at a few places and as shares of its size; `turns` sees them, too."""
-    alone = openmm.System()
+    system, alone = given.getSystem(), openmm.System()
     for k in range(system.getNumParticles()):
         alone.addParticle(1.0 if system.isVirtualSite(k) else system.getParticleMass(k))
-    alone.setDefaultPeriodicBoxVectors(*system.getDefaultPeriodicBoxVectors())
+    alone.setDefaultPeriodicBoxVectors(*given.getState().getPeriodicBoxVectors())
     alone.addForce(copy.deepcopy(force))
     clock = openmm.VerletIntegrator(1e-3)
     context = openmm.Context(alone, clock, openmm.Platform.getPlatformByName("Reference"))
+    for name in context.getParameters():
+        context.setParameter(name, given.getParameter(name))
     rng = np.random.default_rng(0)
     size = float(np.ptp(x, axis=0).max(initial=0.0)) or 1.0
     found: list[FloatArray] = []

@@ -40,6 +40,14 @@ def test_momenta_that_are_conserved_are_found():
     del context
 
 
+def test_forces_are_looked_at_with_the_parameters_of_the_context():
+    system, x, v = dumbbell(stiffness=0.0)
+    context = started(system, integrator := ProjectedIntegrator(1e-4, ensemble=(bath := Isokinetic(300.0))), x, v)
+    context.setParameter("k", 50.0)
+    integrator.step(1)
+    assert bath.count(integrator) == 5
+
+
 def test_a_free_cluster_is_warned_of():
     system, x, v = loose_alanine()
     masses = masses_of(system)
