@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -172,7 +171,8 @@ def _conserved(system: System, state: State, forces: FloatArray) -> tuple[FloatA
     directions = open_directions(system.motion, state.positions, state.time)
     if system.force is None:
         return directions, False
-    places, turns = _places(system, state, forces), _Turns(system, state)
+    places, turns = _places(system, state, forces), RigidMotions(state.positions, bool(forces.any()))
+    turns.keep_rows(system.motion, state.positions, state.time)
     for attempt, (x, f) in enumerate(places):
         turns.see(x, f)
         total = directions @ f.sum(axis=0)
@@ -202,51 +202,57 @@ def _places(system: System, state: State, forces: FloatArray) -> Iterator[tuple[
         yield x, system.forces(x, state.velocities, state.time, state.step)
 
 
-class _Turns:
+class RigidMotions:
     """Motions of everything at once, shifts and turns about the middle, that change no row and meet no force.
 
-    Each place takes one of six away, unless forces do no work in any that is left. None in a cell, whose turn changes
-    what is meant, and where rows move.
+    Each place takes one of six away, unless forces do no work in any that is left.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 3)
+    turn : bool
+        False for none: in a cell, whose turn changes what is meant.
     """
 
-    def __init__(self, system: System, state: State) -> None:
-        x, motion = state.positions, system.motion
-        self._middle = x.mean(axis=0)
-        self._size = float(np.ptp(x, axis=0).max(initial=0.0)) or 1.0
+    def __init__(self, positions: FloatArray, turn: bool = True) -> None:
+        self._middle = positions.mean(axis=0)
+        self._size = float(np.ptp(positions, axis=0).max(initial=0.0)) or 1.0
         self._seen, self._idle = 0, False
-        self._motions = np.zeros((0, 6))
-        if motion.lattice is None and not motion.plan.driven:
-            self._motions = np.eye(6)
-            rng = np.random.default_rng(0)
-            shaken = TURN * self._size * (system.inverse_masses > 0) * rng.standard_normal((3, *x.shape))
-            for place in x + shaken:
-                self._keep_rows(motion.constraint_set, place, state.time)
+        self._motions = np.eye(6) if turn else np.zeros((0, 6))
 
-    def _fields(self, x: FloatArray) -> FloatArray:
+    def fields(self, x: FloatArray) -> FloatArray:
         """How atoms move in each of three shifts and three turns, shape (3 n, 6)."""
         arms = (x - self._middle) / self._size
         turns = np.stack([np.cross(axis, arms).ravel() for axis in np.eye(3)], axis=1)
         return np.hstack([np.tile(np.eye(3), (len(x), 1)), turns])
 
-    def _keep_rows(self, held: ConstraintSet, x: FloatArray, time: float) -> None:
-        with np.errstate(all="ignore"):
-            rows = held.jacobian(x, time)
-            lengths = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
-        change = np.asarray(rows @ self._fields(x)) / np.where(lengths > 0, lengths, 1.0)[:, None]
-        if not np.isfinite(change).all():
-            change = np.eye(6)  # a surface that is not defined nearby
+    def keep_rows(self, motion: Motion, x: FloatArray, time: float = 0.0) -> None:
+        """Leave out motions that change rows, where their atoms are and nearby; all in a cell, and if rows move."""
+        if motion.lattice is not None or motion.plan.driven:
+            self._motions = np.zeros((0, 6))
+        moving = np.ones((len(x), 1))
+        moving[motion.fixed_atoms] = 0.0
+        for shaken in TURN * self._size * moving * np.random.default_rng(0).standard_normal((3, *x.shape)):
+            if not self.found:
+                return
+            with np.errstate(all="ignore"):
+                rows = motion.constraint_set.jacobian(x + shaken, time)
+                lengths = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+            change = np.asarray(rows @ self.fields(x + shaken)) / np.where(lengths > 0, lengths, 1.0)[:, None]
+            self.keep(change if np.isfinite(change).all() else np.eye(6))  # a surface that is not defined nearby
+
+    def keep(self, change: FloatArray) -> None:
+        """Leave out motions in which anything changes, by a change in each of the six, shape (k, 6)."""
         _, values, axes = np.linalg.svd(np.linalg.qr(change @ self._motions.T, mode="r"), full_matrices=True)
         self._motions = axes[int((values > 1e-9).sum()) :] @ self._motions
 
     def see(self, x: FloatArray, forces: FloatArray) -> None:
         """Leave out a motion in which the forces of this place do work."""
-        work = self._motions @ (self._fields(x).T @ forces.ravel())
+        work = self._motions @ (self.fields(x).T @ forces.ravel())
         self._seen += 1
         share = BALANCED if len(self._motions) == 6 else EXACT
         self._idle = bool(np.abs(work).max(initial=0.0) <= share * np.abs(forces).sum())
-        if not forces.any():
-            self._motions = np.zeros((0, 6))
-        elif not self._idle:
+        if not self._idle:
             self._motions = np.linalg.svd(work[None, :])[2][1:] @ self._motions
 
     @property
@@ -260,15 +266,26 @@ class _Turns:
         return self.found and not (self._idle and self._seen > 1)
 
 
-def warn_of_conserved_momenta(system: System, velocities: FloatArray, free: Freedom, stacklevel: int = 4) -> None:
-    """Say so where conserved momenta keep a deterministic thermostat from sampling a temperature."""
-    if momentum_share(system, velocities, free.directions) > AT_REST:
+def warn_of_conserved_momenta(
+    masses: FloatArray, velocities: FloatArray, directions: FloatArray, turns: bool, stacklevel: int
+) -> None:
+    """Say so where conserved momenta keep a deterministic thermostat from sampling a temperature.
+
+    Parameters
+    ----------
+    masses : ndarray, shape (n,)
+    velocities : ndarray, shape (n, 3)
+    directions, turns
+        As in `Freedom`.
+    stacklevel : int
+    """
+    if momentum_share(masses, velocities, directions) > AT_REST:
         warnings.warn(
             "total momentum is not zero, and a thermostat that scales velocities scales it too instead of forgetting "
             "it: no temperature is sampled. Take it out of the velocities first, or use Langevin",
             stacklevel=stacklevel,
         )
-    elif free.turns:
+    elif turns:
         warnings.warn(
             "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere), so "
             "that angular momentum is only scaled by the thermostat and never forgotten: configurations are not "
@@ -277,13 +294,13 @@ def warn_of_conserved_momenta(system: System, velocities: FloatArray, free: Free
         )
 
 
-def momentum_share(system: System, velocities: FloatArray, directions: FloatArray) -> float:
+def momentum_share(masses: FloatArray, velocities: FloatArray, directions: FloatArray) -> float:
     """|P|^2/(M 2K) along `directions`: the share of total momentum in the kinetic energy."""
-    twice = 2 * system.kinetic_energy(velocities)
+    twice = float(masses @ np.einsum("ij,ij->i", velocities, velocities))
     if not len(directions) or not twice > 0:
         return 0.0
-    momentum = directions @ (system.masses @ velocities)
-    return float(momentum @ momentum / (system.masses.sum() * twice))
+    momentum = directions @ (masses @ velocities)
+    return float(momentum @ momentum / (masses.sum() * twice))
 
 
 def drift_velocity(velocities: FloatArray, masses: FloatArray, directions: FloatArray) -> FloatArray:

@@ -145,7 +145,7 @@ class NoseHooverChain(Listed):
             return state
         assert state.forces is not None
         free = freedom(system, state, state.forces, None, self.momentum)
-        warn_of_conserved_momenta(system, state.velocities, free)
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, free.turns, stacklevel=4)
         return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
 
     def step(self, system: System, state: State, dt: float) -> State:

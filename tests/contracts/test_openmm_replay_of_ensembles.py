@@ -176,7 +176,7 @@ def test_initial_temperature(name, platform):
     assert integrator.degrees_of_freedom() == 3 * n - n // 2
 
 
-@pytest.mark.filterwarnings("ignore:total momentum")
+@pytest.mark.filterwarnings("ignore:total momentum", "ignore:the forces exert no torque")
 @made
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_massless_particles(name, platform):

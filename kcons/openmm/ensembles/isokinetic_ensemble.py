@@ -21,7 +21,6 @@ from kcons.openmm.ensembles.conserved_momenta import (
     Momentum,
     check_momentum,
     conserved_momenta,
-    warn_of_conserved_momenta,
 )
 from kcons.openmm.integrator.ensemble import Value
 from kcons.openmm.integrator.guard import positions_of, velocities_of
@@ -35,7 +34,7 @@ from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.freedom import atom_numbers
+from kcons.thermostats.freedom import atom_numbers, warn_of_conserved_momenta
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
 #: is continued stays as it is, bit for bit.
@@ -253,7 +252,8 @@ class Isokinetic(Value):
             )
         momenta = self._momenta(integrator, context)
         twice = self._twice_kinetic(_count(self.atoms, integrator, context, momenta), int(np.sum(masses > 0)), found)
-        warn_of_conserved_momenta(momenta, masses, v, turns=momenta.angular and self.temperature is not None)
+        turns = momenta.turns and self.temperature is not None
+        warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=6)
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())

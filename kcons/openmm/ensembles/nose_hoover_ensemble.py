@@ -11,13 +11,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm.ensembles.conserved_momenta import (
-    Momenta,
-    Momentum,
-    check_momentum,
-    conserved_momenta,
-    warn_of_conserved_momenta,
-)
+from kcons.openmm.ensembles.conserved_momenta import Momenta, Momentum, check_momentum, conserved_momenta
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.guard import velocities_of
@@ -29,6 +23,7 @@ from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
+from kcons.thermostats.freedom import warn_of_conserved_momenta
 from kcons.thermostats.nose_hoover import HALF, chain_fractions
 
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
@@ -244,7 +239,7 @@ class NoseHoover(ConstantEnergy):
         masses, v = integrator._watch().rows.masses, velocities_of(context)
         if removes_centre_of_mass_motion(system):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
-        warn_of_conserved_momenta(momenta, masses, v, turns=momenta.angular)
+        warn_of_conserved_momenta(masses, v, momenta.directions, momenta.turns, stacklevel=6)
         integrator.program.write("momenta", count)
 
     def _count(self, integrator: Integrator, momenta: Momenta) -> int:

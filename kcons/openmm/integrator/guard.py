@@ -25,6 +25,7 @@ from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
     forces_of,
+    knows_a_place,
     parts_of_steps,
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
@@ -188,9 +189,10 @@ class Guard:
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
         #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them, and
         #: a CMMotionRemover, to which half a kick matters where forces add up to something.
-        kinds = {type(force) for force in forces_of(self.system)}
+        applied = [force for force in forces_of(self.system) if force.getForceGroup() not in integrator.row_groups]
         self.undisturbed = not (
-            openmm.AndersenThermostat in kinds or {openmm.CMMotionRemover, openmm.CustomExternalForce} <= kinds
+            any(isinstance(force, openmm.AndersenThermostat) for force in applied)
+            or (removes_centre_of_mass_motion(self.system) and any(map(knows_a_place, applied)))
         )
         self.started = False  # whether the set-up was checked
         #: Whether others may have moved x or v since: the next step looks where they are.

@@ -43,6 +43,26 @@ _LATE = ("Reference", "CPU")
 BAROSTATS = frozenset(
     {"MonteCarloBarostat", "MonteCarloAnisotropicBarostat", "MonteCarloMembraneBarostat", "MonteCarloFlexibleBarostat"}
 )
+#: Forces that know no place in space.
+_INVARIANT = frozenset(
+    {
+        "HarmonicBondForce",
+        "HarmonicAngleForce",
+        "PeriodicTorsionForce",
+        "RBTorsionForce",
+        "CMAPTorsionForce",
+        "NonbondedForce",
+        "CustomNonbondedForce",
+        "CustomBondForce",
+        "CustomAngleForce",
+        "CustomTorsionForce",
+        "GBSAOBCForce",
+        "GayBerneForce",
+        "CMMotionRemover",
+        "AndersenThermostat",
+        *BAROSTATS,
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -183,6 +203,11 @@ def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
 
 def removes_centre_of_mass_motion(system: openmm.System) -> bool:
     return any(isinstance(force, openmm.CMMotionRemover) for force in forces_of(system))
+
+
+def knows_a_place(force: openmm.Force) -> bool:
+    """Whether a force may depend on where in space particles are, beyond distances and angles between them."""
+    return type(force).__name__ not in _INVARIANT
 
 
 def refuse_forgotten_parts(system: openmm.System, row_groups: Iterable[int]) -> None:

@@ -206,9 +206,8 @@ class Isokinetic(Splitting):
             )
         free = freedom(system, state, state.forces, self.atoms, self.momentum)
         twice = self._twice_kinetic(share, free, found)
-        if self.thermal_energy is None:
-            free = replace(free, turns=False)
-        warn_of_conserved_momenta(system, state.velocities, free, stacklevel=5)
+        turns = free.turns and self.thermal_energy is not None
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=5)
         velocities = rest if drive is None else drive + rest
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:

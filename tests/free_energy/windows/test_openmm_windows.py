@@ -27,6 +27,7 @@ def sampler(coordinates, of=None):
     return OpenMMWindows(PDB.topology, of or system(), PDB.positions, coordinates, platform="Reference")
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
 @pytest.mark.parametrize("thermostat", ["langevin", "nose-hoover", "isokinetic"])
 def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
     windows = pickle.loads(pickle.dumps(sampler({"phi": PHI, "psi": PSI})))

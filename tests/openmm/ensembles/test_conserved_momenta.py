@@ -1,10 +1,25 @@
 """Momenta that a System conserves: found, warned of, or refused."""
 
-import pytest
-from ensemble_runs import run
-from openmm_systems import dumbbell, loose_alanine, masses_of
+import warnings
 
-from kcons.openmm import Isokinetic, ProjectedIntegrator
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import run, tied
+from openmm_systems import dumbbell, loose_alanine, masses_of, started
+
+from kcons.constraints import Cylinder, Ellipsoid, Sphere
+from kcons.openmm import (
+    CollectiveRows,
+    ExpressionSurface,
+    Isokinetic,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    Row,
+    hold,
+    surface_parts,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 
@@ -25,8 +40,165 @@ def test_momenta_that_are_conserved_are_found():
     del context
 
 
+def test_forces_are_looked_at_with_the_parameters_of_the_context():
+    system, x, v = dumbbell(stiffness=0.0)
+    context = started(system, integrator := ProjectedIntegrator(1e-4, ensemble=(bath := Isokinetic(300.0))), x, v)
+    context.setParameter("k", 50.0)
+    integrator.step(1)
+    assert bath.count(integrator) == 5
+
+
 def test_a_free_cluster_is_warned_of():
     system, x, v = loose_alanine()
     masses = masses_of(system)
     with pytest.warns(UserWarning, match="no torque"):
         run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0)), x, v - masses @ v / masses.sum(), 1)
+
+
+PLACES = [[0.5, 0.1, -0.2], [-0.1, 0.4, 0.3], [0.2, -0.6, 0.4], [-0.4, -0.2, -0.5]]
+CALM = "0.1*r^-1"
+FOUR = [0, 1, 2, 3]
+
+
+def surfaces(*rows):
+    return lambda system, x: surface_parts(rows, system=system)
+
+
+def carried(*rows):
+    return lambda system, x: [hold(system, rows, x)]
+
+
+def from_a_fixed_place(system, x):
+    """A collective row: the distance of particle 0 from (0.1, 0.2, 0)."""
+    force = openmm.CustomExternalForce("sqrt((x-0.1)^2+(y-0.2)^2+z^2)")
+    force.addParticle(0, [])
+    return [CollectiveRows(system, [Row(force)], positions=x)]
+
+
+def between_two(system, x):
+    """A collective row: a distance."""
+    force = openmm.CustomBondForce("r")
+    force.addBond(0, 1)
+    return [CollectiveRows(system, [Row(force)], positions=x)]
+
+
+SPHERE = Sphere(FOUR, [0, 0, 0], 0.6)
+CYLINDER = Cylinder(FOUR, [0.1, 0, 0], [0, 0, 1.0], 0.5)
+FLAT = Ellipsoid(FOUR, [0, 0, 0], [0.6, 0.6, 0.4])
+BALL = ExpressionSurface(FOUR, "x^2+y^2+z^2-0.36")
+LOPSIDED = "30*(x-0.1)^2+40*y^2+20*(z+0.3)^2+9*x*y*z"
+
+
+@pytest.mark.parametrize(
+    ("parts", "field", "warned"),
+    [
+        (surfaces(SPHERE), "", True),
+        (surfaces(SPHERE), "20*z^2", True),
+        (surfaces(SPHERE), LOPSIDED, False),
+        (carried(SPHERE), "", True),
+        (carried(SPHERE), LOPSIDED, False),
+        (surfaces(BALL), "", True),
+        (surfaces(BALL), LOPSIDED, False),
+        (surfaces(CYLINDER), "20*z^2", True),
+        (surfaces(CYLINDER), "20*x^2", False),
+        (surfaces(FLAT), "", True),
+        (surfaces(Ellipsoid(FOUR, [0, 0, 0], [0.6, 0.5, 0.4])), "", False),
+        (from_a_fixed_place, "", True),
+        (from_a_fixed_place, "20*(x^2+y^2+z^2)", True),
+        (from_a_fixed_place, LOPSIDED, False),
+        (between_two, "", True),
+        (between_two, LOPSIDED, False),
+        (lambda system, x: [], "20*((x-0.1)^2+y^2+z^2)", True),
+        (lambda system, x: [], LOPSIDED, False),
+    ],
+)
+def test_angular_momentum_about_the_axes_of_what_is_held_is_said(parts, field, warned):
+    """Pairs that repel exert no torque, and rows none about some axis; a field across it does."""
+    system, x = tied([20.0] * 4, CALM, PLACES)
+    if field:
+        force = openmm.CustomExternalForce(field)
+        for k in FOUR:
+            force.addParticle(k, [])
+        system.addForce(force)
+    assert said(system, x, NoseHoover(300.0, 5.0), parts(system, x)) == warned
+
+
+def test_thermostats_without_noise_say_so_where_a_temperature_is_asked_for():
+    system, x = tied([20.0] * 4, CALM, PLACES)
+    parts = surface_parts(SPHERE, system=system)
+    assert said(system, x, Isokinetic(300.0), parts)
+    assert said(system, x, NoseHooverMiddle(300.0, 5.0), parts)
+    assert not said(system, x, Isokinetic(), parts)
+    assert not said(system, x, Isokinetic(300.0, momentum="free"), parts)
+
+
+def said(system, x, bath, parts=()):
+    """Whether the first step warns of angular momentum."""
+    integrator = ProjectedIntegrator(1e-4, parts=parts, ensemble=bath)
+    context = started(system, integrator, x)
+    integrator.applyConstraints(context)
+    v = np.random.default_rng(2).standard_normal(x.shape)
+    v -= masses_of(system) @ v / masses_of(system).sum()
+    context.setVelocities(np.where(masses_of(system)[:, None] > 0, v, 0.0))
+    integrator.applyVelocityConstraints(context)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        integrator.step(1)
+    told = [one for one in heard if "exert no torque about an axis" in str(one.message)]
+    assert all(one.filename == __file__ for one in told)
+    assert all(one in told or "total momentum is not zero" in str(one.message) for one in heard)
+    return bool(told)
+
+
+@pytest.mark.parametrize(("fixed", "warned"), [([0], True), ([0, 1], True), ([0, 1, 2], False)])
+def test_particles_without_mass_leave_turns_about_them(fixed, warned):
+    """About one, about the line through two; a virtual site holds nothing."""
+    masses = np.array([20.0] * 5)
+    masses[fixed] = 0
+    system, x = tied(masses, CALM, [*PLACES, [0.9, 0.9, 0.0]])
+    site = system.addParticle(0.0)
+    system.setVirtualSite(site, openmm.TwoParticleAverageSite(3, 4, 0.5, 0.5))
+    x = np.vstack([x, (x[3] + x[4]) / 2])
+    system.getForce(0).addBond(0, site)
+    assert said(system, x, NoseHoover(300.0, 5.0)) == warned
+
+
+def test_a_motion_remover_leaves_turns_about_the_centre_of_mass():
+    """A round trap elsewhere leaves one, about the line between both; a trap with an axis elsewhere none."""
+    system, x = tied([20.0] * 4, CALM, PLACES)
+    system.addForce(openmm.CMMotionRemover())
+    bath = Isokinetic(300.0)
+    assert said(system, x, bath)
+    trap = openmm.CustomExternalForce("20*((x-0.1)^2+y^2)+k*z^2")
+    trap.addGlobalParameter("k", 20.0)
+    for k in FOUR:
+        trap.addParticle(k, [])
+    system.addForce(trap)
+    assert said(system, x, bath)
+    trap.setGlobalParameterDefaultValue(0, 9.0)
+    assert not said(system, x, bath)
+    system.removeForce(1)
+    assert said(system, x, bath)
+    system.getForce(1).setEnergyFunction("20*((x-0.1)^2+1.1*y^2)+k*z^2")
+    assert not said(system, x, bath)
+
+
+def test_forces_that_cannot_be_copied_go_with_a_motion_remover():
+    system, x = tied([20.0] * 4, CALM, PLACES)
+    system.addForce(openmm.CMMotionRemover())
+    system.addForce(openmm.PythonForce(lambda state: (0.0, np.zeros((4, 3)))))
+    assert said(system, x, Isokinetic(300.0))
+
+
+def test_a_box_is_not_turned(monkeypatch):
+    """Nothing is computed for it, either."""
+    system, x = tied([20.0] * 4, CALM, PLACES)
+    system.getForce(0).setUsesPeriodicBoundaryConditions(True)
+    monkeypatch.setattr("kcons.openmm.ensembles.conserved_momenta._totals", None)
+    assert not said(system, x, Isokinetic(300.0))
+    assert not said(system, x, Isokinetic(300.0), surface_parts(SPHERE, system=system))
+    field = openmm.CustomExternalForce("x^2")
+    field.addParticle(0, [])
+    system.addForce(field)
+    system.addForce(openmm.CMMotionRemover())
+    assert not said(system, x, Isokinetic(300.0))

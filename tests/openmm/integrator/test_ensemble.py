@@ -17,6 +17,7 @@ from kcons.openmm import (
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
 def test_ensembles_are_values():
     shared = Langevin(300, 1.0)
     one, two = thermostatted(shared)(), thermostatted(shared)()

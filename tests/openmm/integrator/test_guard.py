@@ -337,15 +337,31 @@ def test_positions_rounded_to_single_numbers_are_excused_where_few_molecules_cro
         watch.check(given, 1)
 
 
-@pytest.mark.filterwarnings("ignore:the forces exert no torque")
+def external(n):
+    pull = openmm.CustomExternalForce("50*((x-1)^2+y^2+z^2)")
+    for k in range(n):
+        pull.addParticle(k, [])
+    return pull
+
+
+def compound(n):
+    pull = openmm.CustomCompoundBondForce(1, "500*x1^2")
+    pull.addBond([0], [])
+    return pull
+
+
+def collective(n):
+    pull = openmm.CustomCVForce("20*pull")
+    pull.addCollectiveVariable("pull", compound(n))
+    return pull
+
+
+@pytest.mark.parametrize("force", [external, compound, collective])
 @pytest.mark.parametrize("kind", ["RattleIntegrator", "Isokinetic", "Langevin", "NoseHoover", "carried"])
-def test_a_motion_remover_meets_complete_velocities_beside_an_external_force(kind):
+def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place(kind, force):
     """Half a kick has momentum there, and how steps are divided into calls would decide what is removed."""
     system, x, v = alanine()
-    pull = openmm.CustomExternalForce("50*((x-1)^2+y^2+z^2)")
-    for k in range(len(x)):
-        pull.addParticle(k, [])
-    system.addForce(pull)
+    system.addForce(force(len(x)))
     assert openmm.CMMotionRemover in {type(force) for force in system.getForces()}
     parts = [hold(carried := copy.deepcopy(system), [], x, take="all")] if kind == "carried" else []
     ensemble = {
@@ -371,3 +387,13 @@ def test_a_motion_remover_meets_complete_velocities_beside_an_external_force(kin
     for places, speeds in ends[1:]:
         np.testing.assert_allclose(places, ends[0][0], rtol=0, atol=1e-11)
         np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-8)
+
+
+def test_rows_beside_a_motion_remover_know_no_place():
+    """Steps leave out what only an observer needs there: forces that carry rows are none."""
+    system, x, v = alanine()
+    part = hold(system, [], x, take="all")
+    context = started(system, integrator := ProjectedIntegrator(1e-3, parts=[part]), x, v)
+    integrator.step(1)
+    assert integrator._guard.undisturbed
+    del context

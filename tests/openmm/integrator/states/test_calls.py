@@ -16,6 +16,9 @@ from kcons.openmm import Langevin, ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.integrator.states import calls
 from tests.openmm.integrator.states.test_settings import KINDS, carried_at
 
+#: The trap of `cluster` is round.
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
 kinds = pytest.mark.parametrize("kind", KINDS)
 
 

@@ -87,6 +87,7 @@ def test_forces_and_parts_after_reinitialize():
 # -- forces change --------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_of_forces_are_used_in_the_next_step(kind):
     made, fresh = KINDS[kind](), KINDS[kind]()

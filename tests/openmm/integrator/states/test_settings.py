@@ -28,6 +28,9 @@ from kcons.openmm import (
 )
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
+#: The trap of `cluster` is round.
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
 #: Radius of the sphere that holds particle 0, about a centre that is not the origin.
 RADIUS, CENTRE = 0.2, X[0] - [0.2, 0, 0]
 
