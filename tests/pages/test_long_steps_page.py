@@ -135,6 +135,29 @@ def test_spheres_at_32_fs_are_right_with_long_waves_inside():
     assert abs(row["bias"][0]) <= 0.5 and max(abs(row[kind][0] - 1) for kind in ("shift", "turn")) <= 0.01
 
 
+def test_inner_steps_of_2_fs_cool_turns_a_little():
+    """By 1.4 K; spheres at 64 fs are right then, where 0.003 of the stiffness is slow."""
+    pairs = []
+    for rows in (part["water"] for part in REACH.values()):
+        same = {key: [r for r in rows if identity(r) == key] for key in map(identity, rows)}
+        for (_, *rest), [row] in ((key, found) for key, found in same.items() if key[0] == 2):
+            others = [r["turn"] for r in same.get((4, *rest), [])]
+            if others:
+                error = math.hypot(row["turn"][1], math.hypot(*(e for _, e in others)) / len(others))
+                pairs.append((row["turn"][0] - sum(t for t, _ in others) / len(others), error))
+    weights = [1 / error**2 for _, error in pairs]
+    mean = sum(w * off for w, (off, _) in zip(weights, pairs, strict=True)) / sum(weights)
+    assert len(pairs) == 6 and f"{-300 * mean:.1f} ± {300 / math.sqrt(sum(weights)):.1f}" == "1.4 ± 1.0"
+    (row,) = (r for r in REACH["pairs to 9 A, long waves"]["water"] if identity(r)[:3] == (2, "split", 64))
+    assert abs(row["bias"][0]) <= 0.2 and abs(row["shift"][0] - 1) <= 0.004 and abs(row["turn"][0] - 1) <= 0.007
+    assert row["bias"][1] < 0.25 and row["shift"][1] < 0.015 and row["turn"][1] < 0.01
+
+
+def identity(row):
+    """What a run is of, besides its seed; the inner step first."""
+    return row["inner"], row["bath"], row["outer"], row["friction"], row["auxiliary"]
+
+
 def test_what_spheres_gain_with_long_waves_inside():
     """Slow evaluations while a dipole turns, where turns are equally hot: half as many again for Langevin dynamics."""
     spheres, langevin = FAR["split 5/ps, 64 fs, halfway"], FAR["langevin 5/ps, 32 fs, halfway"]

@@ -15,13 +15,15 @@ def test_the_page_shows_them():
 
 
 def test_distributions_are_those_of_quadrature_and_of_metropolis():
-    """p above 0.001."""
+    """p above 0.001, and the least of the samplers as low as chance makes it."""
     small = RESULT["small"]
+    values = [p for row in small["rows"] if "HMC" in row["method"] for p in row["p"]]
+    assert len(values) == 12 and 1 - (1 - min(values)) ** 12 > 0.05
     for row in small["rows"]:
         away = np.abs(np.array(row["mean"]) - small["exact"]) / row["error"]
         assert away.max() < 3.5, row["method"]
         assert min(row["p"]) > 1e-3 and min(row["p_metropolis"]) > 1e-3, row["method"]
-        assert row["independent"] >= 590
+        assert row["independent"] >= 2400
         assert row["rejected"] is None or sum(row["rejected"]) > 20
 
 
@@ -53,9 +55,9 @@ def test_chains_take_a_hundredth_of_the_time():
 
 
 def test_a_protein_in_water_is_accepted():
-    """Expected from the changes of energy; the proposals are few."""
     (row,) = RESULT["dhfr"]["rows"]
-    assert row["expected"] >= 0.9 and row["proposals"] == 6 and row["not_reversible"] == 0
+    assert row["expected"] >= 0.9 and row["proposals"] == 24 and row["not_reversible"] == 0
+    assert row["accepted"] >= 0.9 * row["proposals"]
 
 
 def test_physical_validation_finds_nothing():
