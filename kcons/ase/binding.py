@@ -254,12 +254,12 @@ def name_step(error: BaseException, number: int) -> None:
         error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
 
 
-def surroundings(atoms: Atoms) -> bytes:
-    """The cell, what calculators read of atoms beside their positions, and what ASE objects add to forces."""
+def surroundings(atoms: Atoms) -> tuple[bytes, ...]:
+    """The cell, first, what calculators read of atoms beside their positions, and what ASE objects add to forces."""
     parts = [atoms.cell.array.tobytes(), atoms.pbc.tobytes()]
     parts += [atoms.arrays[name].tobytes() for name in _READ if name in atoms.arrays]
     parts += [repr(item.todict()).encode() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
-    return b"".join(parts)
+    return tuple(parts)
 
 
 def refuse_fewer(before: int, now: int, rows: Sequence[Constraint], friction: ArrayLike, stepper: Any) -> int:

@@ -130,7 +130,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self._bound: Binding | None = None
         self._system: System | None = None
         self._state: State | None = None
-        self._cell = b""
+        self._cell: tuple[bytes, ...] = ()
         self._answers = Answers(atoms, self._calculators)
         self._size = len(atoms)
         self._momenta = np.zeros((0, 3))  # as written last
@@ -219,7 +219,7 @@ class ConstrainedDynamics(MolecularDynamics):
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
-            self.atoms.cell[...] = np.frombuffer(self._cell, count=9).reshape(3, 3)  # which barostats change
+            self.atoms.cell[...] = np.frombuffer(self._cell[0]).reshape(3, 3)  # which barostats change
             name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
