@@ -110,7 +110,7 @@ RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
         *(("langevin", 5, step) for step in (24, 32, 48)),
         ("langevin", 10, 32),
         *(("split", 5, step) for step in (48, 64)),
-        *(("split", 20, step, 0) for step in (32, 64)),
+        *(("split", 20, step, 0) for step in (24, 32, 64)),
         *(("langevin", 5, step, 1, 2) for step in (24, 32)),
         *(("split", 5, step, 1, 2) for step in (48, 64)),
         ("split", 20, 64, 0, 2),
