@@ -133,6 +133,8 @@ def test_spheres_at_32_fs_are_right_with_long_waves_inside():
     """The energy to 0.5 %, both temperatures to 1 %."""
     row = FAR["split 20/ps, 32 fs, auxiliary 0, halfway"]
     assert abs(row["bias"][0]) <= 0.5 and max(abs(row[kind][0] - 1) for kind in ("shift", "turn")) <= 0.01
+    turn, error = FAR["split 20/ps, 24 fs, auxiliary 0, halfway"]["turn"]
+    assert f"{100 * (turn - 1):.1f} {100 * error:.1f}" == "1.2 0.6"
 
 
 def test_inner_steps_of_2_fs_cool_turns_a_little():
