@@ -116,6 +116,7 @@ RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
         ("split", 20, 64, 0, 2),
         *(("langevin", 5, step, 1, 1, 2) for step in (24, 32)),
         *(("split", 5, step, 1, 1, 2) for step in (32, 48, 64)),
+        *(("split", 20, 24, 0, seed, 2) for seed in (1, 2, 3, 4)),
     ),
     "pairs to 9 A, long waves": (
         ("langevin", 5, 32),
@@ -123,6 +124,10 @@ RUNS: dict[str, tuple[tuple[Any, ...], ...]] = {
         ("split", 5, 64),
         ("langevin", 5, 64, 1, 1, 2),
         ("split", 5, 64, 1, 1, 2),
+        *(("split", 20, 24, 0, seed, 2) for seed in (1, 2, 3, 4)),
+        *(("split", 20, 32, 0, seed, 2) for seed in (1, 2)),
+        *(("split", 5, 64, 1, seed, 2) for seed in (2, 3)),
+        ("split", 5, 24, 1, 1, 2),
     ),
 }
 REFERENCE = Method("plain", 5, 2)
