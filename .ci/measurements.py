@@ -80,7 +80,9 @@ TABLE = {
     "engine_speed.json": Measurement(CORE, script("03_engine_speed"), 20),
     "error_budget.json": Measurement(CORE, script("18_error_budget")),
     "free_energy.json": Measurement(
-        (*BATHS, "openmm", "free_energy"), script("29_free_energy", "--full", "--alanine alanine-windows"), None
+        (*BATHS, "openmm", "free_energy"),
+        script("29_free_energy", "--full", "--placement", "--recording", "--alanine alanine-windows"),
+        None,
     ),
     "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), None),
     "hard_cases.json": Measurement(HARD, ("kcons hardcases --out hardcases", "cp hardcases/hard_cases.json F"), 6),

@@ -2,6 +2,7 @@
 
     python examples/24_openmm_four_femtoseconds.py                   alanine dipeptide for 4 ps on the CPU
     python examples/24_openmm_four_femtoseconds.py --full --out F    the committed results
+    python examples/24_openmm_four_femtoseconds.py --platform "CUDA mixed" --add F   three runs of villin more, into F
     python examples/24_openmm_four_femtoseconds.py --show F          the tables of an earlier run
 
 Alanine dipeptide and villin in implicit solvent (amber14, OBC2, no cutoff). What is held is what
@@ -32,7 +33,7 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons import ConstraintSet, Motion
-from kcons.comparison import measure, scripts
+from kcons.comparison import json_files, measure, scripts
 from kcons.constraints import Angle, Constraint, Distance
 from kcons.openmm import Langevin, ProjectedIntegrator, constraints_of, hold, positions_of
 from kcons.topology import HeldRows, bond_angles
@@ -220,6 +221,14 @@ def over_runs(result: dict[str, Any]) -> str:
     return f"villin at 4 fs, of what is conserved: {mean:+.1e} ± {error:.0e}, from the scatter of {len(runs)} runs"
 
 
+def added(known: dict[str, Any], place: str) -> dict[str, Any]:
+    """A result with three runs of villin more, on another platform."""
+    machine = measure.environment()
+    about = {key: machine[key] for key in ("cpu", "commit", "date")}
+    more = [run("villin", place, 50.0, 5.0, STEP, seed) | about for seed in range(2, 5)]
+    return known | {"again": [*known["again"], *more]}
+
+
 def measured(chosen: argparse.Namespace) -> dict[str, Any]:
     names = chosen.structure or (list(STRUCTURES) if chosen.full else ["alanine dipeptide"])
     place = chosen.platform or ("OpenCL mixed" if chosen.full else "CPU")
@@ -241,7 +250,11 @@ def main() -> None:
     parser.add_argument("--platform", help="such as CPU or 'OpenCL mixed'")
     parser.add_argument("--structure", action="append", choices=list(STRUCTURES), help="may be given several times")
     parser.add_argument("--picoseconds", type=float, help="length of the runs")
-    scripts.script(parser, measured, show)
+    parser.add_argument("--add", type=Path, metavar="F", help="a result to add three runs of villin to")
+    chosen = parser.parse_args()
+    if chosen.add:
+        json_files.write(chosen.add, added(json_files.read(chosen.add), chosen.platform or "CPU"))
+    scripts.script(parser, measured, show, ["--show", str(chosen.add)] if chosen.add else None)
 
 
 if __name__ == "__main__":

@@ -420,7 +420,8 @@ def main(arguments: list[str]) -> None:
         if "--full" not in arguments:
             return
     known = json_files.read(RESULT) if RESULT.exists() else {}
-    json_files.write(RESULT, known | {**found, "machine": environment()})
+    machines = known.get("machines", {}) | dict.fromkeys(found, environment())
+    json_files.write(RESULT, known | found | {"machines": machines})
     print(f"wrote {RESULT}")
 
 

@@ -165,13 +165,50 @@ def collect(folder: Path, samples: int) -> dict[str, Any]:
     return result | {"environment": environment()}
 
 
+def mean(values: list[list[float]]) -> tuple[float, float]:
+    """Of values with errors, and its error."""
+    return sum(value for value, _ in values) / len(values), math.hypot(*(error for _, error in values)) / len(values)
+
+
+def over_seeds(rows: list[dict[str, Any]], reference: dict[str, Any]) -> list[dict[str, Any]]:
+    """Means of methods that ran with several seeds, and their errors: how far the energy is off, and temperatures."""
+    by_name: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_name.setdefault(row["name"].replace(f", seed {row['seed']}", ""), []).append(row)
+    found = []
+    known, doubt = reference["energy"]
+    for name, same in by_name.items():
+        if len(same) > 1:
+            means = {
+                key: (
+                    sum(row[key][0] for row in same) / len(same),
+                    math.hypot(*(row[key][1] for row in same)) / len(same),
+                )
+                for key in ("energy", "shift", "turn")
+            }
+            value, error = means["energy"]
+            # Positive where the energy is too high.
+            means["bias"] = (100 * (value - known) / abs(known), 100 * math.hypot(error, doubt) / abs(known))
+            found.append({"name": name, "seeds": len(same), **means})
+    return found
+
+
 def show(result: dict[str, Any]) -> str:
-    """Averages by splitting."""
+    """Averages by splitting, all but the reference looked at halfway; then the means of several seeds."""
     head, first = water.show_water({"water": [result["reference"]]}).split("\n")
     lines = [head, first]
     for part in result["splittings"]:
+        rows = [row | {"name": row["name"].removesuffix(", halfway")} for row in part["water"]]
         lines += [f"fast: {part['name']}; slow forces have {part['share']:.3f} of the stiffness"]
-        lines += water.show_water({"water": part["water"]}).split("\n")[1:]
+        lines += water.show_water({"water": rows}).split("\n")[1:]
+    lines += ["", f"{'means over seeds':52s}{'seeds':>6s}{'U off, %':>14s}{'T shift, K':>14s}{'T turn, K':>14s}"]
+    for part in result["splittings"]:
+        means = over_seeds(part["water"], result["reference"])
+        lines += [f"fast: {part['name']}"] * bool(means)
+        for row in means:
+            cells = f"{row['name'].removesuffix(', halfway'):52s}{row['seeds']:6d}"
+            cells += f"{row['bias'][0]:+8.2f}({row['bias'][1]:.2f})"
+            lines.append(cells + "".join(f"{300 * row[k][0]:9.1f}({300 * row[k][1]:.1f})" for k in ("shift", "turn")))
     return "\n".join(lines)
 
 

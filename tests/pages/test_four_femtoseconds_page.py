@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 
 from committed_pages import FOLDER, page, printed
 
@@ -30,3 +31,14 @@ def test_rows_stay_and_energy_is_what_the_page_says():
         drift = peptide[name]
         assert abs(drift["slope"]) <= 3 * drift["error"] < 1e-3
         assert -0.055 < villin[name]["slope"] * villin["freedom"] * 0.1 < -0.045
+
+
+def test_villin_does_not_drift_over_nine_runs():
+    """On two platforms, in two precisions: the mean of the slopes is within two errors, from their scatter."""
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    runs = [run for run in (found["runs"]["villin"], *found["again"]) if run["step"] == 0.004]
+    slopes = [run["drift of what steps conserve"]["slope"] for run in runs]
+    mean, error = statistics.mean(slopes), statistics.stdev(slopes) / len(slopes) ** 0.5
+    assert len(runs) == 9 and abs(mean) <= 2 * error < 5e-3
+    assert {run["place"] for run in runs} == {"OpenCL mixed", "OpenCL double", "CUDA mixed", "CUDA double"}
+    assert max(run["residual"] for run in runs) < 5e-9
