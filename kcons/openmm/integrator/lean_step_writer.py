@@ -84,13 +84,16 @@ class LeanStepWriter(StepWriter):
             p.let_others_act()
             p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
             u, h = "v", "(0.5*dt)" if self.halves else "dt"
-            if ensemble.forceless:
+            if self.halves:
+                # What the kick makes of v need not be written: the bath's v follows from where the first half leads.
+                p.each("xu", "x", "where the drift begins")
+                p.each("x", f"x+{h}*({self._kicked('kick*dt', tangent=True)})", "applied forces act, then move freely")
+                p.hold_positions("back onto the constraints of the System")
+                ensemble.middle(p, f"(x-xu)/{h}", lambda: None)  # the second half absorbs what is across
+            elif ensemble.forceless:
                 u = self._kicked("kick*dt", tangent=True, unseen=True)
             else:
                 self._kick("kick*dt", tangent=True)
-            if self.halves:
-                ensemble.middle(p, f"{u}+{self._drift(h, u)}", lambda: None)  # the second half absorbs what is across
-                u = "v"
             p.each("v", f"{u}+{self._drift(h, u)}", "the constraint forces act on v as well")
             if ensemble.stays_tangent:
                 self._project()
