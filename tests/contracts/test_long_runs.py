@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from stepper_systems import PROJECTED, SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
 
+from kcons.comparison import environment, json_files
 from kcons.constraints import Distance
 from kcons.steppers import (
     BlanesMoan4,
@@ -53,9 +54,8 @@ def figures() -> Iterator[dict[str, dict[str, dict[str, float]]]]:
             }
             for kind, runs in found.items()
         }
-        path.write_text(
-            json.dumps({kind: known.get(kind, {}) | runs for kind, runs in rounded.items()}, indent=1) + "\n"
-        )
+        merged = {kind: known.get(kind, {}) | runs for kind, runs in rounded.items()}
+        json_files.write(path, merged | {"machine": environment()})
 
 
 # -- free flight ------------------------------------------------------------------------------------

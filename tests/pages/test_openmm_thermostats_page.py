@@ -20,10 +20,11 @@ def test_page_shows_the_committed_results():
 
 def test_results_are_those_of_a_full_run():
     results = json.loads(RESULTS.read_text(encoding="utf-8"))
-    assert results["full"] and results["machine"]["commit"]
+    assert results["full"] and all(part["machine"]["commit"] for part in results["measurements"].values())
     speed = {name: row["ratio"] for name, row in results["measurements"]["speed"]["rows"].items()}
     assert speed["VerletIntegrator"] == 1.0
-    assert speed["kcons Isokinetic"] >= 0.75
+    assert speed["kcons Isokinetic"] >= 0.8 and speed["kcons rattle"] >= 0.9
+    assert speed["kcons Langevin"] >= 0.9 * speed["LangevinMiddleIntegrator"]
 
 
 def test_a_long_step_of_langevin_is_no_worse_than_a_short_one_of_openmm():
@@ -50,7 +51,6 @@ def _within_three_errors(rows: dict[str, dict[str, float]]) -> None:
 
 def test_kinetic_energies_under_a_chain_are_those_of_the_degrees_of_freedom():
     kinetic = json.loads(RESULTS.read_text(encoding="utf-8"))["measurements"]["kinetic"]
-    assert kinetic["machine"]["commit"]
     _within_three_errors(kinetic["rows"])
 
 
