@@ -177,7 +177,7 @@ def test_wrong_plans(folder, old, new, match):
         read(folder, PLAN.replace(old, new))
 
 
-def test_an_unknown_scheduler(folder):
+def test_an_unknown_scheduler(folder, monkeypatch):
     with pytest.raises(InputError, match="cannot be read"):
         read_plan(folder)
     with pytest.raises(InputError, match="give a path"):
@@ -185,6 +185,8 @@ def test_an_unknown_scheduler(folder):
     with pytest.raises(InputError, match="no file"):
         read_plan(folder / "nothing.toml")
     plan = read(folder, PLAN.replace("processes = 3", 'scheduler = "tcp://127.0.0.1:9"'))
-    pytest.importorskip("distributed")
+    distributed = pytest.importorskip("distributed")
+    client = distributed.Client
+    monkeypatch.setattr(distributed, "Client", lambda address, timeout: client(address, timeout="1s"))
     with pytest.raises((InputError, UnsupportedError), match=r"no scheduler of Dask answers at tcp://127\.0\.0\.1:9"):
         plan.executor()
