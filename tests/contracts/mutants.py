@@ -249,6 +249,18 @@ MUTANTS = [
         "tests/openmm/integrator/test_lean_step_writer.py::test_failure_where_nobody_looked",
     ),
     (
+        "openmm/integrator/lean_step_writer.py",
+        'ensemble.middle(p, f"(x-xu)/{h}", lambda: None)',
+        'ensemble.middle(p, f"v+(x-xu)/{h}", lambda: None)',
+        "tests/openmm/ensembles/test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
+    ),
+    (
+        "openmm/integrator/lean_step_writer.py",
+        "self._kicked('kick*dt', tangent=True)",
+        "self._kicked('0.5*dt', tangent=True)",
+        "tests/openmm/ensembles/test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
+    ),
+    (
         "openmm/ensembles/nose_hoover_ensemble.py",
         'program.let(name, _before(name), "the chain is back where the step began")',
         'program.let(name, name, "the chain is back where the step began")',
