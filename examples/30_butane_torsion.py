@@ -59,7 +59,7 @@ def plan_in(folder: Path, full: bool) -> Path:
     near = atoms.get_all_distances() < np.where((atoms.numbers[:, None] + atoms.numbers) > 7, 1.7, 1.25)
     atoms.info["bonds"] = np.argwhere(np.triu(near, 1))  # the file keeps them; otherwise they are guessed
     write(folder / "butane.xyz", atoms)
-    numbers = {"to": 0, "windows": 10, "relax": 30, "pull": 300, "equilibration": 500, "production": 3000}
+    numbers = {"to": 0, "windows": 10, "relax": 30, "pull": 300, "equilibration": 500, "production": 9000}
     if not full:
         numbers |= {"windows": 4, "relax": 0, "pull": 5, "equilibration": 5, "production": 160}
     text = PLAN.format(atoms=", ".join(map(str, chain)), **numbers)
