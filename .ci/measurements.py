@@ -240,7 +240,7 @@ def row(name: str) -> str:
 def shown(name: str) -> list[str]:
     """What each example of a result prints of it, as pages show it; '' where one cannot, as before a first run."""
     said = []
-    for example in dict.fromkeys(re.findall(r"examples/\w+\.py", " ".join(TABLE[name].commands))):
+    for example in dict.fromkeys(re.findall(r"examples/[\w/]+\.py", " ".join(TABLE[name].commands))):
         option = "--summary" if "--summary" in (ROOT / example).read_text(encoding="utf-8") else "--show"
         words = [sys.executable, example, option, str(RESULTS / name)]
         result = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
