@@ -64,9 +64,9 @@ def script(name: str, *more: str) -> tuple[str, ...]:
 
 HARD = (*OPENMM, "ase", "comparison/hard_cases")
 TABLE = {
-    "ase_dynamics.json": Measurement(ASE, script("05_ase_dynamics")),
-    "butane.json": Measurement((*BATHS, "ase", "free_energy"), script("30_butane_torsion", "--full"), 10),
-    "certificate.json": Measurement(CORE, script("03_engine_speed", "--certificates --full --out F")),
+    "ase_dynamics.json": Measurement(ASE, script("05_ase_dynamics"), 2),
+    "butane.json": Measurement((*BATHS, "ase", "free_energy"), script("30_butane_torsion", "--full"), 12),
+    "certificate.json": Measurement(CORE, script("03_engine_speed", "--certificates --full --out F"), 2),
     "compare_water.json": Measurement(
         (*ASE, "comparison/work_precision", "comparison/methods"),
         ("kcons compare water --out compare-water", "cp compare-water/compare.json F"),
@@ -84,10 +84,10 @@ TABLE = {
         script("29_free_energy", "--full", "--placement", "--recording", "--alanine alanine-windows"),
         None,
     ),
-    "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), None),
+    "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), 11),
     "hard_cases.json": Measurement(HARD, ("kcons hardcases --out hardcases", "cp hardcases/hard_cases.json F"), 6),
     "high_order.json": Measurement(CORE, script("04_high_order")),
-    "killed_runs.json": Measurement(("free_energy",), ("python tests/contracts/killed_runs.py",), None),
+    "killed_runs.json": Measurement(("free_energy",), ("python tests/contracts/killed_runs.py",), 3),
     "long_runs.json": Measurement(
         CORE,
         ("env KCONS_LONG_RUNS=F python -m pytest -m validation tests/contracts/test_long_runs.py",),
@@ -114,7 +114,7 @@ TABLE = {
     "more_free_energies.json": Measurement(
         (*BATHS, "ase", "openmm", "free_energy"), script("35_more_free_energies", "--full more-free-energies"), 80
     ),
-    "openmm.json": Measurement(OPENMM, script("06_openmm"), None),
+    "openmm.json": Measurement(OPENMM, script("06_openmm"), 1),
     "openmm_barostats.json": Measurement(
         (*OPENMM, "thermostats"),
         (
@@ -124,20 +124,20 @@ TABLE = {
         5,
     ),
     "openmm_compare.json": Measurement(OPENMM, script("11_openmm_compare"), 20),
-    "openmm_constraints.json": Measurement(OPENMM, script("08_openmm_constraints"), 20),
+    "openmm_constraints.json": Measurement(OPENMM, script("08_openmm_constraints"), 5),
     "openmm_four_femtoseconds.json": Measurement(OPENMM, script("24_openmm_four_femtoseconds"), None),
-    "openmm_heavy_hydrogens.json": Measurement(OPENMM, script("25_openmm_heavy_hydrogens"), 5),
+    "openmm_heavy_hydrogens.json": Measurement(OPENMM, script("25_openmm_heavy_hydrogens"), 4),
     "openmm_platforms.json": Measurement(
         OPENMM,
         script("23_openmm_platforms", '--platform "CUDA mixed" --full --pdb FILE --out F'),
         None,
         "needs a GPU and a file of DHFR",
     ),
-    "openmm_surfaces.json": Measurement(OPENMM, script("09_openmm_surfaces")),
+    "openmm_surfaces.json": Measurement(OPENMM, script("09_openmm_surfaces"), 1),
     "openmm_thermostats.json": Measurement((*OPENMM, "thermostats"), script("12_openmm_thermostats"), 40),
     "random_cells.json": Measurement(CORE, ("python tests/contracts/random_cells.py --cases 10000 --out F",), 6),
     "report": Measurement((*ASE, "openmm", "comparison"), ("kcons compare --all --out F",), 105),
-    "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), None),
+    "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), 6),
     "solvated_peptide.json": Measurement((*BATHS, "comparison/averages"), script("40_peptide_steps"), 30),
     "stability.json": Measurement(
         (*CORE, "comparison/stability"), ("kcons stability --out stability", "cp stability/stability.json F"), None
