@@ -77,7 +77,7 @@ TABLE = {
         (*script("34_constant_pressure", "--full"), *script("38_constant_pressure_water", "--full")),
         60,
     ),
-    "engine_speed.json": Measurement(CORE, script("03_engine_speed"), 20),
+    "engine_speed.json": Measurement(CORE, script("03_engine_speed"), 4),
     "error_budget.json": Measurement(CORE, script("18_error_budget")),
     "free_energy.json": Measurement(
         (*BATHS, "openmm", "free_energy"),
@@ -123,7 +123,7 @@ TABLE = {
         ),
         5,
     ),
-    "openmm_compare.json": Measurement(OPENMM, script("11_openmm_compare"), 20),
+    "openmm_compare.json": Measurement(OPENMM, script("11_openmm_compare"), 7),
     "openmm_constraints.json": Measurement(OPENMM, script("08_openmm_constraints"), 5),
     "openmm_four_femtoseconds.json": Measurement(OPENMM, script("24_openmm_four_femtoseconds"), None),
     "openmm_heavy_hydrogens.json": Measurement(OPENMM, script("25_openmm_heavy_hydrogens"), 4),

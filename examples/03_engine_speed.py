@@ -1,7 +1,7 @@
 """How fast is the engine, and how exact? Every shape it has a solver for, against the MD engines' own constraints.
 
     python examples/03_engine_speed.py                  small systems, a minute
-    python examples/03_engine_speed.py --full --out F   all sizes and slow peers, twenty minutes; F receives JSON
+    python examples/03_engine_speed.py --full --out F   all sizes and slow peers, four minutes; F receives JSON
     python examples/03_engine_speed.py --certificates   only what certificates take of a run
 
 Times are medians of repeats in one process, one thread, warm. P is the position projection, V the velocity

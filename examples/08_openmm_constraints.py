@@ -1,7 +1,7 @@
 """What kcons' constraint solver does inside OpenMM: speed against CCMA, set-up, steps a second, and hard cases.
 
     python examples/08_openmm_constraints.py                  small systems, a minute
-    python examples/08_openmm_constraints.py --full --out F   everything, twenty minutes; F receives JSON
+    python examples/08_openmm_constraints.py --full --out F   everything, five minutes; F receives JSON
     python examples/08_openmm_constraints.py --full --steps F --out F   the speed of steps again, the rest kept
     python examples/08_openmm_constraints.py --show F         the tables of an earlier result
 

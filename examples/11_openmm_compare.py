@@ -1,7 +1,7 @@
 """OpenMM's own integrators and those of kcons in it: error against cost on molecules, and steps a second in turn.
 
     python examples/11_openmm_compare.py                  alanine dipeptide, half a minute
-    python examples/11_openmm_compare.py --full --out F   and two proteins, twenty minutes; F receives JSON
+    python examples/11_openmm_compare.py --full --out F   and two proteins, seven minutes; F receives JSON
     python examples/11_openmm_compare.py --show F         the tables of an earlier result
     python examples/11_openmm_compare.py --summary F      what it comes to
 
