@@ -62,6 +62,10 @@ def script(name: str, *more: str) -> tuple[str, ...]:
     return tuple(f"python examples/{name}.py {words}" for words in more or ("--full --out F",))
 
 
+SUMMED = (
+    "import sys; from kcons.comparison import json_files; from kcons.comparison.stability.study import digest; "
+    "json_files.write(sys.argv[1], digest(json_files.read('stability/stability.json')))"
+)
 HARD = (*OPENMM, "ase", "comparison/hard_cases")
 TABLE = {
     "ase_dynamics.json": Measurement(ASE, script("05_ase_dynamics"), 2),
@@ -78,7 +82,7 @@ TABLE = {
         60,
     ),
     "engine_speed.json": Measurement(CORE, script("03_engine_speed"), 4),
-    "error_budget.json": Measurement(CORE, script("18_error_budget")),
+    "error_budget.json": Measurement(CORE, script("18_error_budget"), 1),
     "free_energy.json": Measurement(
         (*BATHS, "openmm", "free_energy"),
         script("29_free_energy", "--full", "--placement", "--recording", "--alanine alanine-windows"),
@@ -140,7 +144,9 @@ TABLE = {
     "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), 6),
     "solvated_peptide.json": Measurement((*BATHS, "comparison/averages"), script("40_peptide_steps"), 30),
     "stability.json": Measurement(
-        (*CORE, "comparison/stability"), ("kcons stability --out stability", "cp stability/stability.json F"), None
+        (*CORE, "comparison/stability"),
+        ("kcons stability --out stability", f'python -c "{SUMMED}" F'),
+        8,
     ),
     "step_length.json": Measurement((*BATHS, "comparison/averages"), script("33_step_length"), None),
     "thermostat_cost.json": Measurement((*BATHS, "ase"), script("22_thermostat_cost"), 1),
