@@ -124,6 +124,18 @@ def test_failure_changes_nothing(damage):
     np.testing.assert_array_equal(velocities, c.velocities)
 
 
+def test_a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold():
+    """Lengths and angles are those of the mirror image: only gradients say that the step was half a turn."""
+    c = Rows(seed=5)
+    held = ConstraintSet(CONSTRAINTS[:2], c.x_ref, c.masses)
+    solver = SparseRows(held, np.arange(held.n_rows), c.inv_mass)
+    x = -c.x_ref
+    assert np.all(np.abs(held.value(x)) <= held.tolerance(x))
+    outcome = solver.positions(Request(x, c.x_ref))
+    assert not outcome.converged
+    np.testing.assert_array_equal(x, -c.x_ref)
+
+
 def test_failed_tangents_change_nothing():
     c = Rows(seed=6)
     c.y[3, 1] = np.nan
