@@ -179,13 +179,7 @@ def over_seeds(rows: list[dict[str, Any]], reference: dict[str, Any]) -> list[di
     known, doubt = reference["energy"]
     for name, same in by_name.items():
         if len(same) > 1:
-            means = {
-                key: (
-                    sum(row[key][0] for row in same) / len(same),
-                    math.hypot(*(row[key][1] for row in same)) / len(same),
-                )
-                for key in ("energy", "shift", "turn")
-            }
+            means = {key: mean([row[key] for row in same]) for key in ("energy", "shift", "turn")}
             value, error = means["energy"]
             # Positive where the energy is too high.
             means["bias"] = (100 * (value - known) / abs(known), 100 * math.hypot(error, doubt) / abs(known))
