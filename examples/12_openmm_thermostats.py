@@ -27,7 +27,7 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons.comparison import json_files, measure, scripts
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 TOLERANCE = 1e-8
@@ -98,6 +98,7 @@ def speed(full: bool) -> dict[str, Any]:
     integrators = {
         "VerletIntegrator": openmm.VerletIntegrator(0.002),
         "LangevinMiddleIntegrator": middle(0.002),
+        "kcons RattleIntegrator": RattleIntegrator(0.002),
         "kcons rattle": ProjectedIntegrator(0.002),
         "kcons Isokinetic": isokinetic(0.002),
         "kcons Isokinetic, leapfrog": ProjectedIntegrator(0.002, "leapfrog", ensemble=Isokinetic(TEMPERATURE)),
