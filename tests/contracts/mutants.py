@@ -209,15 +209,33 @@ MUTANTS = [
     # -- programs for OpenMM --
     (
         "openmm/ensembles/isokinetic_ensemble.py",
-        '"max((qq-ww-2*near*wq)/near^2, wq^2/ww)"',
-        '"max(qq-ww-2*near*wq, wq^2/ww)"',
+        '"max(qq-wq, wq^2/ww)"',
+        '"max(qq, wq^2/ww)"',
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_two_sums_do_where_velocities_are_not_read",
     ),
     (
         "openmm/ensembles/isokinetic_ensemble.py",
-        'program.write("exact", float(precision == "double"))',
+        'program.write("exact", float(precision == "double" and not rigid))',
         'program.write("exact", 0.0)',
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
+    ),
+    (
+        "openmm/ensembles/isokinetic_ensemble.py",
+        '"select(behind, exact, 1) != 0"',
+        '"exact != 0"',
+        "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_of_velocities_set_between_calls_only_the_direction_counts",
+    ),
+    (
+        "openmm/integrator/lean_step_writer.py",
+        'p.when("exact+1-between != 0", "kicks need it")',
+        'p.when("1-between != 0", "kicks need it")',
+        "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
+    ),
+    (
+        "openmm/integrator/system_checks.py",
+        "(2 * rows == particles * (particles - 1)).all()",
+        "(rows >= particles - 1).all()",
+        "tests/openmm/integrator/test_system_checks.py::test_rigid_bodies_hold_all_their_distances",
     ),
     (
         "openmm/integrator/step_writer.py",
@@ -251,14 +269,14 @@ MUTANTS = [
     ),
     (
         "openmm/integrator/lean_step_writer.py",
-        'ensemble.middle(p, f"(x-xu)/{h}", lambda: None)',
-        'ensemble.middle(p, f"v+(x-xu)/{h}", lambda: None)',
+        'ensemble.middle(p, f"(x-x_start)/{h}", lambda: None)',
+        'ensemble.middle(p, f"v+(x-x_start)/{h}", lambda: None)',
         "tests/openmm/ensembles/test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
     ),
     (
         "openmm/integrator/lean_step_writer.py",
-        "self._kicked('kick*dt', tangent=True)",
-        "self._kicked('0.5*dt', tangent=True)",
+        'self._kicked("kick*dt", tangent=True, unseen=True)',
+        'self._kicked("0.5*dt", tangent=True, unseen=True)',
         "tests/openmm/ensembles/test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
     ),
     (

@@ -28,9 +28,9 @@ def warm(system, integrator, x, seed):
     return context
 
 
-def in_calls_of_any_length(ensemble):
+def in_calls_of_any_length(ensemble, start=alanine):
     """Check that one motion is made whether steps are called for at once or singly; an integrator that made it."""
-    system, x, v = alanine()
+    system, x, v = start()
     ends = []
     for blocks in ([60], [1] * 60, [7, 30, 23]):
         bath = ensemble()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -91,7 +90,6 @@ class Isokinetic(Value):
 
     stays_tangent = True
     adds_up = True
-    forceless = True
     temperature: float | None
     kinetic_energy: float | None
     convention: Literal["exact", "notes"]
@@ -153,7 +151,7 @@ class Isokinetic(Value):
     def declare(self, program: Program) -> None:
         p = program
         p.number("two_k", "2K, kept; 0 until the first step")
-        p.number("exact", "whether 2K is summed before each kick: in double precision")
+        p.number("exact", "whether v is made tangent before unseen kicks, and 2K summed")
         p.remember("growth", "integral of alpha over time")
         p.number("lost", "kicks that turned velocities round and lost digits")
         p.vector("w", "velocities before a kick")
@@ -162,7 +160,6 @@ class Isokinetic(Value):
             ("wq", "w.M.q, q = h M_par^+ f"),
             ("qq", "q.M.q"),
             ("z", "sqrt(q.M.q/2K)"),
-            ("near", "push/keep of weak kicks"),
             ("aim", "cosine between w and q"),
             ("decay", "exp(-z)"),
             ("sinhc", "exp(-z) sinh(z)/z"),
@@ -191,15 +188,20 @@ class Isokinetic(Value):
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
         """
-        p, of = program, "" if self.atoms is None else "share*"
-        if impulse:
-            p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
-        if impulse or not tangent:
+        p, of, q = program, "" if self.atoms is None else "share*", f"{h}*{force}/m"
+        if unseen:
+            _add_up(p, of, q, f"{of}{h}*{force}*v", project)
+        else:
+            if impulse:
+                p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+            if impulse or not tangent:
+                project()
+            p.each("w", "v", "velocities before the kick")
+            p.each("v", q, "kick by the applied forces alone")
             project()
-        p.each("w", "v", "velocities before the kick")
-        p.each("v", f"{h}*{force}/m", "kick by the applied forces alone")
-        project()
-        _sum_lengths(p, of, unseen)
+            p.sum("wq", f"{of}m*w*v", "along the kick")
+            p.sum("ww", f"{of}m*w*w", "2K before")
+            p.sum("qq", f"{of}m*v*v", "size of the kick")
         # h = 0 where constraints are applied alone: nothing changes then. 1e-300 keeps 0/0 away.
         p.let("z", f"select({h}, max(sqrt(qq/two_k), 1e-300), 1e-300)", "strength of the kick")
         p.let("aim", "min(max(wq/sqrt(max(ww*qq, 1e-300)), -1), 1)", "direction of the kick")
@@ -213,7 +215,8 @@ class Isokinetic(Value):
         # Drifts change the length of velocities at their order; sqrt(two_k/ww) brings it back.
         p.let("keep", f"select({h}, sqrt(two_k/ww), 1)*decay/scale", "share of the velocities")
         p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")
-        return "keep*w+push*v" if self.atoms is None else "select(share, keep*w+push*v, w+v)"
+        turned, plain = (f"keep*v+(push-keep)*{q}", "v") if unseen else ("keep*w+push*v", "w+v")
+        return turned if self.atoms is None else f"select(share, {turned}, {plain})"
 
     def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
         raise NotImplementedError
@@ -259,7 +262,9 @@ class Isokinetic(Value):
             integrator.setPerDofVariableByName("share", share.tolist())
         precision = Precision.of(context).name
         integrator.program.write("two_k", twice)
-        integrator.program.write("exact", float(precision == "double"))
+        # Drifts keep the 2K of rigid bodies, and rounding is larger than what they change where it is not double.
+        rigid = SystemRows.of(context.getSystem()).rigid
+        integrator.program.write("exact", float(precision == "double" and not rigid))
         if abs(found / twice - 1) > ROUNDING[precision]:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
@@ -343,26 +348,23 @@ class Isokinetic(Value):
         return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)) + heat
 
 
-def _sum_lengths(program: Program, of: str, unseen: bool) -> None:
-    """w.M.w, w.M.q and q.M.q of a kick.
+def _add_up(program: Program, of: str, q: str, along: str, project: Callable[[], None]) -> None:
+    """Make v w + q, and find the lengths of a kick that is not seen, without telling w and q apart.
 
-    GPUs wait for each sum. Where another kick follows before v is read, and unless they compute in double precision,
-    w.M.w is taken to be 2K, which drifts keep to fourth order (rigid bodies: to rounding), and q.M.q comes from the
-    length of w + c q. With c near push/keep, velocities get 1 - (push/keep c)^2 of what w.M.w is off by, and the kick
-    that is seen brings 2K back.
+    w + q is v + h f/m made tangent; what v has across the constraints the next drift absorbs. Unless `exact`, v is not
+    made tangent between such kicks, and w.M.w is taken to be 2K, which drifts keep to fourth order (rigid bodies: to
+    rounding); the length of w + q shows what it is off by, and the kick takes that back.
     """
     p = program
-    p.sum("wq", f"{of}m*w*v", "along the kick")
-    with p.when("exact != 0", "sums are cheap") if unseen else nullcontext():
-        p.sum("ww", f"{of}m*w*w", "2K before")
-        p.sum("qq", f"{of}m*v*v", "size of the kick")
-    if unseen:
-        with p.when("exact = 0", "the host waits for each sum"):
-            p.let("ww", "two_k", "2K before, as drifts keep it")
-            p.let("near", "0.5*abs(wq)/ww+sqrt(1+(0.5*wq/ww)^2)", "push/keep of weak kicks, or its inverse")
-            p.let("near", "select(step(wq), near, 1/near)", "push/keep of weak kicks")
-            p.sum("qq", f"{of}m*(w+near*v)^2", "2K before and the size of the kick")
-            p.let("qq", "max((qq-ww-2*near*wq)/near^2, wq^2/ww)", "size of the kick")
+    p.let("ww", "two_k", "2K before, as drifts keep it")
+    with p.when("select(behind, exact, 1) != 0", "to rounding; v may have been changed by whom ever"):
+        p.sum("ww", f"{of}m*v*v", "2K before")
+    p.each("v", f"v+{q}", "the applied forces act")
+    project()
+    p.sum("wq", f"{of}m*v*v", "(w+q).M.(w+q)")
+    p.sum("qq", along, "q.M.(w+q)")
+    p.let("wq", "wq-qq-ww", "along the kick")
+    p.let("qq", "max(qq-wq, wq^2/ww)", "size of the kick")
 
 
 def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np.ndarray:

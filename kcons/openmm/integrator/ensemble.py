@@ -28,8 +28,6 @@ class Ensemble(Protocol):
     adds_up : bool
         Whether two kicks at the same place, which are one of the sum of their times, are made as one. How steps are
         divided into calls then changes the rounding of the motion.
-    forceless : bool
-        Whether what `kick` returns has no forces in it: then it holds after a drift as well, and v need not be written.
     owes : bool
         Whether the end of a step may be left to the next step if the state is not read between; see `open`.
     measures : bool
@@ -38,7 +36,6 @@ class Ensemble(Protocol):
 
     stays_tangent: bool
     adds_up: bool
-    forceless: bool
     owes: bool
     measures: bool
 
@@ -147,7 +144,6 @@ class Ensemble(Protocol):
 class Value:
     """An object whose attributes never change; two are equal if their attributes are."""
 
-    forceless = False
     owes = False
     measures = False
 

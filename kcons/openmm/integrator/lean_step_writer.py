@@ -79,24 +79,24 @@ class LeanStepWriter(StepWriter):
 
     def _write_joined(self) -> None:
         p, ensemble = self.program, self.ensemble
-        use(p, "behind", "kick", "phase")
+        use(p, "behind", "kick", "phase", "x_start")
         with p.when("phase != 2", "up to the new positions"):
             p.let_others_act()
             p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
-            u, h = "v", "(0.5*dt)" if self.halves else "dt"
+            h = "(0.5*dt)" if self.halves else "dt"
+            # What the kick makes of v need not be written: v follows from where the drift leads.
+            u = self._kicked("kick*dt", tangent=True, unseen=True)
+            p.each("x_start", "x", "where the drift begins")
+            p.each("x", f"x+{h}*({u})", "the applied forces act, then move freely (drift)")
+            p.hold_positions("back onto the constraints of the System")
             if self.halves:
-                # What the kick makes of v need not be written: the bath's v follows from where the first half leads.
-                p.each("xu", "x", "where the drift begins")
-                p.each("x", f"x+{h}*({self._kicked('kick*dt', tangent=True)})", "applied forces act, then move freely")
-                p.hold_positions("back onto the constraints of the System")
-                ensemble.middle(p, f"(x-xu)/{h}", lambda: None)  # the second half absorbs what is across
-            elif ensemble.forceless:
-                u = self._kicked("kick*dt", tangent=True, unseen=True)
+                ensemble.middle(p, f"(x-x_start)/{h}", lambda: None)  # the second half absorbs what is across
+                p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
             else:
-                self._kick("kick*dt", tangent=True)
-            p.each("v", f"{u}+{self._drift(h, u)}", "the constraint forces act on v as well")
+                p.each("v", f"(x-x_start)/{h}", "as the drift went")
             if ensemble.stays_tangent:
-                self._project()
+                with p.when("exact+1-between != 0", "kicks need it"):
+                    self._project()
         with p.when("between+delta(phase-1) = 0", "somebody looks at the velocities"):
             self._kick("0.5*dt", tangent=True)
             if not ensemble.stays_tangent:  # otherwise the next drift absorbs what v has across

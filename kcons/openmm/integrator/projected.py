@@ -157,7 +157,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         iterations : int
             How often loops run that solve for positions.
         """
-        lean = {"between": float(not seen), "lean": 1.0}
+        lean = {"between": float(not seen), "behind": float(not seen), "lean": 1.0}
         known = {name: value for name, value in lean.items() if name in self.program.numbers}
         if "exact" in self.program.numbers:
             known["exact"] = self.getGlobalVariableByName("exact")

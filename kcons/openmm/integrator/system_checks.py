@@ -13,6 +13,7 @@ import numpy as np
 import openmm
 from numpy.typing import NDArray
 from openmm import unit
+from scipy.sparse import csr_array
 
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
@@ -116,6 +117,17 @@ class SystemRows:
     @property
     def n_rows(self) -> int:
         return len(self.pairs)
+
+    @property
+    def rigid(self) -> bool:
+        """Whether each molecule that is tied at all is a rigid body: all distances of its particles are held."""
+        from scipy.sparse.csgraph import connected_components  # slow to import
+
+        n = len(self.masses)
+        i, j = np.unique(np.sort(self.pairs, axis=1), axis=0).T
+        count, body = connected_components(csr_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)
+        particles, rows = np.bincount(body, minlength=count), np.bincount(body[i], minlength=count)
+        return bool((2 * rows == particles * (particles - 1)).all())
 
     def stretches(self, x: FloatArray) -> FloatArray:
         """(d - d0)/d0 of each row at positions x, shape (n_rows,), d0 being the nearer of what may be held."""

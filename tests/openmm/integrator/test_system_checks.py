@@ -144,3 +144,26 @@ def test_without_constraints_no_length_is_off():
     system.addParticle(1.0)
     context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
     assert worst_length(context) == ("no constraint of the System", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "rigid"),
+    [
+        ([], True),
+        ([(0, 1)], True),
+        ([(0, 1), (2, 3)], True),
+        ([(0, 1), (1, 2)], False),
+        ([(0, 1), (1, 2), (0, 2)], True),
+        ([(0, 1), (1, 2), (2, 1)], False),
+        ([(0, 1), (1, 2), (0, 2), (3, 4)], True),
+        ([(0, 1), (1, 2), (0, 2), (2, 3)], False),
+        ([(i, j) for i in range(4) for j in range(i)], True),
+    ],
+)
+def test_rigid_bodies_hold_all_their_distances(pairs, rigid):
+    system = openmm.System()
+    for _ in range(5):
+        system.addParticle(1.0)
+    for i, j in pairs:
+        system.addConstraint(i, j, 0.1)
+    assert SystemRows.of(system).rigid is rigid
