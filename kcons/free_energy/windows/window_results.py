@@ -17,6 +17,9 @@ from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.windows.window import Sampler
 
+#: Differences of the two sides that are less probable than this are marked, and widen errors.
+UNLIKELY = 0.01
+
 
 @dataclass(frozen=True)
 class WindowResult:
@@ -28,6 +31,8 @@ class WindowResult:
     value, force, error : ndarray, shape (d,)
         The coordinates, dF/dq and its standard error.
     covariance : ndarray, shape (d, d)
+        Of the mean force. Where the sides differ by more than chance (p < 0.01), neither knows its own error: half
+        their difference is one error more.
     sides : dict of str to MeanForce
         From below and from above.
     hysteresis : float
@@ -138,10 +143,11 @@ def together(
     per = sampler.kJ / sampler.scales
     forces = np.array([side.force * per for side in sides.values()])
     covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
-    chance = math.nan
+    covariance, chance = covariances.sum(axis=0) / len(sides) ** 2, math.nan
     if len(sides) == 2:
         chance = agreement(forces[0], covariances[0], forces[1], covariances[1]).p_value
+        if chance < UNLIKELY:
+            half = (forces[0] - forces[1]) / 2
+            covariance = covariance + np.outer(half, half)
     raw = np.mean([side.raw * per for side in sides.values()], axis=0)
-    return WindowResult(
-        number, target, forces.mean(axis=0), covariances.sum(axis=0) / len(sides) ** 2, sides, chance, raw, seconds
-    )
+    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raw, seconds)

@@ -12,14 +12,12 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.free_energy.averages import FEW_INDEPENDENT
 from kcons.free_energy.profiles.pulls import Pulled
-from kcons.free_energy.windows.window_results import FreeEnergy, WindowResult
+from kcons.free_energy.windows.window_results import UNLIKELY, FreeEnergy, WindowResult
 from kcons.steppers.files import in_one_piece, text
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-#: Differences of the two sides that are less probable than this are marked.
-UNLIKELY = 0.01
 #: Least windows that a profile is drawn through.
 FEWEST = 4
 

@@ -6,9 +6,32 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError
-from kcons.free_energy import FreeEnergy, WindowResult
+from kcons.free_energy import FreeEnergy, MeanForce, WindowResult
+from kcons.free_energy.windows.window_results import together
 
 PERIOD = 2 * np.pi
+
+
+class Units:
+    """Of a sampler, all that is needed here."""
+
+    kJ, scales = 1.0, np.ones(2)
+
+
+def of_two_sides(apart):
+    """A window whose sides, with errors of 0.1 and 0.2, differ by so much."""
+    sides = {
+        name: MeanForce(("a", "b"), np.zeros(2), force, error**2 * np.eye(2), force, 100, 50.0)
+        for name, force, error in (("up", np.zeros(2), 0.1), ("down", np.array(apart), 0.2))
+    }
+    return together(0, np.zeros(2), sides, Units(), 0.0)
+
+
+def test_sides_that_differ_by_more_than_chance_widen_the_error():
+    by_chance, hardly = of_two_sides([0.4, 0.1]), of_two_sides([1.0, 0.1])
+    assert by_chance.hysteresis > 0.01 > hardly.hysteresis
+    np.testing.assert_allclose(by_chance.covariance, 0.0125 * np.eye(2))
+    np.testing.assert_allclose(hardly.covariance, 0.0125 * np.eye(2) + [[0.25, 0.025], [0.025, 0.0025]])
 
 
 def result(place, slope, d=1):
