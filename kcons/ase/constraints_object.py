@@ -17,7 +17,7 @@ from kcons.ase.binding import Binding, applied_forces, bind, check_company, touc
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface, warn_of_displacements
-from kcons.ase.topology import BONDS, bonds_of, named_rows, require_atoms, velocities_of
+from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_form
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
@@ -436,7 +436,7 @@ def constrain(
         atoms.set_constraint(before)
         raise
     if named is not None and named.bonds_guessed:
-        atoms.info[BONDS] = named.topology.bonds
+        keep_guessed(atoms, named.topology.bonds)
         warnings.warn(
             f"{named.bonds_guessed} bonds were guessed from distances and covalent radii; all are now in "
             "atoms.info['bonds'], and are taken from there from now on",

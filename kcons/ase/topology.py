@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import partial
 from typing import Unpack
+from zlib import crc32
 
 import numpy as np
 from ase import Atoms, units
 from ase.data import atomic_masses, atomic_numbers, chemical_symbols
 from numpy.typing import NDArray
 
+from kcons.constraints.arguments import check_pairs
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
-from kcons.topology.guessed_bonds import guess_bonds
+from kcons.topology.guessed_bonds import guess_bonds, reaches
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import (
@@ -43,6 +45,10 @@ __all__ = [
 
 #: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
 BONDS = "bonds"
+#: What bonds that were guessed were guessed for, in ``atoms.info``: atoms that are sorted or cut take both along.
+GUESSED = "bonds_guessed_for"
+#: A guessed bond longer than this times the sum of covalent radii is none of these atoms.
+_STALE = 1.6
 #: ASE's unit of time in ps, to the power that velocities need.
 PS = 1000 * units.fs
 _REMEDY = "put pairs of atoms into atoms.info['bonds']"
@@ -127,7 +133,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
     if known and "atomtypes" in arrays:
         elements, masses = _mended(elements, masses, names, residues, residue_names, "masses" in arrays)
-    bonds = _given_bonds(atoms)
+    bonds, guessed = _given_bonds(atoms)
     charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
     topology = Topology(
         names,
@@ -143,7 +149,12 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     )
     cell = atoms.cell.array.copy() if atoms.pbc.any() else None
     velocities = velocities_of(atoms) * PS if "momenta" in arrays else None
-    return Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
+    made = Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
+    if guessed:
+        long, radii = reaches(made, topology.bonds)
+        if (long > _STALE * radii).any():
+            return replace(made, topology=replace(topology, bonds=np.zeros((0, 2), np.int64)))
+    return made
 
 
 def bonds_of(atoms: Atoms) -> IntArray:
@@ -156,23 +167,36 @@ def bonds_of(atoms: Atoms) -> IntArray:
     InputError
         Bonds that name atoms which do not exist; two atoms on top of each other.
     """
-    given = _given_bonds(atoms)
-    if len(given):
-        return given
-    if not atoms.numbers.any():
-        return given
-    finite = np.flatnonzero(np.isfinite(atoms.positions).all(axis=1))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         snapshot = snapshot_of(atoms)
+    given = snapshot.topology.bonds
+    if len(given) or not atoms.numbers.any():
+        return given
+    finite = np.flatnonzero(np.isfinite(atoms.positions).all(axis=1))
     return finite[guess_bonds(snapshot.subset(finite))]
 
 
-def _given_bonds(atoms: Atoms) -> IntArray:
-    bonds = np.asarray(atoms.info.get(BONDS, np.zeros((0, 2))), dtype=np.int64).reshape(-1, 2)
-    if bonds.size and (bonds.min() < 0 or bonds.max() >= len(atoms)):
-        raise InputError(f"atoms.info['bonds'] names atoms beyond 0 to {len(atoms) - 1}", item="bonds")
-    return bonds
+def keep_guessed(atoms: Atoms, bonds: IntArray) -> None:
+    """Keep bonds that were guessed in ``atoms.info``."""
+    atoms.info[BONDS], atoms.info[GUESSED] = bonds, _stamp(atoms, bonds)
+
+
+def _stamp(atoms: Atoms, bonds: IntArray) -> str:
+    return f"{crc32(bonds.astype('<i8').tobytes()):08x} {crc32(atoms.numbers.astype('<i8').tobytes()):08x}"
+
+
+def _given_bonds(atoms: Atoms) -> tuple[IntArray, bool]:
+    """Bonds in ``atoms.info``, and whether they were guessed; none that were guessed for another order of atoms."""
+    given = atoms.info.get(BONDS)
+    if given is None:
+        return np.zeros((0, 2), np.int64), False
+    bonds = check_pairs(given)
+    said, stamp = str(atoms.info.get(GUESSED, "")), _stamp(atoms, bonds)
+    guessed = said[:8] == stamp[:8]  # otherwise the bonds are somebody's since
+    if guessed and said != stamp:
+        return np.zeros((0, 2), np.int64), True
+    return check_pairs(bonds, len(atoms)), guessed
 
 
 def mend_elements(atoms: Atoms) -> int:

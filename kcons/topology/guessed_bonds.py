@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import minimum_image
@@ -17,6 +18,8 @@ RADII: dict[str, float] = {
 }  # fmt: skip
 #: Atoms closer than this times the sum of their radii are bonded. C-C up to 1.90, C-H 1.34, O-H 1.21 angstrom.
 STRETCH = 1.25
+#: Bonds longer than this times the sum are none of these atoms: those of another order of atoms, or of a cut molecule.
+FAR = 2.0
 #: Atoms closer than this, in angstrom, are one atom twice.
 COINCIDENT = 0.3
 #: Without elements: a bond is shorter than this times the geometric mean of its atoms' distances to their nearest
@@ -52,9 +55,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
         No elements; positions that are not finite; two atoms on top of each other.
     """
     topology = snapshot.topology
-    radius = np.zeros(topology.n_atoms)
-    for symbol, value in RADII.items():
-        radius[topology.elements == symbol] = value
+    radius = _radii(topology.elements)
     able = np.flatnonzero((radius > 0) if among is None else (radius > 0) & among)
     if topology.n_atoms and not (topology.elements != "").any():
         raise InputError(
@@ -89,6 +90,23 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
             atoms=[i, j],
         )
     return sorted_pairs(pairs[_nearest_of_hydrogens(pairs, away, hydrogen)])
+
+
+def reaches(snapshot: Snapshot, bonds: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Length of each bond under minimum images, and the sum of its covalent radii (inf: not known), in angstrom."""
+    i, j = bonds.T
+    d = minimum_image(snapshot.positions[i] - snapshot.positions[j], snapshot.lattice)
+    radius = _radii(snapshot.topology.elements)
+    sums = np.where((radius[i] > 0) & (radius[j] > 0), radius[i] + radius[j], np.inf)
+    return np.linalg.norm(d, axis=1) / snapshot.angstrom, sums
+
+
+def _radii(elements: NDArray[np.str_]) -> FloatArray:
+    """Covalent radii in angstrom, 0 where an element forms no bonds."""
+    radius = np.zeros(len(elements))
+    for symbol, value in RADII.items():
+        radius[elements == symbol] = value
+    return radius
 
 
 def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: IntArray, able: BoolArray) -> IntArray:

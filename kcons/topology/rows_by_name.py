@@ -20,7 +20,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.errors import InputError
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
-from kcons.topology.guessed_bonds import guess_bonds
+from kcons.topology.guessed_bonds import FAR, guess_bonds, reaches
 from kcons.topology.holding import CONSTRAIN, GroupOptions, Holding, RowMaker
 from kcons.topology.rigid_groups import (
     FLAT,
@@ -331,14 +331,17 @@ def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
 
 
 def _refuse_torn(snapshot: Snapshot, bonds: IntArray, longest: float = TORN) -> None:
-    d = minimum_image(snapshot.positions[bonds[:, 0]] - snapshot.positions[bonds[:, 1]], snapshot.lattice)
-    long = np.linalg.norm(d, axis=1) / snapshot.angstrom
-    if len(long) and long.max() > longest:
-        i, j = (int(a) for a in bonds[int(np.argmax(long))])
+    """Raise `InputError` for bonds that are too long for their atoms, or longer than `longest` angstrom."""
+    long, radii = reaches(snapshot, bonds)
+    torn = long > np.minimum(longest, FAR * radii)
+    if torn.any():
+        k = int(np.argmax(np.where(torn, long, 0.0)))
+        i, j = bonds[k].tolist()
         name = snapshot.topology.atom_name
         raise InputError(
-            f"{name(i)} and {name(j)} are bonded and {long.max():.3g} angstrom apart; give the periodic cell, or make "
-            "molecules whole that are cut at its edge; or topology and coordinates are of different systems",
+            f"{name(i)} and {name(j)} are bonded and {long[k]:.3g} angstrom apart; give the periodic cell, or make "
+            "molecules whole that are cut at its edge; or bonds and coordinates are of different systems, or of "
+            "another order of atoms",
             item="positions",
             atoms=[i, j],
         )

@@ -68,7 +68,7 @@ def test_bonds_that_name_no_atoms_are_refused(pair):
     atoms = molecule("H2O")
     atoms.info["bonds"] = [pair]
     for asked in (bonds_of, snapshot_of, constraints_of):
-        with pytest.raises(InputError, match=r"atoms.info\['bonds'\] names atoms beyond 0 to 2"):
+        with pytest.raises(InputError, match=r"bonds has the pair"):
             asked(atoms)
 
 
@@ -162,3 +162,38 @@ def test_a_name_that_is_none_changes_nothing():
     with pytest.raises(InputError, match=r"cannot constrain 'hbond'.*hangles"):
         constrain(atoms, "hbond")
     assert atoms.constraints == [] and "bonds" not in atoms.info
+
+
+def test_guessed_bonds_are_guessed_anew_for_sorted_and_cut_atoms():
+    both = molecule("H2O") + molecule("CH3OH")
+    both.positions[3:] += [5.0, 0.0, 0.0]
+    with pytest.warns(UserWarning, match="guessed"):
+        constrain(both, "hbonds")
+    both.set_constraint()
+    assert len(both.info["bonds"]) == 7
+    rng = np.random.default_rng(0)
+    for order in (np.argsort(both.numbers), rng.permutation(9), rng.permutation(9)[:6], np.arange(1, 9)):
+        other = both[order]
+        bonds = bonds_of(other)
+        expected = bonds_of(Atoms(other.numbers, other.positions))
+        np.testing.assert_array_equal(bonds, expected)
+    far = both.copy()
+    far.positions[1] += [0.0, 0.0, 4.0]
+    assert len(bonds_of(far)) == 6
+
+
+def test_bonds_that_are_far_too_long_are_not_held():
+    """They belong to another order of atoms, in most cases."""
+    atoms = molecule("CH3OH")
+    atoms.info["bonds"] = [[0, 1], [1, 5]]
+    with pytest.raises(InputError, match="another order of atoms"):
+        constraints_of(atoms, "hbonds")
+
+
+@pytest.mark.parametrize("bonds", [[[0, 1, 1], [0, 2, 1]], [[0, 1.7]], "ab", {1: 2}, np.arange(9), 3])
+def test_bonds_that_are_no_pairs_are_refused(bonds):
+    atoms = molecule("CH3OH")
+    atoms.info["bonds"] = bonds
+    for asked in (bonds_of, snapshot_of, constraints_of):
+        with pytest.raises(InputError, match="bonds must be pairs"):
+            asked(atoms)
