@@ -9,9 +9,12 @@ from ase import Atoms
 from ase.geometry import find_mic
 from numpy.typing import NDArray
 
+from kcons.ase.topology import require_atoms
 from kcons.constraints import Distance
+from kcons.constraints.arguments import positive
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
+from kcons.topology.holding import water_geometry
 from kcons.topology.rigid_groups import water_rows
 
 #: O-H length in Angstrom and H-O-H angle in degrees. Jorgensen et al., J. Chem. Phys. 79, 926 (1983).
@@ -38,8 +41,10 @@ def rigid_water(
     Raises
     ------
     InputError
-        If there is no water.
+        No `Atoms`, or no water in it; a geometry or a reach that is none.
     """
+    require_atoms(atoms)
+    reach = positive(reach, "reach")
     z = atoms.numbers
     oxygen = np.flatnonzero((z[:-2] == 8) & (z[1:-1] == 1) & (z[2:] == 1)) if len(z) > 2 else np.zeros(0, int)
 
@@ -62,4 +67,6 @@ def rigid_water(
         if geometry.lower() != "tip3p":
             raise InputError(f"unknown water geometry {geometry!r}; give 'tip3p' or (length, angle)", item="geometry")
         geometry = TIP3P
+    elif geometry is not None:
+        geometry = water_geometry(geometry, "geometry")
     return water_rows(oxygen[:, None] + np.arange(3), geometry)

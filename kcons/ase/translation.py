@@ -9,6 +9,7 @@ import numpy as np
 from ase import Atoms
 from ase.geometry import find_mic
 
+from kcons.ase.topology import require_atoms
 from kcons.constraints import (
     Angle,
     CenterOfMass,
@@ -37,9 +38,12 @@ def from_ase_constraints(atoms: Atoms) -> list[Constraint]:
 
     Raises
     ------
+    InputError
+        No `Atoms`.
     UnsupportedError
         For any other ASE constraint, named.
     """
+    require_atoms(atoms)
     return translated(atoms, atoms.constraints)
 
 

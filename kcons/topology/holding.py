@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -146,12 +147,28 @@ class Holding:
                 )
             length, angle, site = GEOMETRIES[name]
             return (length, angle), site
+        return water_geometry(given, "water_geometry"), 0.0
+
+
+def water_geometry(given: Any, item: str) -> tuple[float, float]:
+    """O-H length (angstrom) and H-O-H angle (degrees) that somebody gave.
+
+    Raises
+    ------
+    InputError
+        No two numbers; no geometry of a water.
+    """
+    try:
         length, angle = (float(v) for v in given)
-        if not (length > 0 and 0 < angle < 180):
-            raise InputError(
-                f"water of O-H {length:g} angstrom and angle {angle:g}: give both positive", item="water_geometry"
-            )
-        return (length, angle), 0.0
+    except (TypeError, ValueError):
+        raise InputError(f"{item} is {given!r:.80}; give (O-H in angstrom, H-O-H in degrees)", item=item) from None
+    if not (0 < length < math.inf and 60 < angle < 180):
+        raise InputError(
+            f"water of O-H {length:g} angstrom and H-O-H {angle:g} degrees: give a positive length, and an angle between "
+            "60 and 180 in degrees",
+            item=item,
+        )
+    return length, angle
 
 
 #: What functions with these options give and refuse.
