@@ -164,8 +164,8 @@ def water_geometry(given: Any, item: str) -> tuple[float, float]:
         raise InputError(f"{item} is {given!r:.80}; give (O-H in angstrom, H-O-H in degrees)", item=item) from None
     if not (0 < length < math.inf and 60 < angle < 180):
         raise InputError(
-            f"water of O-H {length:g} angstrom and H-O-H {angle:g} degrees: give a positive length, and an angle between "
-            "60 and 180 in degrees",
+            f"water of O-H {length:g} angstrom and H-O-H {angle:g} degrees: give a positive length, and an angle "
+            "between 60 and 180 in degrees",
             item=item,
         )
     return length, angle

@@ -64,7 +64,7 @@ def test_geometry_of_water():
     assert Holding().geometry() == (None, 0.0)
     assert Holding(water_geometry="TIP4P/2005").geometry() == ((0.9572, 104.52), 0.1546)
     assert Holding(water_geometry=(1, 109)).geometry() == ((1.0, 109.0), 0.0)
-    with pytest.raises(InputError, match="give both positive"):
+    with pytest.raises(InputError, match="give a positive length"):
         Holding(water_geometry=(np.nan, 109)).geometry()
     assert Holding(rigid_water=False).waters == frozenset()
     assert "MINE" in Holding(water_names=[" mine "]).waters
