@@ -226,6 +226,24 @@ MUTANTS = [
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_of_velocities_set_between_calls_only_the_direction_counts",
     ),
     (
+        "openmm/integrator/guard.py",
+        'write("coarse", float(self.constraints.precision.name == "single"))',
+        'write("coarse", 0.0)',
+        "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_weak_forces_are_not_lost_in_single_precision",
+    ),
+    (
+        "openmm/integrator/system_checks.py",
+        "apex = i if of[j] == of[k] else j if of[j] == sides[j][k] else k",
+        "apex = i",
+        "tests/openmm/integrator/test_system_checks.py::test_triangles_with_unequal_masses_beside_the_apex_are_refused",
+    ),
+    (
+        "openmm/ensembles/respa_ensemble.py",
+        "groups_of(force) - set(self.groups)",
+        "{force.getForceGroup()} - set(self.groups)",
+        "tests/openmm/ensembles/test_respa_ensemble.py::test_forces_in_reciprocal_space_have_a_number_of_steps_too",
+    ),
+    (
         "openmm/integrator/lean_step_writer.py",
         'p.when("exact+1-between != 0", "kicks need it")',
         'p.when("1-between != 0", "kicks need it")',

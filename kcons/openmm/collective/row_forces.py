@@ -14,7 +14,7 @@ from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.system_checks import ROW_NAME
+from kcons.openmm.integrator.system_checks import ROW_NAME, groups_of
 from kcons.openmm.quantities import nanometers
 
 #: Force groups of OpenMM.
@@ -277,14 +277,7 @@ def unit_of(force: openmm.Force) -> unit.Unit | None:
 
 def used_groups(system: openmm.System) -> set[int]:
     """The force groups that Forces of the System are in."""
-    used = set()
-    for force in system.getForces():
-        used.add(force.getForceGroup())
-        if hasattr(force, "getReciprocalSpaceForceGroup"):
-            reciprocal = force.getReciprocalSpaceForceGroup()
-            if reciprocal >= 0:
-                used.add(reciprocal)
-    return used
+    return set().union(*(groups_of(force) for force in system.getForces()))
 
 
 def place(system: openmm.System, forces: Sequence[openmm.Force | int]) -> list[int]:

@@ -352,7 +352,7 @@ def _add_up(program: Program, of: str, q: str, along: str, project: Callable[[],
     """Make v w + q, and find the lengths of a kick that is not seen, without telling w and q apart.
 
     w + q is v + h f/m made tangent; what v has across the constraints the next drift absorbs. Unless `exact`, v is not
-    made tangent between such kicks, and w.M.w is taken to be 2K, which drifts keep to fourth order (rigid bodies: to
+    made tangent between such kicks, and w.M.w is taken to be 2K, which drifts keep to third order (rigid bodies: to
     rounding); the length of w + q shows what it is off by, and the kick takes that back.
     """
     p = program

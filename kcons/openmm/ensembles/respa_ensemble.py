@@ -14,6 +14,7 @@ from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.step_variables import use
+from kcons.openmm.integrator.system_checks import groups_of
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.multistep.nesting import SlowKicks, levels_of, middle_of, nested
@@ -154,9 +155,10 @@ class LangevinRespa(Langevin):
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
         system = context.getSystem()
         for force in system.getForces():
-            if force.getForceGroup() not in self.groups:
+            left = groups_of(force) - set(self.groups)
+            if left:
                 raise InputError(
-                    f"{type(force).__name__} is in force group {force.getForceGroup()}, which has no number of steps; "
+                    f"{type(force).__name__} is in force group {min(left)}, which has no number of steps; "
                     f"there are {', '.join(map(str, self.groups))}",
                     item="steps",
                 )

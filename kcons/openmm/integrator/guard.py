@@ -184,6 +184,8 @@ class Guard:
         self.constraints = SystemConstraints(context, integrator)
         self.rows = self.constraints.rows
         integrator.take_precision(self.constraints.precision)
+        if "coarse" in integrator.program.numbers:
+            integrator.program.write("coarse", float(self.constraints.precision.name == "single"))
         refuse_old_positions(integrator, self.system, self.constraints.precision)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))

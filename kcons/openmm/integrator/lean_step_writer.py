@@ -79,21 +79,28 @@ class LeanStepWriter(StepWriter):
 
     def _write_joined(self) -> None:
         p, ensemble = self.program, self.ensemble
-        use(p, "behind", "kick", "phase", "x_start")
+        use(p, "behind", "kick", "phase", "x_start", "coarse")
         with p.when("phase != 2", "up to the new positions"):
             p.let_others_act()
             p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
             h = "(0.5*dt)" if self.halves else "dt"
-            # What the kick makes of v need not be written: v follows from where the drift leads.
             u = self._kicked("kick*dt", tangent=True, unseen=True)
-            p.each("x_start", "x", "where the drift begins")
-            p.each("x", f"x+{h}*({u})", "the applied forces act, then move freely (drift)")
-            p.hold_positions("back onto the constraints of the System")
-            if self.halves:
-                ensemble.middle(p, f"(x-x_start)/{h}", lambda: None)  # the second half absorbs what is across
+            with p.when("coarse != 0", "where a drift leads does not tell v: the impulse alone is read from it"):
+                p.each("v", u, "the applied forces act (kick)")
+                if self.halves:
+                    ensemble.middle(p, f"v+{self._drift(h)}", lambda: None)
+                else:
+                    p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
+            with p.when("coarse = 0", "v need not be written: it follows from where the drift leads"):
+                p.each("x_start", "x", "where the drift begins")
+                p.each("x", f"x+{h}*({u})", "the applied forces act, then move freely (drift)")
+                p.hold_positions("back onto the constraints of the System")
+                if self.halves:
+                    ensemble.middle(p, f"(x-x_start)/{h}", lambda: None)
+                else:
+                    p.each("v", f"(x-x_start)/{h}", "as the drift went")
+            if self.halves:  # this half absorbs what noise has across the constraints
                 p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
-            else:
-                p.each("v", f"(x-x_start)/{h}", "as the drift went")
             if ensemble.stays_tangent:
                 with p.when("exact+1-between != 0", "kicks need it"):
                     self._project()

@@ -159,8 +159,8 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         """
         lean = {"between": float(not seen), "behind": float(not seen), "lean": 1.0}
         known = {name: value for name, value in lean.items() if name in self.program.numbers}
-        if "exact" in self.program.numbers:
-            known["exact"] = self.getGlobalVariableByName("exact")
+        for name in {"exact", "coarse"} & set(self.program.numbers):
+            known[name] = self.getGlobalVariableByName(name)
         return count_step(self.program, iterations=iterations, **known)
 
     # -- running --------------------------------------------------------------------------------

@@ -52,6 +52,7 @@ VARIABLES = {
     "behind": Variable("number", "1 where v (or raw, where a call has ended) lacks what ends a step"),
     "led": Variable("number", "the same when the last drift began"),
     "looked": Variable("number", "1 if somebody may have looked since the last step", 1.0),
+    "coarse": Variable("number", "1 in single precision: rounding of x, divided by a time step, is much beside a kick"),
     "moving": Variable("control", "1 where barostats may move x between steps"),
     "moved": Variable("number", "how far others have moved x or v since the last step"),
     "stale": Variable("number", "1 at a fresh start, and when forces must be computed anew", 1.0),

@@ -209,6 +209,12 @@ def _settled(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:
     return held[pairs[:, 0]] & held[pairs[:, 1]] if len(pairs) else np.zeros(0, bool)
 
 
+def groups_of(force: openmm.Force) -> set[int]:
+    """The force groups of a Force: that of its sum in reciprocal space may be another."""
+    reciprocal = force.getReciprocalSpaceForceGroup() if hasattr(force, "getReciprocalSpaceForceGroup") else -1
+    return {force.getForceGroup(), reciprocal} - {-1}
+
+
 def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
     return (system.getForce(k) for k in range(system.getNumForces()))
 
@@ -264,14 +270,34 @@ def check_system(system: openmm.System) -> None:
     ------
     UnsupportedError
         Particles or forces that need an integrator of their own, a barostat that scales atoms one by one although
-        bonds are held.
+        bonds are held, rigid triangles that OpenMM's solver gets wrong.
     """
+    _refuse_lopsided(SystemRows.of(system))
     for force in forces_of(system):
         name = type(force).__name__
         if name in _FOREIGN:
             raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
         if system.getNumConstraints() and _scales_atoms(force):
             raise UnsupportedError(f"the System has constraints, and {_ATOM_BY_ATOM}")
+
+
+def _refuse_lopsided(rows: SystemRows) -> None:
+    """OpenMM's SETTLE takes the two particles beside the apex to have one mass, and moves others wildly."""
+    sides: dict[int, dict[int, float]] = {}
+    for (i, j), d in zip(rows.pairs[rows.settled].tolist(), rows.lengths[rows.settled].tolist(), strict=True):
+        sides.setdefault(min(i, j), {})[max(i, j)] = d
+    for i, of in sides.items():
+        if len(of) < 2:
+            continue
+        j, k = sorted(of)
+        apex = i if of[j] == of[k] else j if of[j] == sides[j][k] else k
+        first, second = (n for n in (i, j, k) if n != apex)
+        if rows.masses[first] != rows.masses[second]:
+            raise UnsupportedError(
+                f"particles {i}, {j} and {k} are a rigid triangle, of which {first} and {second} have the masses "
+                f"{rows.masses[first]:g} and {rows.masses[second]:g}: OpenMM's SETTLE needs equal ones, and moves "
+                "others wildly. Hold it with kcons: take_constraints(system, keep_water=False), then hold"
+            )
 
 
 def _scales_atoms(force: openmm.Force) -> bool:

@@ -6,7 +6,7 @@ import pytest
 from ensemble_runs import run
 from openmm import unit
 from openmm_parts import HeldCoordinates
-from openmm_systems import GPUS, PLATFORMS, alanine, context_of, state_of, water_box
+from openmm_systems import GPUS, PLATFORMS, alanine, context_of, started, state_of, water_box
 
 from kcons import ConstraintSet, Motion, State, System
 from kcons import run as steps_of
@@ -238,3 +238,19 @@ def test_temperature_friction_and_files():
     read = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(integrator))
     assert read.ensemble == integrator.ensemble
     assert isinstance(ensemble, Langevin)
+
+
+def test_forces_in_reciprocal_space_have_a_number_of_steps_too():
+    """Those of a group of their own would be left out."""
+    system, x = water_box(8, spacing=0.4)
+    force = next(force for force in system.getForces() if isinstance(force, openmm.NonbondedForce))
+    force.setNonbondedMethod(openmm.NonbondedForce.PME)
+    force.setReciprocalSpaceForceGroup(2)
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, {0: 1, 1: 2}))
+    context = started(system, integrator, x)
+    with pytest.raises(InputError, match="force group 2"):
+        integrator.step(1)
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, {0: 2, 2: 1}))
+    context = started(system, integrator, x)
+    integrator.step(1)
+    assert np.isfinite(context.getState(energy=True).getPotentialEnergy()._value)

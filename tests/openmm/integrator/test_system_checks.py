@@ -8,6 +8,7 @@ import pytest
 from openmm import app, unit
 from openmm_systems import (
     PLATFORMS,
+    context_of,
     dumbbell,
     started,
     state_of,
@@ -167,3 +168,25 @@ def test_rigid_bodies_hold_all_their_distances(pairs, rigid):
     for i, j in pairs:
         system.addConstraint(i, j, 0.1)
     assert SystemRows.of(system).rigid is rigid
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (2, 1, 0)])
+@pytest.mark.parametrize("heavier", [0, 1, 2])
+def test_triangles_with_unequal_masses_beside_the_apex_are_refused(order, heavier):
+    """OpenMM's SETTLE: HDO gains momentum from nothing. Heavy apexes are the rule."""
+    system, x = openmm.System(), np.array([[0.0, 0.0585882, 0.0], [-0.075695, 0.0, 0.0], [0.075695, 0.0, 0.0]])
+    masses = np.array([16.0, 1.0, 1.0])
+    masses[heavier] *= 2
+    for k in order:
+        system.addParticle(masses[k])
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        system.addConstraint(i, j, 0.15139 if 0 not in (order[i], order[j]) else 0.09572)
+    integrator = ProjectedIntegrator(1e-3)
+    context = context_of(system, integrator)
+    context.setPositions(x[list(order)])
+    if heavier == 0:
+        integrator.applyConstraints(context)
+        integrator.step(1)
+        return
+    with pytest.raises(UnsupportedError, match=r"particles 0, 1 and 2 .* SETTLE"):
+        integrator.step(1)
