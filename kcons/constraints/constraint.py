@@ -68,6 +68,8 @@ class Constraint(ABC):
     functions: ClassVar[tuple[str, ...]] = ()
     #: What targets are, for Quantities.
     held: ClassVar[Kind] = LENGTH
+    #: Whether kernels square the target, so that one below zero would hold its opposite.
+    squared: ClassVar[bool] = False
     #: Whether the coordinate depends on the masses of its atoms.
     uses_masses: ClassVar[bool] = False
 
@@ -164,7 +166,18 @@ class Constraint(ABC):
         """What each row is held at, shape (n_rows,)."""
         if self.target is None:
             raise ConstraintError(f"{self!r} has no target; put it in a ConstraintSet first")
-        return self.target.at(time, self.n_rows) if isinstance(self.target, MovingTarget) else self.target
+        if not isinstance(self.target, MovingTarget):
+            return self.target
+        target = self.target.at(time, self.n_rows)
+        if self.squared and not (target > 0).all():
+            k = int(np.argmin(target))
+            raise InputError(
+                f"{self.row_name(k)}: target {target[k]:g} is not positive at t = {time:g}; give a function that stays "
+                "above zero, or end the run before",
+                item="target",
+                atoms=self.atoms[k].tolist(),
+            )
+        return target
 
     def parameters(self) -> FloatArray:
         """Numbers for the compiled kernels, shape (n_rows, p); see `RowKind`."""
@@ -180,6 +193,16 @@ class Constraint(ABC):
 
         `first_row` is the number of this object's first row in its set, for messages.
         """
+
+    def check_target(self, time: float, first_row: int) -> None:
+        """Raise `InputError` where derivatives of a moving target that were given contradict it."""
+        said = self.target.contradiction(time, self.n_rows) if isinstance(self.target, MovingTarget) else ""
+        if said:
+            raise InputError(
+                f"{self!r}, row {first_row} on: the target contradicts itself: {said}; correct it, or leave the "
+                "derivatives out",
+                item="target",
+            )
 
     def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
         """Raise where rows are undefined.

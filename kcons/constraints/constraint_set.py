@@ -117,6 +117,7 @@ class ConstraintSet(InCell):
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)
             item.check(r, time, int(start))
+            item.check_target(time, int(start))
             if item.target is None:
                 item = item.with_target(
                     item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)

@@ -43,6 +43,7 @@ class Distance(Constraint):
     """
 
     family = "Distance"
+    squared = True
     row_width = 2
     translation_invariant = True
     kind = RowKind.DISTANCE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -68,6 +69,26 @@ class MovingTarget:
         if self.rate is not None:
             return first_derivative(lambda t: self.rate_at(t, rows), time, self.time_step)
         return second_derivative(lambda t: self.at(t, rows), time, self.time_step)
+
+    def contradiction(self, time: float, rows: int) -> str:
+        """What a given derivative and differences say at two times soon after `time`, where they differ; or ''."""
+        said = ""
+        for name, given, function in (("rate", self.rate, self.at), ("acceleration", self.acceleration, self.rate_at)):
+            if given is None:
+                continue
+            for later in (1.3, 2.7):  # at one alone there may be a kink
+                t, h = time + later * self.time_step, 0.1 * self.time_step
+                derivative = _per_row(given(t), rows, t)
+                coarse, fine = (first_derivative_4(partial(function, rows=rows), t, step) for step in (h, h / 2))
+                size = np.maximum(np.abs(derivative), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)) / h
+                wrong = (np.abs(fine - derivative) > 0.01 * size) & (np.abs(fine - coarse) <= 1e-3 * size)
+                if not wrong.any():
+                    break
+                k = int(np.argmax(wrong))
+                said = f"its {name} is {derivative[k]:.6g} at t = {t:g}, but differences give {fine[k]:.6g}"
+            else:
+                return said
+        return ""
 
 
 Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None

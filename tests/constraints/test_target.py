@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kcons import ConstraintSet
+from kcons.constraints import Distance
 from kcons.constraints.target import MovingTarget, as_target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
 
@@ -75,3 +77,27 @@ def test_order(formula, expected, order):
     steps = np.array([0.4, 0.2, 0.1])
     errors = [abs(float(formula(lambda t: np.asarray(np.sin(t)), 0.3, h)) - expected) for h in steps]
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(order, abs=0.1)
+
+
+def test_derivatives_that_contradict_a_moving_target_are_refused():
+    """They would move the atoms off it without another sign."""
+    x, masses = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.ones(2)
+    right = MovingTarget(lambda t: 1 + 0.01 * np.sin(t), lambda t: 0.01 * np.cos(t), lambda t: -0.01 * np.sin(t))
+    ConstraintSet(Distance([[0, 1]], right), x, masses)
+    kinked = MovingTarget(lambda t: 1 + 0.01 * max(t, 0.026), lambda t: 0.01 * (t > 0.026))
+    ConstraintSet(Distance([[0, 1]], kinked), x, masses)
+    for rate, acceleration, said in (
+        (lambda t: -0.01 * np.cos(t), None, "its rate is -0.00"),
+        (lambda t: 0.01 * np.cos(t), lambda t: 0.01 * np.cos(t), "its acceleration is 0.0"),
+    ):
+        target = MovingTarget(right.value, rate, acceleration)
+        with pytest.raises(InputError, match=said):
+            ConstraintSet(Distance([[0, 1]], target), x, masses)
+
+
+def test_a_distance_that_moves_below_zero_is_refused_there():
+    x, masses = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.ones(2)
+    held = ConstraintSet(Distance([[0, 1]], lambda t: 1 - t), x, masses)
+    assert held.target(0.9) == pytest.approx(0.1)
+    with pytest.raises(InputError, match=r"Distance\(0, 1\): target -0.5 is not positive at t = 1.5"):
+        held.target(1.5)

@@ -21,6 +21,8 @@ from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate
 
 #: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
 START_TOLERANCE = 1e-10
+#: Relative deviation of a given derivative from differences that counts as a mistake.
+_WRONG = 0.01
 EPSILON = float(np.finfo(np.float64).eps)
 
 
@@ -133,11 +135,57 @@ class HolonomicRow(Row):
         return -evaluate(self._time_derivative, p, 0, self.vectorized, f"time derivative of {self.name}")
 
     def bind(self, p: Populations) -> Self:
+        self.check_derivatives(p)
         if self.target is not None:
             return self
         bound = copy.copy(self)
         bound.target = self.measure(p)
         return bound
+
+    def check_derivatives(self, p: Populations) -> None:
+        """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign.
+
+        Raises
+        ------
+        InputError
+        """
+        if self._gradient is not None:
+            given, found = self.gradient(p) * p.x, relative_differences(self.measure, p) * p.x
+            wrong = np.abs(given - found) > _WRONG * np.abs(found).sum(axis=0)
+            if wrong.any():
+                k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
+                raise InputError(
+                    f"gradient of {self.name}: {(given / p.x)[k]:.6g} for species {k[0]}, but differences of the "
+                    f"function give {(found / p.x)[k]:.6g}; correct it, or leave it out",
+                    item="gradient",
+                )
+        if self._time_derivative is None:
+            self._compare_rates(p, 0.0, "depends on time, but has no time_derivative: give it")
+        else:
+            self._compare_rates(p, -self.rate(p), "has another time_derivative than its differences: correct it")
+
+    def _compare_rates(self, p: Populations, given: FloatArray | float, said: str) -> None:
+        """Compare a derivative in time at the state `p` with differences, where these are smooth."""
+        coarse, fine = (self._rate_by_differences(p, h) for h in (1e-3, 5e-4))
+        size = np.maximum(np.abs(given), np.abs(fine)) + 1e-9 * self._magnitude(p)
+        wrong = (np.abs(fine - given) > _WRONG * size) & (np.abs(fine - coarse) <= 0.1 * _WRONG * size)
+        if np.any(wrong):
+            k = int(np.argmax(wrong))
+            values = [float(np.broadcast_to(v, np.shape(wrong)).ravel()[k]) for v in (given, fine)]
+            raise InputError(
+                f"{self.name} {said} ({values[0]:.6g}; differences give {values[1]:.6g})", item="time_derivative"
+            )
+
+    def _rate_by_differences(self, p: Populations, h: float) -> FloatArray:
+        later, earlier = (self._at_time(Populations.from_logarithms(p.time + dt, p.log_x)) for dt in (h, -h))
+        return (later - earlier) / (2 * h)
+
+    def _at_time(self, p: Populations) -> FloatArray:
+        """What changes with time at fixed x."""
+        return self.measure(p)
+
+    def _magnitude(self, p: Populations) -> FloatArray:
+        return np.abs(self.measure(p))
 
     def take(self, lanes: NDArray[np.intp]) -> Self:
         return taken(self, lanes, "target")
@@ -200,7 +248,17 @@ class LinearRow(HolonomicRow):
         return self._moved(p, 1) if self.moving else 0.0
 
     def bind(self, p: Populations) -> Self:
-        return self if self.moving else super().bind(p)
+        if not self.moving:
+            return super().bind(p)
+        self.check_derivatives(p)
+        return self
+
+    def check_derivatives(self, p: Populations) -> None:
+        if self.moving:
+            self._compare_rates(p, self.rate(p), "has another rate of its target than differences of it: correct it")
+
+    def _at_time(self, p: Populations) -> FloatArray:
+        return self._moved(p, 0)
 
 
 class TotalPopulation(LinearRow):

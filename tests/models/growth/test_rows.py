@@ -54,7 +54,7 @@ def test_rate_is_minus_the_time_derivative():
 
 
 def test_target_is_what_the_start_gives():
-    row = HolonomicRow(product).bind(P)
+    row = HolonomicRow(product, None, lambda t, x: -x[0] * x[1] ** 2 * np.exp(-t)).bind(P)
     assert row.value(P) == 0.0
     with pytest.raises(ConstraintError, match="no target"):
         HolonomicRow(product).value(P)
@@ -102,3 +102,21 @@ def test_start_off_a_row_is_refused():
 def test_bad_rows_are_refused(make):
     with pytest.raises(InputError):
         make()
+
+
+@pytest.mark.parametrize("p", [P, MANY])
+def test_derivatives_that_contradict_their_function_are_refused(p):
+    def rate(t, x):
+        return -x[0] * x[1] ** 2 * np.exp(-t)
+
+    HolonomicRow(product, product_gradient, rate, vectorized=True).bind(p)
+    for gradient, given, said in (
+        (lambda t, x: 1.1 * product_gradient(t, x), rate, "gradient of holonomic row: 1.83"),
+        (product_gradient, None, "depends on time, but has no time_derivative"),
+        (product_gradient, lambda t, x: -rate(t, x), "another time_derivative"),
+    ):
+        with pytest.raises(InputError, match=said):
+            HolonomicRow(product, gradient, given, vectorized=True).bind(p)
+    LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, 0.1)).bind(p)
+    with pytest.raises(InputError, match="another rate of its target"):
+        LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, -5.0)).bind(p)
