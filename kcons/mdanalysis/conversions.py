@@ -94,7 +94,7 @@ def to_ase(universe: Any, constraints: Iterable[Constraint] = ()) -> ase.Atoms:
     Raises
     ------
     InputError, ConstraintError
-        What does not fit the atoms.
+        What does not fit the atoms, such as rows that were made for another group.
 
     Warns
     -----
@@ -166,7 +166,8 @@ def to_openmm(
     Raises
     ------
     InputError
-        The force field does not know a residue; a cell that OpenMM does not take; atoms of a residue scattered.
+        The force field does not know a residue; a cell that OpenMM does not take; atoms of a residue scattered; rows
+        that were made for another group.
     """
     return _openmm(snapshot_of(universe), constraints, 1.0, force_field, options)
 
@@ -321,8 +322,9 @@ def _warn_of_cut(snapshot: Snapshot) -> None:
 
 
 def _with_bonds_of(snapshot: Snapshot, constraints: Iterable[Constraint]) -> Snapshot:
-    """Bonds that were guessed for the constraints are worth keeping."""
-    if isinstance(constraints, HeldRows) and constraints.topology.n_atoms == snapshot.topology.n_atoms:
+    """Bonds that were guessed for the constraints are worth keeping; rows of other atoms are refused."""
+    if isinstance(constraints, HeldRows):
+        constraints.require_atoms(snapshot.topology.n_atoms, snapshot.indices, snapshot.host)
         return replace(snapshot, topology=snapshot.topology.with_bonds(constraints.topology.bonds))
     return snapshot
 

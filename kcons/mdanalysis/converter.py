@@ -11,6 +11,7 @@ from kcons.constraints.constraint import Constraint, constraints_in
 from kcons.errors import InputError
 from kcons.mdanalysis.conversions import to_ase
 from kcons.mdanalysis.topology import constraints_of
+from kcons.topology.rows_by_name import HeldRows
 
 if TYPE_CHECKING:
     import ase
@@ -46,7 +47,8 @@ class ASEConverter(ConverterBase):  # type: ignore[misc]
         InputError
             Both `constrain` and `constraints`, or options without a name.
         """
-        given = constraints_in(constraints, "constraints")
+        # Rows by name know their atoms; a plain list of them would not.
+        given = constraints if isinstance(constraints, HeldRows) else constraints_in(constraints, "constraints")
         if given and constrain is not None:
             raise InputError("give constrain, a name, or constraints, a list; not both", item="constraints")
         if options and constrain is None:

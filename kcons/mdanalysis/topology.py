@@ -124,7 +124,7 @@ def snapshot_of(universe: Any) -> Snapshot:
     if step.dimensions is not None and np.all(step.dimensions[:3] > 2.0):
         cell = _cell(step)
     velocities = as_written(group.velocities) if step.has_velocities else None
-    return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, f"topology {_file(whole)}")
+    return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
 
 
 def _require_atoms(universe: Any) -> None:
@@ -206,6 +206,11 @@ def _texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
         return np.full(n, "")
     values = np.asarray(getattr(holder, name))
     return values.astype(str) if n else np.zeros(0, dtype="U1")
+
+
+def host_of(whole: Any) -> str:
+    """Where a `Snapshot` of a Universe says that it came from."""
+    return f"topology {_file(whole)}"
 
 
 def _file(whole: Any) -> str:

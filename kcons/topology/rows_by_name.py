@@ -66,6 +66,33 @@ class HeldRows(list[Constraint]):
     def topology(self) -> Topology:
         return self.snapshot.topology
 
+    def require_atoms(self, n: int, indices: IntArray | None, host: str) -> None:
+        """Refuse these rows for another system, or for another part of the same; `indices`, `host` as of a `Snapshot`.
+
+        Raises
+        ------
+        InputError
+        """
+        mine = self.snapshot
+        remedy = "make them for the same atoms: constraints_of(group), with the group that is given here"
+        if mine.topology.n_atoms != n:
+            raise InputError(
+                f"the rows were made for {mine.topology.n_atoms} atoms, and there are {n} here; {remedy}",
+                item="constraints",
+            )
+        # Numbers in different files say nothing about each other.
+        if mine.indices is None or indices is None or mine.host != host:
+            return
+        differ = np.flatnonzero(mine.indices != indices)
+        if len(differ):
+            k = int(differ[0])
+            raise InputError(
+                f"the rows were made for other atoms: their atom {k} is atom {mine.indices[k]} of the Universe, and "
+                f"here it is atom {indices[k]}; {remedy}",
+                item="constraints",
+                atoms=[k],
+            )
+
     def row_name(self, row: int) -> str:
         """For example '#7 Distance: OW of SOL 12 (atom 33), HW1 of SOL 12 (atom 34)'."""
         item, _ = self.constraint_set.locate(row)

@@ -159,6 +159,8 @@ class Snapshot:
         In units of the positions a picosecond.
     host : str
         Where it came from, for messages.
+    indices : ndarray of int, shape (n_atoms,), or None
+        The numbers that the atoms have there, where it may be a part.
     """
 
     topology: Topology
@@ -168,6 +170,7 @@ class Snapshot:
     pbc: BoolArray = field(default_factory=lambda: np.zeros(3, dtype=bool))
     velocities: FloatArray | None = None
     host: str = ""
+    indices: IntArray | None = None
 
     def __post_init__(self) -> None:
         if self.positions.shape != (self.topology.n_atoms, 3):
@@ -202,6 +205,7 @@ class Snapshot:
             topology=self.topology.subset(atoms),
             positions=self.positions[atoms],
             velocities=None if self.velocities is None else self.velocities[atoms],
+            indices=None if self.indices is None else self.indices[atoms],
         )
 
 

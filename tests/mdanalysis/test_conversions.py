@@ -224,3 +224,18 @@ def test_molecules_cut_by_a_box_that_is_not_there_are_said():
         whole = ethane_cut(box=False)
         whole.atoms[2:].positions += [10.0, 0.0, 0.0]
         to_ase(whole)
+
+
+def test_rows_of_another_group_are_refused(villin):
+    water = villin.select_atoms("resname HOH SOL WAT TIP3")
+    ten, other = water[30:60], water[:30]
+    rows = quietly(constraints_of, ten, "none")
+    for convert in (to_ase, to_openmm, lambda group, held: group.convert_to("ASE", constraints=held)):
+        with pytest.raises(InputError, match=rf"made for 30 atoms, and there are {len(water)} here.*constraints_of"):
+            convert(water, rows)
+        with pytest.raises(InputError, match=rf"atom 0 is atom {ten.indices[0]} .*here it is atom {other.indices[0]}"):
+            convert(other, rows)
+    (held,) = ten.convert_to("ASE", constraints=rows).constraints
+    assert held.get_removed_dof(to_ase(ten)) == 30
+    # Another file of the same atoms may number them otherwise.
+    assert len(to_ase(mda.Merge(ten), rows).constraints) == 1

@@ -35,6 +35,8 @@ from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
+from kcons.mdanalysis.topology import host_of
+from kcons.topology.rows_by_name import HeldRows
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
 #: in how many frames at least.
@@ -82,7 +84,7 @@ class ConstraintCheck(AnalysisBase):
     Raises
     ------
     InputError
-        No constraints; constraints on atoms that do not exist; a bad option.
+        No constraints; constraints on atoms that do not exist; rows that were made for a part; a bad option.
 
     Notes
     -----
@@ -114,6 +116,8 @@ class ConstraintCheck(AnalysisBase):
     ) -> None:
         universe = atoms.universe
         super().__init__(universe.trajectory, **options)
+        if isinstance(constraints, HeldRows):
+            constraints.require_atoms(len(universe.atoms), universe.atoms.indices, host_of(universe))
         if isinstance(constraints, ConstraintSet):
             given: tuple[Constraint, ...] = constraints.constraints
         else:

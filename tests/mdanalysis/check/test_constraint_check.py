@@ -9,7 +9,7 @@ from water_files import mda
 
 from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, LinearRelation
 from kcons.errors import InputError
-from kcons.mdanalysis import ConstraintCheck, load_trajectory
+from kcons.mdanalysis import ConstraintCheck, constraints_of, load_trajectory
 
 N, SIDE = 40, 12.0
 
@@ -294,3 +294,12 @@ def test_bodies_longer_than_half_the_cell_are_seen_whole(tmp_path, targets):
     largest = np.array(result.series["largest Å"])
     assert largest[[0, 1, 2, 3, 4, 6, 7]].max() < 1e-5
     assert 0.02 < largest[5] < 0.2
+
+
+def test_rows_that_were_made_for_a_part_are_refused(water):
+    whole = loaded(water["dcd"])
+    with pytest.raises(InputError, match=rf"made for 30 atoms, and there are {3 * N} here"):
+        ConstraintCheck(whole, constraints_of(whole.atoms[30:60], "none"))
+    with pytest.raises(InputError, match="their atom 0 is atom 3 of the Universe, and here it is atom 0"):
+        ConstraintCheck(whole, constraints_of(whole.atoms[np.r_[3:6, 0:3, 6 : 3 * N]], "none"))
+    assert ConstraintCheck(whole, constraints_of(whole.atoms, "none")).run().check.n_rows == 3 * N
