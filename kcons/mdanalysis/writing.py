@@ -373,6 +373,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     TrajectoryWriter
         Attached to the dynamics; close it at the end.
     """
+    from kcons.ase.binding import applied_forces
     from kcons.ase.topology import velocities_of
 
     atoms = dynamics.atoms
@@ -394,7 +395,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
         cell = atoms.cell.array if atoms.pbc.any() and atoms.cell.rank == 3 else None
         forces = None
         if writer.motion is not None or with_forces:
-            forces = atoms.get_forces(apply_constraint=False)
+            forces = dynamics.applied_forces() if hasattr(dynamics, "applied_forces") else applied_forces(atoms)
         writer.write(
             atoms.positions,
             velocities_of(atoms),

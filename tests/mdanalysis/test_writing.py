@@ -258,3 +258,33 @@ def test_bad_input(tmp_path):
         writer.write(x)
     with pytest.raises(InputError, match="interval is 0"):
         OpenMMReporter(tmp_path / "o.dcd", 0)
+
+
+def test_multipliers_count_hookean_objects_and_friction(tmp_path):
+    pytest.importorskip("ase")
+    import ase.constraints
+    from ase.build import molecule
+    from ase.calculators.emt import EMT
+
+    from kcons.ase import ConstrainedDynamics, constrain
+
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    atoms.set_momenta(np.random.default_rng(1).normal(size=(len(atoms), 3)))
+    bond = Distance([[0, 1]])
+    constrain(atoms, bond, project=True)
+    atoms.set_constraint([*atoms.constraints, ase.constraints.Hookean(0, 2, k=5.0, rt=1.0)])
+    dynamics = ConstrainedDynamics(atoms, 0.1, friction=0.5)
+    with write_ase(dynamics, tmp_path / "a.trr", forces=True):
+        dynamics.run(1)
+    applied = dynamics.applied_forces()
+    assert np.abs(applied - atoms.get_forces(apply_constraint=False)).max() > 1.0  # both matter here
+    expected = dynamics.motion.multipliers(atoms.positions, atoms.get_velocities(), applied, dynamics.get_time())
+    written = np.loadtxt(tmp_path / "a.xvg", comments=("#", "@"))[-1, 4:]
+    np.testing.assert_allclose(written, expected, rtol=1e-7)
+    np.testing.assert_allclose(
+        mda.Universe.empty(9, trajectory=True).load_new(str(tmp_path / "a.trr")).trajectory[-1].forces,
+        applied * ASE_UNITS.force,
+        rtol=1e-5,
+        atol=1e-4,
+    )
