@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -391,7 +392,20 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
         path, len(atoms), **{"units": ASE_UNITS, "motion": engine(), "interval": interval * dynamics.dt, **options}
     )
 
+    def follow() -> None:
+        """Targets may change; columns may not, nor what the file says they are."""
+        now = engine()
+        if now is not writer.motion and not _same_rows(now, writer.motion):
+            raise InputError(
+                f"the constraints are no longer those that {writer.path.name} was begun with; write a new file: close "
+                "this writer, take it off (dynamics.observers) and call write_ase again",
+                item="constraints",
+            )
+        writer.motion = now
+
     def report() -> None:
+        if "motion" not in options:
+            follow()
         cell = atoms.cell.array if atoms.pbc.any() and atoms.cell.rank == 3 else None
         forces = None
         if writer.motion is not None or with_forces:
@@ -407,6 +421,14 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
 
     dynamics.attach(report, interval=interval)
     return writer
+
+
+def _same_rows(one: Motion | None, two: Motion | None) -> bool:
+    """Whether the same functions of the same atoms are held, whatever their targets."""
+    if one is None or two is None:
+        return one is two
+    pairs = zip_longest(one.constraint_set.constraints, two.constraint_set.constraints)
+    return all(a and b and a.family == b.family and np.array_equal(a.atoms, b.atoms) for a, b in pairs)
 
 
 class OpenMMReporter:

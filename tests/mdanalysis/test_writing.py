@@ -288,3 +288,36 @@ def test_multipliers_count_hookean_objects_and_friction(tmp_path):
         rtol=1e-5,
         atol=1e-4,
     )
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_constraints_that_change_in_a_run(tmp_path, ours):
+    pytest.importorskip("ase")
+    from ase.build import molecule
+    from ase.calculators.emt import EMT
+    from ase.md.verlet import VelocityVerlet
+
+    from kcons.ase import ConstrainedDynamics, constrain
+
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    constrain(atoms, Distance([[0, 1]]))
+    dynamics = (ConstrainedDynamics if ours else VelocityVerlet)(atoms, 0.1)
+    with write_ase(dynamics, tmp_path / "a.dcd") as writer:
+        dynamics.run(1)
+        # The same row at another length: the file goes on, with residuals from the new one.
+        atoms.set_constraint()
+        constrain(atoms, Distance([[0, 1]], [1.6]), project=True)
+        dynamics.run(1)
+        residuals = np.loadtxt(tmp_path / "a.xvg", comments=("#", "@"))[:, 1]
+        assert np.abs(residuals).max() < 1e-10 and abs(atoms.get_distance(0, 1) - 1.6) < 1e-10
+        # Another row is no longer what the columns say.
+        written = writer.n_frames
+        atoms.set_constraint()
+        constrain(atoms, Distance([[1, 2]]))
+        with pytest.raises(InputError, match="no longer those that a.dcd was begun with; write a new file"):
+            dynamics.run(1)
+        assert writer.n_frames == written
+        atoms.set_constraint()
+        with pytest.raises(InputError, match="no longer those"):
+            dynamics.run(1)
