@@ -19,11 +19,11 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
-from kcons.mdanalysis.topology import snapshot_of
+from kcons.mdanalysis.topology import check_box, snapshot_of
 from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows
-from kcons.topology.topology import Snapshot, require_standard_form, whole_numbers
+from kcons.topology.topology import Snapshot, whole_numbers
 from kcons.topology.virtual_sites import VirtualSites
 from kcons.topology.whole_molecules import whole_molecules
 
@@ -289,11 +289,8 @@ def universe_of(snapshot: Snapshot) -> Any:
 def _dimensions(snapshot: Snapshot) -> Any:
     if snapshot.cell is None or not snapshot.pbc.any():
         return None
-    cell = snapshot.cell
-    if not snapshot.pbc.all():
-        warnings.warn("boxes of MDAnalysis are periodic in all directions; this cell is not", UserWarning, stacklevel=4)
-    require_standard_form(cell, "MDAnalysis")
-    return triclinic_box(*cell)
+    check_box(snapshot.cell, snapshot.pbc, stacklevel=5)
+    return triclinic_box(*snapshot.cell)
 
 
 def _rows(constraints: Iterable[Constraint], angstrom: float) -> list[Constraint]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, Unpack
 
 import MDAnalysis
 import numpy as np
 from MDAnalysis.lib.mdamath import triclinic_vectors
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
@@ -21,6 +23,7 @@ from kcons.topology.topology import (
     listed,
     near_misses,
     require_kind,
+    require_standard_form,
     sorted_pairs,
 )
 
@@ -206,6 +209,19 @@ def _texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
         return np.full(n, "")
     values = np.asarray(getattr(holder, name))
     return values.astype(str) if n else np.zeros(0, dtype="U1")
+
+
+def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> None:
+    """Refuse a cell that no box of MDAnalysis can be, and warn of one that is periodic in some directions only.
+
+    Raises
+    ------
+    InputError
+    """
+    if not np.all(pbc):
+        text = "boxes of MDAnalysis are periodic in all directions; this cell is not"
+        warnings.warn(text, UserWarning, stacklevel=stacklevel)
+    require_standard_form(cell, "MDAnalysis")
 
 
 def host_of(whole: Any) -> str:

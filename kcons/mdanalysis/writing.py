@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
+from kcons.mdanalysis.topology import check_box
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 
@@ -221,7 +222,7 @@ class TrajectoryWriter:
         Raises
         ------
         InputError
-            A wrong shape; the writer is closed.
+            A wrong shape; a cell that is not in the form of MDAnalysis; the writer is closed.
         NonFiniteError
             A NaN or infinity; nothing was written.
         """
@@ -342,8 +343,10 @@ class TrajectoryWriter:
 
 
 def _dimensions(matrix: FloatArray) -> Any:
+    """Lengths and angles, of a cell whose orientation they tell."""
     if matrix.shape == (3,):
         matrix = np.diag(matrix)
+    check_box(matrix)
     return triclinic_box(*matrix)
 
 
@@ -373,6 +376,16 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     -------
     TrajectoryWriter
         Attached to the dynamics; close it at the end.
+
+    Raises
+    ------
+    InputError
+        A cell that is not in the form of MDAnalysis; in a run, constraints that are no longer the same rows.
+
+    Warns
+    -----
+    UserWarning
+        A cell that is periodic in some directions only.
     """
     from kcons.ase.binding import applied_forces
     from kcons.ase.topology import velocities_of
@@ -380,6 +393,13 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     atoms = dynamics.atoms
     if interval < 1:
         raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
+
+    def box() -> FloatArray | None:
+        cell: FloatArray = atoms.cell.array
+        return cell if atoms.pbc.any() and atoms.cell.rank == 3 else None
+
+    if (cell := box()) is not None:
+        check_box(cell, atoms.pbc, stacklevel=3)  # before there is a file
 
     def engine() -> Motion | None:
         found = getattr(dynamics, "motion", None)
@@ -392,21 +412,9 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
         path, len(atoms), **{"units": ASE_UNITS, "motion": engine(), "interval": interval * dynamics.dt, **options}
     )
 
-    def follow() -> None:
-        """Targets may change; columns may not, nor what the file says they are."""
-        now = engine()
-        if now is not writer.motion and not _same_rows(now, writer.motion):
-            raise InputError(
-                f"the constraints are no longer those that {writer.path.name} was begun with; write a new file: close "
-                "this writer, take it off (dynamics.observers) and call write_ase again",
-                item="constraints",
-            )
-        writer.motion = now
-
     def report() -> None:
         if "motion" not in options:
-            follow()
-        cell = atoms.cell.array if atoms.pbc.any() and atoms.cell.rank == 3 else None
+            writer.motion = _followed(writer, engine())
         forces = None
         if writer.motion is not None or with_forces:
             forces = dynamics.applied_forces() if hasattr(dynamics, "applied_forces") else applied_forces(atoms)
@@ -414,7 +422,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
             atoms.positions,
             velocities_of(atoms),
             time=float(dynamics.get_time()),
-            cell=cell,
+            cell=box(),
             forces=forces,
             step=dynamics.nsteps,
         )
@@ -423,12 +431,18 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     return writer
 
 
-def _same_rows(one: Motion | None, two: Motion | None) -> bool:
-    """Whether the same functions of the same atoms are held, whatever their targets."""
-    if one is None or two is None:
-        return one is two
-    pairs = zip_longest(one.constraint_set.constraints, two.constraint_set.constraints)
-    return all(a and b and a.family == b.family and np.array_equal(a.atoms, b.atoms) for a, b in pairs)
+def _followed(writer: TrajectoryWriter, now: Motion | None) -> Motion | None:
+    """What is held now. Targets may have changed; columns may not, nor what the file says they are."""
+    if now is writer.motion:
+        return now
+    held = [[] if m is None else m.constraint_set.constraints for m in (writer.motion, now)]
+    if not all(a and b and a.family == b.family and np.array_equal(a.atoms, b.atoms) for a, b in zip_longest(*held)):
+        raise InputError(
+            f"the constraints are no longer those that {writer.path.name} was begun with; write a new file: close this "
+            "writer, take it off (dynamics.observers) and call write_ase again",
+            item="constraints",
+        )
+    return now
 
 
 class OpenMMReporter:

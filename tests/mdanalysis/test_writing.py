@@ -315,9 +315,36 @@ def test_constraints_that_change_in_a_run(tmp_path, ours):
         written = writer.n_frames
         atoms.set_constraint()
         constrain(atoms, Distance([[1, 2]]))
-        with pytest.raises(InputError, match="no longer those that a.dcd was begun with; write a new file"):
+        with pytest.raises(InputError, match=r"no longer those that a\.dcd was begun with; write a new file"):
             dynamics.run(1)
         assert writer.n_frames == written
         atoms.set_constraint()
         with pytest.raises(InputError, match="no longer those"):
             dynamics.run(1)
+
+
+def test_cells_that_boxes_of_mdanalysis_are_not(tmp_path):
+    pytest.importorskip("ase")
+    from ase import Atoms
+    from ase.calculators.emt import EMT
+
+    from kcons.ase import ConstrainedDynamics, constrain
+
+    x = [[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]
+    turned = Atoms("N2", x, cell=[[9, 3, 0], [-1, 9, 0], [0, 0, 9]], pbc=True, calculator=EMT())
+    constrain(turned, Distance([[0, 1]]))
+    with pytest.raises(InputError, match=r"MDAnalysis wants the first cell vector along x.*standard_form\(\)"):
+        write_ase(ConstrainedDynamics(turned, 0.1), tmp_path / "a.trr")
+    assert not list(tmp_path.iterdir())
+    with TrajectoryWriter(tmp_path / "b.trr", 2) as writer:
+        with pytest.raises(InputError, match="standard_form"):
+            writer.write(turned.positions, cell=turned.cell.array)
+        assert writer.n_frames == 0
+    slab = Atoms("N2", x, cell=[[9, 0, 0], [3, 9, 0], [0, 0, 9]], pbc=[True, True, False], calculator=EMT())
+    dynamics = ConstrainedDynamics(slab, 0.1)
+    with pytest.warns(UserWarning, match="periodic in all directions; this cell is not"):
+        writer = write_ase(dynamics, tmp_path / "c.trr")
+    with writer:
+        dynamics.run(1)
+    box = mda.Universe.empty(2, trajectory=True).load_new(str(tmp_path / "c.trr")).trajectory[-1].triclinic_dimensions
+    np.testing.assert_allclose(box, slab.cell.array, atol=1e-5)
