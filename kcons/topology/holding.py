@@ -187,7 +187,7 @@ InputError
 Warns
 -----
 UserWarning
-    If bonds were guessed without being asked for."""
+    If bonds were guessed without being asked for, or not for all hydrogens."""
 
 
 def with_options(function: F) -> F:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Any, Literal, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
@@ -51,16 +52,24 @@ class HeldRows(list[Constraint]):
         Massless sites of rigid water; they are placed, not held.
     bonds_guessed : int
         How many bonds did not come with the topology.
+    loose_hydrogens : ndarray of int
+        Hydrogens for which no bond was found where bonds were guessed; nothing holds them.
     """
 
     def __init__(
-        self, constraint_set: ConstraintSet, snapshot: Snapshot, virtual_sites: VirtualSites, bonds_guessed: int = 0
+        self,
+        constraint_set: ConstraintSet,
+        snapshot: Snapshot,
+        virtual_sites: VirtualSites,
+        bonds_guessed: int = 0,
+        loose_hydrogens: ArrayLike = (),
     ) -> None:
         super().__init__(constraint_set.constraints)
         self.constraint_set = constraint_set
         self.snapshot = snapshot
         self.virtual_sites = virtual_sites
         self.bonds_guessed = bonds_guessed
+        self.loose_hydrogens: IntArray = np.array(loose_hydrogens, dtype=np.int64)
 
     @property
     def topology(self) -> Topology:
@@ -157,7 +166,7 @@ def held_rows(
     Warns
     -----
     UserWarning
-        If bonds were guessed without being asked for (guess='missing').
+        If bonds were guessed without being asked for (guess='missing'), or not for all hydrogens.
     """
     holding = Holding(constrain, on=on, select="all" if selected is None else selected, guess_bonds=guess, **options)
     return rows_of(snapshot, holding, np.asarray, remedy, flat)
@@ -216,7 +225,16 @@ def rows_of(
             UserWarning,
             stacklevel=3,
         )
-    return HeldRows(held, snapshot, waters.sites, guessed)
+    loose = _loose_hydrogens(snapshot.topology, holding, selected)
+    if len(loose):
+        cell = "" if snapshot.lattice is not None else "give the cell, at whose faces molecules may be cut, or "
+        warnings.warn(
+            f"no bond was guessed for {len(loose)} hydrogens, the first of which is "
+            f"{snapshot.topology.atom_name(int(loose[0]))}: nothing holds them; {cell}{remedy}",
+            UserWarning,
+            stacklevel=3,
+        )
+    return HeldRows(held, snapshot, waters.sites, guessed, loose)
 
 
 # -- bonds ----------------------------------------------------------------------------------------
@@ -281,6 +299,17 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
     found = guess_bonds(snapshot, lacking, ~settled)
     both = sorted_pairs(np.concatenate([topology.bonds, found]))
     return replace(snapshot, topology=topology.with_bonds(both)), len(both) - len(topology.bonds)
+
+
+def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray | None) -> IntArray:
+    """Hydrogens that were looked for bonds, and have none; ions of their own residue are not."""
+    if holding.kind == "none" and (topology.residues_known or not holding.rigid_water):
+        return np.zeros(0, np.int64)
+    loose = topology.hydrogen if selected is None else topology.hydrogen & selected
+    loose[topology.bonds] = False
+    if topology.residues_known:
+        loose &= np.bincount(topology.residues, minlength=topology.n_residues)[topology.residues] > 1
+    return np.flatnonzero(loose)
 
 
 def _without_waters(groups: list[IntArray], triples: IntArray) -> list[IntArray]:

@@ -289,6 +289,25 @@ def test_advice_is_of_the_command(folder, tmp_path, capsys):
         assert words not in page
 
 
+def test_hydrogens_without_a_bond_are_a_gap(tmp_path, capsys):
+    """ASE's extended XYZ has a cell, which MDAnalysis does not read: rows of molecules at its faces are missing."""
+    from ase.build import molecule
+    from ase.io import write
+
+    water = molecule("H2O", vacuum=1.6, pbc=True) * (2, 2, 2)
+    write(tmp_path / "whole.xyz", [water, water])
+    water.positions += 3
+    water.wrap()
+    write(tmp_path / "cut.xyz", [water, water])
+    for name, status in (("cut", 3), ("whole", 0)):
+        path = str(tmp_path / f"{name}.xyz")
+        assert main(["check", path, "--topology", path, "--no-rank", "--out", str(tmp_path / name)]) == status
+        page = " ".join(capsys.readouterr().out.split())
+        told = "incomplete: no bond was found for 4 hydrogens, the first of which is H (atom 8)" in page
+        assert told == (name == "cut")
+    assert "give files with the cell" in json.loads((tmp_path / "cut" / "check.json").read_text())["gaps"][0]
+
+
 # -- picture ----------------------------------------------------------------------------------------
 
 

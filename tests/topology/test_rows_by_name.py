@@ -86,6 +86,29 @@ def test_missing_bonds_are_guessed_and_said():
         held_rows(solution(()), "hbonds", guess=False)
 
 
+def test_hydrogens_that_get_no_bond_are_told():
+    """Water across a face of a cell that the file does not give."""
+    cut = snapshot(["O", "H", "H"], WATER + np.array([[0, 0, 0], [0, 0, 0], [12.0, 0, 0]]))
+    cut = replace(cut, topology=replace(cut.topology, residues_known=False))
+    with pytest.warns(UserWarning) as caught:
+        rows = held_rows(cut, "hbonds", remedy="give bonds")
+    texts = [str(w.message) for w in caught]
+    assert len(texts) == 2 and texts[1] == (
+        "no bond was guessed for 1 hydrogens, the first of which is H (atom 2): nothing holds them; give the cell, at "
+        "whose faces molecules may be cut, or give bonds"
+    )
+    assert rows.loose_hydrogens.tolist() == [2] and counts(rows) == {"Distance": 1}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = replace(cut, cell=np.diag([12.0] * 3), pbc=np.ones(3, dtype=bool))
+        assert not len(held_rows(whole, "hbonds", guess=True).loose_hydrogens)
+        # Not among the atoms that are asked for; an ion of its own residue.
+        assert not len(held_rows(cut, "hbonds", guess=True, selected=np.array([True, True, False])).loose_hydrogens)
+        known = replace(cut.topology, residues=np.array([0, 0, 1]), residue_names=np.array(["OH", "H"]))
+        known = replace(known, residue_ids=np.array(["1", "2"]), chains=np.full(2, ""), residues_known=True)
+        assert not len(held_rows(replace(cut, topology=known), "hbonds", guess=True).loose_hydrogens)
+
+
 def test_without_residues_molecules_are_found():
     made = solution()
     made = replace(made, topology=replace(made.topology, residues_known=False))

@@ -105,7 +105,8 @@ def plan(
         except KconsError as error:
             error.args = (f"{path}: {error}",)
             raise
-    notes = tuple(str(w.message) for w in caught if "were guessed from distances" in str(w.message))
+    told = ("were guessed from distances", "no bond was guessed")
+    notes = tuple(str(w.message) for w in caught if any(words in str(w.message) for words in told))
     held = rows.constraint_set
     start = rows.snapshot.positions
     motion = Motion(held, start)

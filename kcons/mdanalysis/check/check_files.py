@@ -92,6 +92,13 @@ def check_trajectory(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
             "topology with bonds, such as PSF, PRMTOP or TPR"
         )
+    loose = constraints.loose_hydrogens
+    if len(loose):
+        check.asked.gaps.append(
+            f"no bond was found for {len(loose)} hydrogens, the first of which is "
+            f"{constraints.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
+            "whose faces molecules may be cut, or a topology with bonds"
+        )
     # Sets are made anew at the first frame; this one need not stay in memory.
     del constraints
     give_back()
@@ -109,6 +116,7 @@ def _rows(universe: Any, constrain: str | None, held: dict[str, Any]) -> tuple[A
     """Constraints, and how many bonds were guessed for them."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
+        warnings.filterwarnings("ignore", message="no bond was guessed", category=UserWarning)  # a gap
         try:
             found = constraints_of(universe, constrain, **held)
         except InputError as error:

@@ -36,6 +36,8 @@ class Asked:
         Number of rows to name.
     remarks : list of str
         What there is to say besides.
+    gaps : list of str
+        What is known beforehand to be missing.
     """
 
     names: tuple[str, str]
@@ -45,6 +47,7 @@ class Asked:
     removed: int | None
     worst: int
     remarks: list[str] = field(default_factory=list)
+    gaps: list[str] = field(default_factory=list)
 
 
 def concluded(
@@ -72,7 +75,7 @@ def concluded(
     beyond_file = found.margins + rows.tolerance * table.sizes > 0
     # Targets that are nothing but rounding.
     untold = rows.measured & (rows.of_targets > table.sizes)
-    gaps = gaps_of(part, int(rows.measured.sum()), int(untold.sum()), asked.target_text)
+    gaps = asked.gaps + gaps_of(part, int(rows.measured.sum()), int(untold.sum()), asked.target_text)
     # The rounding of a mean averages out.
     of_targets = rows.of_targets if asked.mode != "mean" else np.where(rows.measured, 0.0, rows.of_targets)
     rounding = rows.spread_of_rounding * np.hypot(found.mean(found.rounded), of_targets)

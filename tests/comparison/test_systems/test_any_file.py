@@ -51,6 +51,13 @@ def test_plan_of_an_xyz_file(ethanol, capsys):
     assert "rank 13, degrees of freedom 14" in out
 
 
+def test_plan_tells_of_hydrogens_without_a_bond(tmp_path, capsys):
+    path = tmp_path / "cut.xyz"
+    path.write_text("3\n\nO 0 0 0\nH 0.96 0 0\nH 11.76 0.93 0\n")
+    status, out, _ = plan(path, capsys=capsys)
+    assert status == 0 and "no bond was guessed for 1 hydrogens" in out
+
+
 def test_plan_with_a_selection_and_rigid_residues(alanine, capsys):
     status, out, _ = plan(alanine, "--rigid-residues", "ALA", "--constrain", "none", capsys=capsys)
     assert status == 0
