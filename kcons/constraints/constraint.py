@@ -365,7 +365,8 @@ def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):
-        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}", item="atoms")
+        remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
+        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item="atoms")
     table = np.atleast_2d(table.astype(np.int64))
     if table.ndim != 2:
         raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item="atoms")

@@ -166,12 +166,12 @@ class FixedAtoms(LinearRows):
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
         column = np.asarray(atoms).reshape(-1, 1)
+        if target is not None and not callable(target) and np.shape(target) == (3,):  # type: ignore[arg-type]
+            target = np.tile(numbers(target, "target"), len(column))
+        super().__init__(np.repeat(column, 3, axis=0), target)
         values, counts = np.unique(column, return_counts=True)
         if np.any(counts > 1):
             atom = int(values[np.argmax(counts > 1)])
             raise InputError(f"FixedAtoms names atom {atom} twice; name it once", item="atoms", atoms=[atom])
-        if target is not None and not callable(target) and np.shape(target) == (3,):  # type: ignore[arg-type]
-            target = np.tile(numbers(target, "target"), len(column))
-        super().__init__(np.repeat(column, 3, axis=0), target)
         self._keep(coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :])
         self._settle()

@@ -46,21 +46,31 @@ def constraints_of(universe: Any, constrain: str | None = "hbonds", **options: U
     group = universe.atoms
     local = not isinstance(universe, MDAnalysis.Universe)
 
-    def numbers(words: str) -> IntArray:
+    def numbers(words: Any) -> IntArray:
         found = selected(group, words)
         return np.flatnonzero(np.isin(group.indices, found)) if local else found
 
     return rows_of(snapshot_of(universe), Holding(constrain, **options), numbers, _REMEDY)
 
 
-def selected(universe: Any, words: str) -> IntArray:
-    """Numbers of the atoms that a selection matches, as the Universe counts them.
+def selected(universe: Any, words: Any) -> IntArray:
+    """Numbers of the atoms that a selection matches, or that an AtomGroup has, as the Universe counts them.
 
     Raises
     ------
     InputError
-        Words that MDAnalysis does not understand, or that match nothing; with names that exist.
+        Words that MDAnalysis does not understand, or that match nothing; with names that exist. Atoms that are not
+        among those of `universe`; neither words nor an AtomGroup.
     """
+    if isinstance(words, MDAnalysis.AtomGroup):
+        if not len(words) or words.universe is not universe.universe or not words.issubset(universe.atoms):
+            raise InputError(f"{words!r} as a selection: give some of the atoms of {universe!r}", item="select")
+        return words.unique.indices.astype(np.int64)
+    if not isinstance(words, str):
+        raise InputError(
+            f"selection {words!r:.60}: give words of MDAnalysis, such as 'protein' or 'index 0:9', or an AtomGroup",
+            item="select",
+        )
     try:
         found = universe.atoms.select_atoms(words)
     except Exception as error:  # MDAnalysis raises SelectionError, and others for odd words

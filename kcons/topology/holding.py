@@ -76,8 +76,8 @@ class Holding:
         Rows on selections: selection -> callable that gets its atoms and gives a constraint, for example
         ``{"protein": CenterOfMass}`` for MDAnalysis, ``{(0, 1, 2): CenterOfMass}`` for the others.
     select : 'all', mask, atoms or str
-        Rows are kept if all of their atoms are among these (words are for MDAnalysis); `rigid_bodies` and `on` are not
-        restricted.
+        Rows are kept if all of their atoms are among these; `rigid_bodies` and `on` are not restricted. For MDAnalysis
+        words or an AtomGroup, for the others masks and numbers of atoms.
     angles : {'angles', 'distances'}
         Angles as rows in radian, or as distances of their ends as in OpenMM.
     guess_bonds : bool or 'missing'
@@ -106,6 +106,13 @@ class Holding:
             raise InputError(f"angles must be 'angles' or 'distances', not {self.angles!r}", item="angles")
         if not (self.kind != "none" or self.rigid_water or self.residues or self.bodies or self.on):
             raise InputError("nothing is to be held; name bonds, water, residues, bodies or rows", item="constrain")
+        for entry in self.own_rows:
+            if not (isinstance(entry, tuple | list) and len(entry) == 2 and callable(entry[1])):
+                raise InputError(
+                    f"on has {entry!r:.100}; give pairs of a selection and what gets its atoms and makes a constraint, "
+                    "such as the class kcons.constraints.CenterOfMass itself",
+                    item="on",
+                )
 
     @property
     def kind(self) -> str:
@@ -120,9 +127,9 @@ class Holding:
     @cached_property
     def bodies(self) -> tuple[str | Sequence[int] | IntArray, ...]:
         """What is held rigid, as it was given."""
-        return tuple(self.rigid_bodies)
+        return (self.rigid_bodies,) if isinstance(self.rigid_bodies, str) else tuple(self.rigid_bodies)
 
-    @property
+    @cached_property
     def own_rows(self) -> tuple[tuple[Any, RowMaker], ...]:
         """Selections and what makes rows of them."""
         return tuple(self.on.items() if isinstance(self.on, Mapping) else self.on or ())

@@ -192,7 +192,8 @@ def rows_of(
     if not (isinstance(holding.select, str) and holding.select == "all"):
         selected = np.zeros(topology.n_atoms, dtype=bool)
         selected[numbers(holding.select)] = True
-    bodies = [numbers(b) if isinstance(b, str) else b for b in holding.bodies]
+    # Words, and AtomGroups.
+    bodies = [numbers(b) if isinstance(b, str) or hasattr(b, "atoms") else b for b in holding.bodies]
     snapshot, waters, guessed = _with_waters(snapshot, holding, model_site, remedy)
     groups = residue_bodies(snapshot, holding.residues)
     if selected is not None:

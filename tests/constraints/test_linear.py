@@ -92,3 +92,11 @@ def test_fixed_atoms_may_have_no_mass():
 def test_bad_input_is_named(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_masks_are_no_numbers_of_atoms():
+    for mask in ([True, False, False], np.array([True, False, True])):
+        with pytest.raises(InputError, match=r"FixedAtoms: .*integers, not bool; of a mask give np\.flatnonzero"):
+            FixedAtoms(mask)
+    with pytest.raises(InputError, match="names atom 5 twice"):
+        FixedAtoms([5, 2, 5], [0.0, 0.0, 0.0])

@@ -142,3 +142,27 @@ def test_topologies_of_adenylate_kinase():
     for one, two in zip(rows, guessed, strict=True):
         np.testing.assert_array_equal(one.atoms, two.atoms)
         np.testing.assert_allclose(one.target, two.target, rtol=0, atol=1e-10)
+
+
+def test_selections_may_be_groups(villin):
+    protein = villin.select_atoms("protein")
+    few = protein[10:60]
+    for holder in (villin, protein):
+        by_words = quietly(constraints_of, holder, select="index 10:59", on={"index 10:59": CenterOfMass})
+        by_group = quietly(constraints_of, holder, select=few, on=[(few, CenterOfMass)])
+        assert repr(by_words) == repr(by_group)
+        for one, two in zip(by_words, by_group, strict=True):
+            np.testing.assert_array_equal(one.atoms, two.atoms)
+        bodies = [quietly(constraints_of, holder, "none", rigid_bodies=b) for b in ("index 10:59", [few])]
+        np.testing.assert_array_equal(bodies[0][0].atoms, bodies[1][0].atoms)
+
+
+def test_selections_that_are_neither_words_nor_groups_of_these_atoms(villin):
+    protein = villin.select_atoms("protein")
+    for wrong in ([0, 1, 2], np.arange(len(protein)) < 50, (0, 1)):
+        with pytest.raises(InputError, match=r"give words of MDAnalysis, .*or an AtomGroup") as caught:
+            quietly(constraints_of, protein, select=wrong)
+        assert caught.value.item == "select" and len(str(caught.value)) < 200
+    for group in (villin.atoms[-3:], protein[:0], read_universe(VILLIN).atoms[:3]):
+        with pytest.raises(InputError, match="give some of the atoms of <AtomGroup with 582 atoms>"):
+            quietly(constraints_of, protein, select=group)

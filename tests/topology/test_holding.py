@@ -68,3 +68,14 @@ def test_geometry_of_water():
         Holding(water_geometry=(np.nan, 109)).geometry()
     assert Holding(rigid_water=False).waters == frozenset()
     assert "MINE" in Holding(water_names=[" mine "]).waters
+
+
+def test_one_body_in_words_is_one_body():
+    assert Holding(rigid_bodies="protein and resid 45").bodies == ("protein and resid 45",)
+
+
+@pytest.mark.parametrize("on", [{"protein": "CenterOfMass"}, [("protein", None)], ["protein"], [1]])
+def test_own_rows_that_cannot_be_made(on):
+    with pytest.raises(InputError, match=r"on has .*give pairs .*CenterOfMass itself") as caught:
+        Holding(on=on)
+    assert caught.value.item == "on"
