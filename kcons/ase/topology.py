@@ -202,10 +202,11 @@ def _given_bonds(atoms: Atoms) -> tuple[IntArray, bool]:
 def mend_elements(atoms: Atoms) -> int:
     """Give atoms of residues the elements that their names say, in place; how many changed.
 
-    ASE's reader takes atom names for symbols where a PDB file has no column of elements.
+    ASE's reader takes atom names for symbols where a PDB file has no column of elements. Elements other than hydrogen
+    are left, with a warning, where some of them can only have come from such a column.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.filterwarnings("ignore", message=".*the names are followed")
         topology = snapshot_of(atoms).topology
     numbers = np.array([atomic_numbers[e] if e else 0 for e in topology.elements.tolist()], dtype=np.int64)
     changed = int(np.sum(numbers != atoms.numbers))
@@ -233,6 +234,12 @@ def atoms_of(snapshot: Snapshot) -> Atoms:
     return atoms
 
 
+def _had_elements(elements: NDArray[np.str_], by_name: NDArray[np.str_], names: NDArray[np.str_]) -> bool:
+    """Whether an atom has the right element where ASE, by the name alone, takes two letters for a symbol."""
+    right = (elements == by_name) & (np.char.str_len(elements) == 1) & (by_name != "H")
+    return any(name[:2].capitalize() in atomic_numbers for name in set(names[right].tolist()) if name[1:2].isalpha())
+
+
 def _mended(
     elements: NDArray[np.str_],
     masses: NDArray[np.float64],
@@ -247,6 +254,18 @@ def _mended(
     # A name that begins otherwise says nothing about the element (C1 of a chlorine, X1): the symbol stays.
     start = np.array([name.lstrip("0123456789")[:2].upper() for name in names[wrong].tolist()] or [""])[: wrong.sum()]
     wrong[np.flatnonzero(wrong)] = np.char.upper(elements[wrong]) == start
+    # Hydrogens may have been added by a program that writes no elements, other atoms come from one file.
+    left = wrong & (by_name != "H")
+    if left.any() and _had_elements(elements, by_name, names):
+        atom = int(np.argmax(left))
+        warnings.warn(
+            f"{int(left.sum())} elements are not what names suggest, such as {elements[atom]} of {names[atom]} in "
+            f"{residue_names[residues[atom]]}; they are left, since other atoms have elements that ASE read from the "
+            "file and not from names. Set atoms.symbols where they are wrong",
+            UserWarning,
+            stacklevel=4,
+        )
+        wrong &= ~left
     if not wrong.any():
         return elements, masses
     atom = int(np.argmax(wrong))

@@ -89,6 +89,20 @@ def test_names_say_what_elements_are():
         assert snapshot_of(other).topology.masses.tolist() == [14.0, 99.0, 12.0, 98.0]
 
 
+def test_metals_of_a_file_with_elements_stay():
+    """Cobalt is no carbon where CA is one; a mercury is a hydrogen still."""
+    atoms = peptide()
+    atoms.symbols = "NCCoHg"
+    atoms.arrays["atomtypes"][2] = "CO"
+    with pytest.warns(UserWarning, match="1 elements are not what names suggest, such as Co of CO") as told:
+        assert mend_elements(atoms) == 1
+    assert str(atoms.symbols) == "NCCoH" and len(told) == 1
+    with pytest.warns(UserWarning, match="they are left"):
+        assert snapshot_of(atoms).topology.elements[2] == "Co"
+    atoms.symbols[1] = "Ca"  # nothing says that elements were in a file
+    assert mend_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
+
+
 def test_there_and_back():
     atoms = peptide()
     mend_elements(atoms)
