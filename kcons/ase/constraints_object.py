@@ -27,6 +27,7 @@ from kcons.errors import CertificateError, ConvergenceError, InputError, KconsEr
 from kcons.motion.certificate import CHECK_EVERY
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
+from kcons.steppers.state import KICK_ROUNDING
 
 __all__ = ["Constraints", "constrain"]
 
@@ -141,7 +142,8 @@ class Constraints(FixConstraint):
         try:
             _in_place(bound.motion.project_positions, new, new, old)
             if self._positions_due <= 0:
-                self._certify_positions(bound.motion, new, asked)
+                _certify_positions(bound.motion, new, asked)
+                self._positions_due = CHECK_EVERY
             self._positions_due -= 1
         except ConvergenceError as error:
             error.add_note(
@@ -150,14 +152,6 @@ class Constraints(FixConstraint):
             )
             raise
         self._watch.accept(asked, new, bound.cell, atoms)
-
-    def _certify_positions(self, motion: Motion, new: FloatArray, asked: FloatArray) -> None:
-        try:
-            motion.certify(new)
-        except CertificateError:
-            new[...] = asked
-            raise
-        self._positions_due = CHECK_EVERY
 
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
@@ -182,9 +176,12 @@ class Constraints(FixConstraint):
                 return
             masses, inverse_masses, velocities = bound.weights
             np.multiply(momenta, inverse_masses, velocities)
+            due = self._momenta_due <= 0
+            # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
+            still = KICK_ROUNDING * float(np.abs(velocities).max(initial=0.0)) if due else 0.0
             bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
-            if self._momenta_due <= 0:
-                bound.motion.certify(atoms.arrays["positions"], velocities)
+            if due:
+                bound.motion.certify(atoms.arrays["positions"], velocities, still=still)
                 self._momenta_due = CHECK_EVERY
             self._momenta_due -= 1
             np.multiply(velocities, masses, momenta)
@@ -371,6 +368,14 @@ def _refuse_moving(given: Iterable[Constraint]) -> None:
                 f"{item!r} {what}; ASE's own dynamics give constraints neither time nor time step. Give it to "
                 "kcons.ase.ConstrainedDynamics(atoms, timestep, constraints=[...]), or use kcons.steppers"
             )
+
+
+def _certify_positions(motion: Motion, new: FloatArray, asked: FloatArray) -> None:
+    try:
+        motion.certify(new)
+    except CertificateError:
+        new[...] = asked
+        raise
 
 
 def _in_place(project: Callable[..., FloatArray], values: FloatArray, *arguments: FloatArray) -> None:

@@ -18,6 +18,7 @@ from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import BFGS
 from ase_systems import (
+    FS,
     Free,
     loose_waters,
     off,
@@ -237,6 +238,29 @@ def test_forces_off_the_surface_use_the_rows_there():
     held.adjust_forces(atoms, forces)
     rows = held.engine(atoms).constraint_set.jacobian(atoms.positions)
     assert np.abs(rows @ (forces / atoms.get_masses()[:, None]).ravel()).max() <= 1e-14
+
+
+@pytest.mark.parametrize("degrees", [0, 40, 77])
+def test_momenta_of_which_nothing_is_left(degrees):
+    """Along a bond: what the projection leaves is rounding, at which no certificate may be taken by its own size."""
+    atoms = molecule("CO")
+    atoms.rotate(degrees, [1, 2, 3])
+    along = atoms.positions[1] - atoms.positions[0]
+    constrain(atoms, Distance([0, 1]))
+    atoms.set_momenta([along, -along])
+    assert np.abs(atoms.get_momenta()).max() <= 1e-15
+
+
+def test_a_molecule_at_rest_stays_certified():
+    """Forces along a bond alone, so that momenta are rounding whenever they are certified."""
+    atoms = molecule("CO")
+    atoms.rotate(40, [1, 2, 3])
+    atoms.calc = EMT()
+    held = constrain(atoms, Distance([0, 1], 1.3), project=True)
+    dynamics = VelocityVerlet(atoms, FS)
+    for _ in dynamics.irun(100):
+        held._momenta_due = 0
+    assert np.abs(atoms.get_velocities()).max() <= 1e-12
 
 
 # -- targets ----------------------------------------------------------------------------------------
