@@ -68,8 +68,16 @@ class Binding:
             return bool(values.tobytes() == self.mass_bytes)
         return bool((values == self.mass_values).all())
 
-    def require_finite(self, values: NDArray[Any], what: str) -> None:
-        """Refuse NaN and infinity also on atoms that no row holds, which the engine does not look at."""
+    def check(self, values: NDArray[Any], what: str) -> None:
+        """Refuse integers, and NaN and infinity also on atoms that no row holds, which the engine does not look at."""
+        # The answer is written into the same array, which would cut it; that for momenta and forces of 0 is 0.
+        if values.dtype.kind in "biu" and (what == "position" or values.any()):
+            plural = "momenta" if what == "momentum" else f"{what}s"
+            raise InputError(
+                f"{plural} are integers ({values.dtype}), which cannot hold what the constraints leave of them; give "
+                "floats, for example array.astype(float)",
+                item=what,
+            )
         if self.all_touched or isfinite(np.vdot(values, values)):
             return
         bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))

@@ -133,7 +133,7 @@ class Constraints(FixConstraint):
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails."""
         bound = self._bound(atoms)
-        bound.require_finite(new, "position")
+        bound.check(new, "position")
         old = atoms.arrays["positions"]
         if not self._on_surface:
             require_on_surface(bound.motion.constraint_set, old)
@@ -163,7 +163,7 @@ class Constraints(FixConstraint):
             dynamics do not respect constraints.
         """
         bound = self._bound(atoms)
-        bound.require_finite(momenta, "momentum")
+        bound.check(momenta, "momentum")
         if momenta.shape == (bound.n_atoms, 3):  # otherwise the engine complains
             if not self._on_surface:
                 require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
@@ -184,7 +184,7 @@ class Constraints(FixConstraint):
                 bound.motion.certify(atoms.arrays["positions"], velocities, still=still)
                 self._momenta_due = CHECK_EVERY
             self._momenta_due -= 1
-            np.multiply(velocities, masses, momenta)
+            np.multiply(velocities, masses, momenta, casting="unsafe")  # integers are all 0
         except InputError as error:
             if not np.isfinite(momenta).all():
                 error.add_note("In dynamics, momenta come from forces: look at what the calculator returned")
@@ -211,7 +211,7 @@ class Constraints(FixConstraint):
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
-        self._bound(atoms).require_finite(forces, "force")
+        self._bound(atoms).check(forces, "force")
         self._project_covector(atoms, forces)
 
     def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:

@@ -220,6 +220,31 @@ def test_momenta_are_projected_once():
     assert np.abs(atoms.get_momenta() - once).max() <= 1e-14
 
 
+@pytest.mark.parametrize("rows", [Distance([0, 1]), Distance([[0, 1], [0, 2]])])
+def test_integers_are_not_cut(rows):
+    """ASE hands on the array that it was given, and would keep 0.6 as 0."""
+
+    class Whole(EMT):
+        def get_forces(self, atoms=None):
+            return np.array([[0, 3, 1], [0, -3, 2], [1, 1, 1]])
+
+    atoms = molecule("H2O")
+    held = constrain(atoms, rows)
+    whole = np.array([[0, 3, 1], [0, -3, 2], [1, 1, 1]])
+    atoms.calc = Whole()
+    with pytest.raises(InputError, match=r"momenta are integers .*give floats"):
+        atoms.set_momenta(whole)
+    assert "momenta" not in atoms.arrays
+    with pytest.raises(InputError, match=r"forces are integers .*give floats"):
+        atoms.get_forces()
+    with pytest.raises(InputError, match=r"positions are integers .*give floats"):
+        held.adjust_positions(atoms, whole)
+    atoms.set_momenta(whole.astype(float))
+    assert slip(atoms, held) <= 1e-14
+    atoms.set_momenta(np.zeros((3, 3), dtype=int))
+    assert not atoms.get_momenta().any()
+
+
 def test_constrain_projects_momenta_that_are_there():
     atoms = molecule("H2O")
     atoms.set_momenta(np.random.default_rng(0).normal(size=(3, 3)))
