@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from typing import Any, Literal
+from weakref import ref
 
 import ase.constraints
 import numpy as np
@@ -84,6 +85,8 @@ class Constraints(FixConstraint):
             (a, b, c), n = repeated
             self._repeated = ((a, b, c), n)
         self._binding: Binding | None = None
+        #: The atoms that the positions known of belong to; one object may be on several.
+        self._last: ref[Atoms] | None = None
         self._forget()
 
     # -- the engine -----------------------------------------------------------------------------
@@ -101,6 +104,9 @@ class Constraints(FixConstraint):
         return self._bound(atoms).motion
 
     def _bound(self, atoms: Atoms) -> Binding:
+        if self._last is None or self._last() is not atoms:
+            self._forget()
+            self._last = ref(atoms)
         bound = self._binding
         if bound is None or not bound.fits(atoms):
             bound = self._bind(atoms)
@@ -116,8 +122,7 @@ class Constraints(FixConstraint):
         _refuse_moving(given)
         bound = bind(given, atoms, self.degenerate)
         self.constraints = bound.given
-        self._repeated = None
-        self._binding = bound
+        self._repeated, self._binding = None, bound
         self._forget()
         return bound
 
@@ -278,7 +283,7 @@ class Constraints(FixConstraint):
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None, "_on_surface": False, "_watch": Watch()}
+        return {**self.__dict__, "_binding": None, "_last": None, "_on_surface": False, "_watch": Watch()}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]

@@ -363,6 +363,21 @@ def test_same_object_on_several_images():
     assert np.array_equal(other.positions, atoms.positions)
 
 
+def test_what_is_known_of_one_image_says_nothing_of_another():
+    """The second is off the length that the first gave: dynamics would move it there, unasked."""
+    first, second = (Atoms("CO", positions=[[0, 0, 0], [d, 0, 0]], calculator=Free()) for d in (1.15, 1.2))
+    held = constrain(first, Distance([0, 1]))
+    for atoms in (first, second):
+        atoms.set_momenta([[0, 1.0, 0], [0, -1.0, 0]], apply_constraint=False)
+        atoms.set_constraint(held)
+    VelocityVerlet(first, FS).run(2)
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.05"):
+        VelocityVerlet(second, FS).run(2)
+    assert second.get_distance(0, 1) == 1.2
+    VelocityVerlet(first, FS).run(2)
+    assert off(first, held) <= 1e-14
+
+
 # -- `constrain(project=True)` and `Constraints.restore` with far targets: whole groups move, bonds stay --
 
 
