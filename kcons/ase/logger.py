@@ -5,24 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import IO, Any
 
+import numpy as np
 from ase import Atoms, units
 from ase.md.logger import MDLogger
 from ase.stress import full_3x3_to_voigt_6_stress
 
 from kcons.ase.binding import applied_forces
 from kcons.ase.constraints_object import Constraints
+from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.topology import kinetic_energy_of, velocities_of
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import rows_like
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
 
 
 class ConstraintLogger(MDLogger):
-    """`ase.md.MDLogger` with the temperature that the dynamics knows, and multipliers by name.
+    """`ase.md.MDLogger` with temperature and stress of all that the dynamics holds, and multipliers by name.
 
     ASE's own logger counts what the objects on the atoms remove. Rows that only the dynamics holds, and total momentum
-    that a thermostat leaves alone, are missing there. ``logfile=`` of the dynamics of kcons is such a log.
+    that a thermostat leaves alone, are missing there, and constraint forces of such rows in the stress. ``logfile=`` of
+    the dynamics of kcons is such a log.
 
     Parameters
     ----------
@@ -85,7 +89,7 @@ class ConstraintLogger(MDLogger):
             row.append(2 * whole / (atoms.get_number_of_degrees_of_freedom() * units.kB))
         if self.stress:
             gas = atoms.get_momenta().T @ velocities_of(atoms) / atoms.get_volume()
-            row += ((atoms.get_stress() - full_3x3_to_voigt_6_stress(gas)) / units.GPa).tolist()
+            row += ((_stress(dyn, atoms) - full_3x3_to_voigt_6_stress(gas)) / units.GPa).tolist()
         if self.coordinates:
             motion = _motion(dyn, atoms)
             x, v = atoms.positions, velocities_of(atoms)
@@ -102,6 +106,14 @@ class ConstraintLogger(MDLogger):
             rows = [row for name, item in self.coordinates.items() for row in rows_like(held, item, name)]
             self._known = motion, rows
         return self._known[1]
+
+
+def _stress(dyn: Any, atoms: Atoms) -> FloatArray:
+    """Without that of momenta; the constraints' part is of all rows that a dynamics class of kcons holds."""
+    if not hasattr(dyn, "motion"):
+        return np.asarray(atoms.get_stress())
+    virial = virial_of(dyn.motion, atoms, applied_forces(atoms), dyn.get_time())
+    return np.asarray(atoms.get_stress(apply_constraint=False)) - virial[VOIGT] / atoms.get_volume()
 
 
 def _motion(dyn: Any, atoms: Atoms) -> Motion:

@@ -10,11 +10,19 @@ from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
+from ase.constraints import FixBondLengths
 from ase.md.logger import MDLogger
 from ase.md.verlet import VelocityVerlet
 from ase_systems import Free
 
-from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, ConstraintLogger, constrain, draw_velocities
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    ConstraintLogger,
+    PressureReporter,
+    constrain,
+    draw_velocities,
+)
 from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms
 from kcons.errors import InputError
 from kcons.free_energy import AseRecorder
@@ -124,6 +132,40 @@ def test_a_fixed_atom_needs_no_mass():
         found.append((ours.getvalue(), recorder.series.multiplier, held.report(atoms).velocity_residual))
     assert found[0][0] == found[1][0] and "nan" not in found[0][0]
     assert np.array_equal(found[0][1], found[1][1]) and found[0][2] == found[1][2]
+
+
+@pytest.mark.parametrize("held_by", ["atoms", "dynamics", "ase"])
+def test_stress_is_that_of_all_rows(held_by):
+    """The same pressure wherever the rows are held, as `PressureReporter` has it by another way."""
+    atoms, log, rows = Atoms("N2", [[0, 0, 0], [0, 0, 1.1]], cell=[6.0] * 3, pbc=True), io.StringIO(), [[0, 1], [2, 3]]
+    atoms.rotate(33, [1, 2, 3])
+    atoms *= (2, 1, 1)
+    atoms.calc = EMT()
+    atoms.set_momenta(np.random.default_rng(0).normal(size=(4, 3)))
+    if held_by == "ase":
+        atoms.set_constraint(FixBondLengths(rows))
+    elif held_by == "atoms":
+        constrain(atoms, Distance(rows))
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=[Distance(rows)] if held_by == "dynamics" else [])
+    reporter = PressureReporter(dynamics, virial="atomic")
+    ConstraintLogger(dynamics, atoms, log, stress=True)()
+    reporter()
+    tensor = -reporter.values[0] / units.GPa
+    assert columns(log)[0, 5:11] == pytest.approx(tensor[(0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1)], abs=6e-4)
+    assert abs(tensor[2, 2]) > 0.05
+
+
+def test_stress_of_a_target_that_moves():
+    """Its rows are looked at as they are by now."""
+    atoms, log = Atoms("Ar2", [[0, 0, 0], [3.5, 0, 0]], cell=[20.0] * 3, pbc=True), io.StringIO()
+    atoms.calc = LennardJones(epsilon=0.01, sigma=3.4, rc=9.0)
+    rod = Distance([0, 1], lambda t: 3.5 + 0.01 * t / units.fs)
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=rod)
+    dynamics.run(5)
+    reporter = PressureReporter(dynamics, virial="atomic")
+    ConstraintLogger(dynamics, atoms, log, stress=True)()
+    reporter()
+    assert columns(log)[0, 5] == pytest.approx(-reporter.values[0][0, 0] / units.GPa, abs=6e-4)
 
 
 def test_what_is_not_held_is_refused():

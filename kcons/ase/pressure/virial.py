@@ -15,7 +15,7 @@ from kcons.thermostats.pressure import constraint_virial
 VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
 
 
-def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray) -> FloatArray:
+def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
     """`constraint_virial` at the present positions and momenta, which are zero where there are none.
 
     Raises
@@ -25,7 +25,7 @@ def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray) -> FloatArray:
         StrainFilter, does not respect them.
     """
     try:
-        require_on_surface(motion.constraint_set, atoms.arrays["positions"])
+        require_on_surface(motion.constraint_set, atoms.arrays["positions"], time)
     except InputError as error:
         raise UnsupportedError(
             f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
@@ -35,4 +35,4 @@ def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray) -> FloatArray:
     v = np.zeros_like(x)
     if "momenta" in atoms.arrays:
         np.divide(atoms.arrays["momenta"], masses, out=v, where=masses > 0)
-    return constraint_virial(motion, x, v, forces)
+    return constraint_virial(motion, x, v, forces, time)
