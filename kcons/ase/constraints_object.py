@@ -24,7 +24,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
+from kcons.errors import CertificateError, ConvergenceError, InputError, UnsupportedError
 from kcons.motion.certificate import CHECK_EVERY
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
@@ -433,6 +433,7 @@ def constrain(
         constraints = named = named_rows(atoms, constraints)
     held = Constraints(constraints, degenerate=degenerate)
     before = list(atoms.constraints)
+    arrays = {name: atoms.arrays[name].copy() for name in ("positions", "momenta") if name in atoms.arrays}
     atoms.set_constraint([*before, held])
     try:
         if project:
@@ -442,8 +443,10 @@ def constrain(
         held._on_surface = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
-    except KconsError:
+    except BaseException:
         atoms.set_constraint(before)
+        for name, values in arrays.items():
+            atoms.arrays[name][...] = values
         raise
     if named is not None and named.bonds_guessed:
         keep_guessed(atoms, named.topology.bonds)

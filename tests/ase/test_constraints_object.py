@@ -342,6 +342,24 @@ def test_impossible_restore_changes_nothing():
     assert atoms.constraints == []
 
 
+@pytest.mark.parametrize("error", [InputError, KeyboardInterrupt])
+def test_projection_that_fails_late_changes_nothing(error, monkeypatch):
+    """A bad momentum of an atom that is not held is seen after the positions were moved; or somebody interrupts."""
+    atoms = molecule("CH3CH2OH")
+    momenta = np.random.default_rng(0).normal(size=(9, 3))
+    if error is InputError:
+        momenta[8] = np.nan
+    else:
+        monkeypatch.setattr(Constraints, "adjust_momenta", lambda *_: (_ for _ in ()).throw(error))
+    atoms.set_momenta(momenta)
+    before = atoms.positions.copy()
+    with pytest.raises(error):
+        constrain(atoms, Distance([0, 1], 1.6), project=True)
+    assert np.array_equal(atoms.positions, before)
+    assert np.array_equal(atoms.get_momenta(), momenta, equal_nan=True)
+    assert atoms.constraints == []
+
+
 # -- changes of the atoms ---------------------------------------------------------------------------
 
 
