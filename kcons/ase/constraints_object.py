@@ -76,7 +76,7 @@ class Constraints(FixConstraint):
         degenerate: Literal["convert", "raise"] = "convert",
         repeated: tuple[Sequence[int], int] | None = None,
     ) -> None:
-        self.constraints = _listed(constraints)
+        self.constraints = listed(constraints)
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         self.degenerate = degenerate
@@ -349,16 +349,24 @@ def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {**native, REGISTERED_NAME: kwargs}
 
 
-def _listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
-    """Constraints, those that are given as plain data made anew."""
-    if isinstance(constraints, Constraint):
-        return (constraints,)
-    result = tuple(families.from_dict(item) if isinstance(item, Mapping) else item for item in constraints)
+def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
+    """Constraints, those that are given as plain data made anew.
+
+    Raises
+    ------
+    InputError
+        What is no constraint of kcons.
+    """
+    given: Iterable[Any] = (constraints,)
+    if isinstance(constraints, Iterable) and not isinstance(constraints, str):
+        given = constraints
+    result = tuple(families.from_dict(item) if isinstance(item, Mapping) else item for item in given)
     for item in result:
         if not isinstance(item, Constraint):
             raise InputError(
-                f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE, and constraints_of "
-                "gives those of a name as a list",
+                f"{item!r} is no kcons constraint; from_ase_constraints(atoms) translates those of ASE, "
+                "constraints_of(atoms, name) gives those of a name as a list, and the attribute constraints those of a "
+                "Constraints object",
                 item="constraints",
             )
     return result

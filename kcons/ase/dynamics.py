@@ -26,7 +26,7 @@ from kcons.ase.binding import (
     refuse_fewer,
     surroundings,
 )
-from kcons.ase.constraints_object import Constraints
+from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
@@ -125,7 +125,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         self.time = float(time)
         self._degenerate, self._friction = degenerate, friction
-        self._more = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        self._more = listed(constraints)
         self._present: tuple[Any, ...] | None = None
         self._bound: Binding | None = None
         self._system: System | None = None

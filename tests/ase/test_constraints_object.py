@@ -10,9 +10,7 @@ from ase import Atoms, units
 from ase.build import fcc111, molecule
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
-from ase.constraints import (
-    FixBondLengths,
-)
+from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.langevin import Langevin
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
@@ -28,7 +26,7 @@ from ase_systems import (
     slip,
 )
 
-from kcons.ase import Constraints, constrain, rigid_water
+from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
 from kcons.ase.topology import bonds_of
 from kcons.constraints import (
     Angle,
@@ -358,6 +356,31 @@ def test_projection_that_fails_late_changes_nothing(error, monkeypatch):
     assert np.array_equal(atoms.positions, before)
     assert np.array_equal(atoms.get_momenta(), momenta, equal_nan=True)
     assert atoms.constraints == []
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (FixAtoms([0]), r"FixAtoms\(indices=\[0\]\) is no kcons constraint; from_ase_constraints"),
+        (Constraints(Distance([0, 1])), r"Constraints\(1 rows.* is no kcons constraint.* the attribute constraints"),
+        (None, "None is no kcons constraint"),
+        (["hbonds"], r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"),
+    ],
+)
+def test_what_is_no_constraint_is_named(given, named):
+    atoms = molecule("H2O")
+    atoms.calc = Free()
+    with pytest.raises(InputError, match=named):
+        constrain(atoms, given)
+    with pytest.raises(InputError, match=named):
+        ConstrainedDynamics(atoms, FS, constraints=given)
+    assert atoms.constraints == [] and "momenta" not in atoms.arrays
+
+
+def test_a_name_is_not_taken_for_a_list_of_letters():
+    for make in (Constraints, lambda name: ConstrainedDynamics(molecule("H2O"), FS, constraints=name)):
+        with pytest.raises(InputError, match=r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"):
+            make("hbonds")
 
 
 # -- changes of the atoms ---------------------------------------------------------------------------
