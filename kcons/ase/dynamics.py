@@ -32,13 +32,13 @@ from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import finite_number, numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
-from kcons.steppers.stepper import Listed
+from kcons.steppers.stepper import Listed, require_stepper
 from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
@@ -120,10 +120,9 @@ class ConstrainedDynamics(MolecularDynamics):
         require_atoms(atoms)
         _check_timestep(timestep)
         self._check_every, self._spare = checked_every(check_every)
-        if not math.isfinite(time):
-            raise InputError(f"time is {time}", item="time")
+        self.time = finite_number(time, "time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
-        self.time = float(time)
+        require_stepper(self.stepper)
         self._degenerate, self._friction = degenerate, friction
         self._more = listed(constraints)
         self._present: tuple[Any, ...] | None = None

@@ -9,11 +9,10 @@ import numpy as np
 
 from kcons.constraints.arguments import check_call, finite_number, refuse_other, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.state import State, System
-from kcons.steppers.stepper import Stepper
+from kcons.steppers.stepper import Stepper, require_stepper
 
 Observer: TypeAlias = Callable[[State], Any]
 
@@ -162,11 +161,7 @@ def run(
     refuse_other(state, State, "state", "a kcons.State, such as system.initial_state(positions, velocities)")
     if stepper is None:
         stepper = Rattle()
-    if isinstance(stepper, type) or not hasattr(stepper, "step"):
-        remedy = "give an object, such as kcons.Rattle()"
-        if hasattr(stepper, "states"):
-            remedy = "it chooses its own steps: iterate over its states(system, state, until)"
-        raise InputError(f"stepper is {stepper!r}; {remedy}", item="stepper")
+    require_stepper(stepper)
     refuse_other(observers, Iterable, "observers", "a list of functions of a state")
     observers = list(observers)
     for observer in observers:

@@ -47,6 +47,20 @@ class Stepper(Protocol):
         ...
 
 
+def require_stepper(stepper: Any) -> None:
+    """Refuse a class, a name, and what chooses its own steps.
+
+    Raises
+    ------
+    InputError
+    """
+    if isinstance(stepper, type) or not hasattr(stepper, "step"):
+        remedy = "give an object, such as kcons.Rattle()"
+        if hasattr(stepper, "states"):
+            remedy = "it chooses its own steps: iterate over its states(system, state, until)"
+        raise InputError(f"stepper is {stepper!r}; {remedy}", item="stepper")
+
+
 class Portable:
     """Base of those that remember what they found for a System: copies and other processes find it anew."""
 

@@ -482,10 +482,18 @@ def test_bad_time_step(bad):
         dyn.set_timestep(bad)
 
 
+@pytest.mark.parametrize("bad", [Rattle, "rattle", 5])
+def test_what_is_no_stepper(bad):
+    atoms, _ = water()
+    with pytest.raises(InputError, match=r"stepper is .*; give an object, such as kcons\.Rattle\(\)"):
+        ConstrainedDynamics(atoms, FS, bad)
+
+
 def test_bad_time_and_forces():
     atoms, _ = water()
-    with pytest.raises(InputError, match="time is nan"):
-        ConstrainedDynamics(atoms, FS, time=np.nan)
+    for time in (np.nan, "0", None):
+        with pytest.raises(InputError, match=f"time is {time!r}; give a finite number"):
+            ConstrainedDynamics(atoms, FS, time=time)
     for forces in (np.zeros((2, 3)), np.full((3, 3), np.nan)):
         with pytest.raises(InputError, match="forces"):
             ConstrainedDynamics(atoms, FS, forces=forces)
