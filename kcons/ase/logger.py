@@ -15,6 +15,7 @@ from kcons.ase.constraints_object import Constraints
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.topology import kinetic_energy_of, velocities_of
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import refuse_other
 from kcons.constraints.constraint_set import rows_like
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -61,6 +62,10 @@ class ConstraintLogger(MDLogger):
         header: bool = True,
         **kwargs: Any,
     ) -> None:
+        if coordinates is not None:
+            refuse_other(coordinates, Mapping, "coordinates", "each a name: {'torsion': torsion}")
+            for name, item in coordinates.items():
+                refuse_other(item, Constraint, f"coordinates[{name!r}]", "a constraint that is held")
         self.coordinates = dict(coordinates or {})
         self._known: tuple[Motion, list[int]] | None = None
         if self.coordinates:
@@ -86,7 +91,8 @@ class ConstraintLogger(MDLogger):
         if hasattr(dyn, "degrees_of_freedom"):
             row.append(dyn.get_temperature())
         else:
-            row.append(2 * whole / (atoms.get_number_of_degrees_of_freedom() * units.kB))
+            freedom = atoms.get_number_of_degrees_of_freedom()
+            row.append(2 * whole / (freedom * units.kB) if freedom else 0.0)
         if self.stress:
             gas = atoms.get_momenta().T @ velocities_of(atoms) / atoms.get_volume()
             row += ((_stress(dyn, atoms) - full_3x3_to_voigt_6_stress(gas)) / units.GPa).tolist()

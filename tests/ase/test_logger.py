@@ -10,7 +10,7 @@ from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
-from ase.constraints import FixBondLengths
+from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.logger import MDLogger
 from ase.md.verlet import VelocityVerlet
 from ase_systems import Free
@@ -19,6 +19,7 @@ from kcons.ase import (
     ConstrainedDynamics,
     ConstrainedLangevin,
     ConstraintLogger,
+    Constraints,
     PressureReporter,
     constrain,
     draw_velocities,
@@ -166,6 +167,27 @@ def test_stress_of_a_target_that_moves():
     ConstraintLogger(dynamics, atoms, log, stress=True)()
     reporter()
     assert columns(log)[0, 5] == pytest.approx(-reporter.values[0][0, 0] / units.GPa, abs=6e-4)
+
+
+@pytest.mark.parametrize("row", [FixedAtoms([0, 1]), FixAtoms([0, 1])])
+def test_nothing_is_free(row):
+    """As `get_temperature` of the dynamics of kcons: 0."""
+    atoms, log = Atoms("Ar2", positions=[[0, 0, 0], [2.0, 0, 0]], calculator=Free()), io.StringIO()
+    atoms.set_constraint(row if isinstance(row, FixAtoms) else Constraints(row))
+    dynamics = VelocityVerlet(atoms, units.fs)
+    dynamics.attach(ConstraintLogger(dynamics, atoms, log))
+    dynamics.run(2)
+    assert columns(log)[:, 4].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_coordinates_without_names_are_refused():
+    atoms = moving()
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=ROWS)
+    for given in (ROWS, TORSION):
+        with pytest.raises(InputError, match=r"coordinates is .*; give each a name: \{'torsion'"):
+            ConstraintLogger(dynamics, atoms, io.StringIO(), given)
+    with pytest.raises(InputError, match=r"coordinates\['torsion'\] is \[.*; give a constraint that is held"):
+        ConstraintLogger(dynamics, atoms, io.StringIO(), {"torsion": [TORSION]})
 
 
 def test_what_is_not_held_is_refused():

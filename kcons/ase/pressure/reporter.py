@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure
@@ -39,6 +39,11 @@ class PressureReporter:
     values : list of ndarray, shape (3, 3)
         Pressure tensors in eV/A^3.
     volumes : list of float
+
+    Raises
+    ------
+    InputError
+        An unknown virial; dynamics of ASE, which do not know all rows.
     """
 
     def __init__(
@@ -52,6 +57,7 @@ class PressureReporter:
     ) -> None:
         if virial not in get_args(Virial):
             raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
+        refuse_other(dynamics, ConstrainedDynamics, "dynamics", "a dynamics object of kcons.ase")
         self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
         self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
         self._own = isinstance(file, str | Path)

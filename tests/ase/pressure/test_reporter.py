@@ -8,6 +8,7 @@ from ase import units
 from ase.build import bulk
 from ase.calculators.emt import EMT
 from ase.constraints import Hookean
+from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
@@ -87,3 +88,10 @@ def test_forces_of_ase_constraints_have_no_stress():
 def test_what_is_no_way_to_the_pressure():
     with pytest.raises(InputError, match="virial is 'mol'; choose 'molecular', 'atomic' or 'difference'"):
         PressureReporter(None, virial="mol")
+
+
+def test_dynamics_of_ase_are_refused(tmp_path):
+    """Before a file is opened."""
+    with pytest.raises(InputError, match=r"dynamics is <ase\.md\.verlet.*; give a dynamics object of kcons\.ase"):
+        PressureReporter(VelocityVerlet(copper(), FS), tmp_path / "pressure.txt")
+    assert not list(tmp_path.iterdir())
