@@ -45,6 +45,7 @@ class Watch:
 
     def __init__(self) -> None:
         self._accepted: FloatArray | None = None
+        self._before: FloatArray | None = None  # what was accepted before these positions were asked for first
         self._cell = b""
         self._asked: FloatArray | None = None
         self._momenta_since = False
@@ -71,12 +72,15 @@ class Watch:
 
     def accept(self, asked: FloatArray, new: FloatArray, cell: bytes, atoms: Atoms) -> None:
         """Remember the corrected positions."""
+        if not self._counted:
+            self._before = self._accepted
         own = new.base is None and new is not atoms.arrays["positions"] and new.dtype == np.float64
         self._accepted = new if own else np.array(new, dtype=np.float64)
         self._cell = cell
         self._asked = asked
-        if self._counted and float(np.abs(asked - new).max(initial=0.0)) <= START_TOLERANCE:
-            self._repeats = 0  # positions that need no correction may be set as often as one likes
+        if self._counted and (_near(asked, new) or _near(self._before, new)):
+            # Positions that need no correction may be set as often as one likes; atoms at rest ask for the same.
+            self._repeats = 0
 
     def check_momenta(self, held: ConstraintSet, cell: bytes, x: FloatArray) -> None:
         """Momenta are about to be set at `x`.
@@ -160,6 +164,10 @@ def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) ->
 def _same(a: FloatArray, b: FloatArray) -> bool:
     # Mostly they differ in the first number already.
     return a.shape == b.shape and (not a.size or a[0, 0] == b[0, 0]) and bool((a == b).all())
+
+
+def _near(a: FloatArray | None, b: FloatArray) -> bool:
+    return a is not None and a.shape == b.shape and float(np.abs(a - b).max(initial=0.0)) <= START_TOLERANCE
 
 
 def warn_of_displacements(held: Callable[[], IntArray]) -> None:

@@ -77,6 +77,19 @@ def test_honest_dynamics_raise_no_alarm():
     assert off(atoms, held) <= 1e-12
 
 
+def test_atoms_at_rest_ask_for_the_same_positions():
+    """A kick along the bond is the same in each step, but for rounding."""
+    atoms = molecule("CO")
+    held = constrain(atoms, Distance([0, 1]))
+    start = atoms.get_positions()
+    apart = np.outer(1 / atoms.get_masses(), start[0] - start[1]) * [[1], [-1]]
+    for pull in (0.1, 0.1, 0.11, 0.11, 0.1, 0.1, 0.1):
+        atoms.set_positions(start + pull * apart)
+        atoms.set_momenta(np.zeros((2, 3)))
+    assert off(atoms, held) <= 1e-14
+    assert atoms.positions == pytest.approx(start, abs=1e-14)
+
+
 def test_momenta_of_edited_atoms():
     atoms, held = dumbbells(2)
     before = atoms.get_momenta()
