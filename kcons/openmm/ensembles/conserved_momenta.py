@@ -71,7 +71,8 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     broken: list[FloatArray] = []
     fixed = [k for k in np.flatnonzero(masses == 0).tolist() if not system.isVirtualSite(k)]
     if fixed:
-        broken.append(np.eye(3))
+        if not removed:  # what a remover takes is not there, whatever holds the others
+            broken.append(np.eye(3))
         turns.keep(turns.fields(x[fixed]))
     for part in integrator.parts:
         engine = part.engine_at(context)

@@ -163,6 +163,26 @@ def test_particles_without_mass_leave_turns_about_them(fixed, warned):
     assert said(system, x, NoseHoover(300.0, 5.0)) == warned
 
 
+@pytest.mark.parametrize("make", [Isokinetic, lambda *given, **more: NoseHoover(*given, 5.0, **more)])
+@pytest.mark.parametrize(("tied_to_it", "remover", "g"), [(True, True, 9), (False, True, 9), (True, False, 12)])
+def test_a_motion_remover_takes_momentum_beside_particles_without_mass(make, tied_to_it, remover, g):
+    """It acts on particles with mass only, whether another holds them or is a ghost."""
+    masses = [20.0] * 4 + [0.0]
+    system, x = tied(masses if tied_to_it else masses[:4], CALM, [*PLACES, [0.9, 0.9, 0.0]])
+    if not tied_to_it:
+        system.addParticle(0.0)
+    v = np.where(np.array(masses)[:, None] > 0, np.random.default_rng(2).standard_normal(x.shape), 0.0)
+    if remover:
+        system.addForce(openmm.CMMotionRemover())
+    for momentum in ("auto", "conserved") if remover else ("auto",):
+        bath = make(300.0, momentum=momentum)
+        context = started(system, integrator := ProjectedIntegrator(1e-4, ensemble=bath), x, v)
+        integrator.step(1)
+        assert bath.count(integrator) == g
+        assert integrator.degrees_of_freedom() == g
+    del context
+
+
 def test_a_motion_remover_leaves_turns_about_the_centre_of_mass():
     """A round trap elsewhere leaves one, about the line between both; a trap with an axis elsewhere none."""
     system, x = tied([20.0] * 4, CALM, PLACES)
