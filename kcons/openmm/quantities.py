@@ -89,6 +89,11 @@ def masses_of(system: openmm.System) -> FloatArray:
     return np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
 
 
+def held_without_mass(system: openmm.System) -> list[int]:
+    """Particles without mass that are no virtual sites: they stay where they are."""
+    return [k for k in np.flatnonzero(masses_of(system) == 0).tolist() if not system.isVirtualSite(k)]
+
+
 T = TypeVar("T")
 
 

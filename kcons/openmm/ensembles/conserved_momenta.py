@@ -15,7 +15,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.system_checks import forces_of, knows_a_place, removes_centre_of_mass_motion
-from kcons.openmm.quantities import masses_of
+from kcons.openmm.quantities import held_without_mass, masses_of
 from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, RigidMotions, open_directions
 
 Momentum = Literal["auto", "conserved", "free"]
@@ -69,7 +69,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     masses, removed = masses_of(system), removes_centre_of_mass_motion(system)
     turns = RigidMotions(x, turn=not system.usesPeriodicBoundaryConditions())
     broken: list[FloatArray] = []
-    fixed = [k for k in np.flatnonzero(masses == 0).tolist() if not system.isVirtualSite(k)]
+    fixed = held_without_mass(system)
     if fixed:
         if not removed:  # what a remover takes is not there, whatever holds the others
             broken.append(np.eye(3))

@@ -30,6 +30,7 @@ from kcons.openmm.integrator.system_checks import (
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
 )
+from kcons.openmm.quantities import held_without_mass
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -190,11 +191,14 @@ class Guard:
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
         #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them, and
-        #: a CMMotionRemover, to which half a kick matters where forces add up to something.
+        #: a CMMotionRemover, to which half a kick matters where forces add up to something, on what has mass.
         applied = [force for force in forces_of(self.system) if force.getForceGroup() not in integrator.row_groups]
         self.undisturbed = not (
             any(isinstance(force, openmm.AndersenThermostat) for force in applied)
-            or (removes_centre_of_mass_motion(self.system) and any(map(knows_a_place, applied)))
+            or (
+                removes_centre_of_mass_motion(self.system)
+                and (any(map(knows_a_place, applied)) or held_without_mass(self.system))
+            )
         )
         self.started = False  # whether the set-up was checked
         #: Whether others may have moved x or v since: the next step looks where they are.

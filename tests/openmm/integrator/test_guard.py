@@ -389,6 +389,37 @@ def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_pl
         np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("kind", ["RattleIntegrator", "Isokinetic", "Langevin", "NoseHoover", "constant energy"])
+def test_a_motion_remover_meets_complete_velocities_beside_particles_without_mass(kind):
+    """They take up momentum that forces between particles give: half a kick has some for the others."""
+    system, pairs, rng = openmm.System(), openmm.CustomBondForce("200*(r-0.3)^2"), np.random.default_rng(1)
+    for k, mass in enumerate([0.0, 0.0, 20.0, 25.0, 30.0]):
+        system.addParticle(mass)
+        for j in range(k):
+            pairs.addBond(j, k)
+    system.addForce(pairs)
+    system.addForce(openmm.CMMotionRemover())
+    x = np.array([[0, 0, 0], [0.4, 0, 0], [0.1, 0.3, 0], [0.2, 0.1, 0.3], [0.3, 0.3, 0.3]])
+    v = np.vstack([np.zeros((2, 3)), rng.normal(size=(3, 3))])
+    ensemble = {
+        "Isokinetic": Isokinetic(300, momentum="free"),
+        "Langevin": Langevin(300, 0.0),
+        "NoseHoover": NoseHoover(300, 5.0, momentum="free"),
+    }.get(kind)
+    ends = []
+    for calls in ([40], [13, 27], [1] * 40):
+        integrator = (
+            RattleIntegrator(1e-3) if kind == "RattleIntegrator" else ProjectedIntegrator(1e-3, ensemble=ensemble)
+        )
+        context = started(system, integrator, x, v)
+        for steps in calls:
+            integrator.step(steps)
+        ends.append(state_of(context))
+    for places, speeds in ends[1:]:
+        np.testing.assert_allclose(places, ends[0][0], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-9)
+
+
 def test_rows_beside_a_motion_remover_know_no_place():
     """Steps leave out what only an observer needs there: forces that carry rows are none."""
     system, x, v = alanine()
