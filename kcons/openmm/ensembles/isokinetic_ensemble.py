@@ -28,7 +28,7 @@ from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
-from kcons.openmm.quantities import number
+from kcons.openmm.quantities import masses_of, number
 from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
@@ -244,7 +244,7 @@ class Isokinetic(Value):
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
         masses, v = _masses(self.atoms, integrator, context), velocities_of(context)
-        if self.atoms is None and removes_centre_of_mass_motion(context.getSystem()):
+        if _everyone(self.atoms, integrator, context) and removes_centre_of_mass_motion(context.getSystem()):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover would do
         found = float(masses @ np.einsum("ij,ij->i", v, v))
         if not found > 0:
@@ -279,7 +279,7 @@ class Isokinetic(Value):
             )
 
     def _momenta(self, integrator: Integrator, context: openmm.Context) -> Momenta:
-        if self.atoms is not None:
+        if not _everyone(self.atoms, integrator, context):
             return NONE
         return conserved_momenta(integrator, context, self.momentum)
 
@@ -310,7 +310,7 @@ class Isokinetic(Value):
     def warmth(self, integrator: Integrator) -> float:
         """2 K/(g k) times this is the temperature of the configurations."""
         count = self.count(integrator)
-        if self.atoms is not None or count < 2:
+        if count < 2 or not _everyone(self.atoms, integrator, integrator.context):
             return 1.0
         return integrator.degrees_of_freedom() / (count - 1)
 
@@ -371,7 +371,7 @@ def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np
     """Of thermostatted particles; 0 for others."""
     system = context.getSystem()
     n = system.getNumParticles()
-    masses = np.array([system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(n)])
+    masses = masses_of(system)
     if atoms is None:
         return masses
     inside = np.zeros(n, dtype=bool)
@@ -390,6 +390,11 @@ def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np
                 "inside or outside"
             )
     return np.where(inside, masses, 0.0)
+
+
+def _everyone(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> bool:
+    """Whether all particles with a mass are thermostatted: total momentum may be conserved then."""
+    return atoms is None or np.array_equal(_masses(atoms, integrator, context), masses_of(context.getSystem()))
 
 
 def _count(atoms: Atoms, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:

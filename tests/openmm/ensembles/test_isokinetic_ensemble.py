@@ -410,3 +410,24 @@ def test_a_part_of_the_particles():
     assert np.abs(state_of(both)[0][:12] - state_of(start)[0][:12]).max() > 1e-9
     with pytest.raises(UnsupportedError, match="couples"):
         run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300, atoms=[0, 1])), x, v, 1)
+
+
+@pytest.mark.parametrize("ghost", [False, True])
+def test_all_particles_by_number_are_all(ghost):
+    """Momentum that is conserved is not counted, and the motion is that without atoms=; numbers of ghosts may lack."""
+    system, x, v = alanine()
+    named = range(len(x))
+    if ghost:
+        system.addParticle(0.0)
+        force = next(force for force in system.getForces() if isinstance(force, openmm.NonbondedForce))
+        force.addParticle(0.0, 1.0, 0.0)
+        x, v = np.vstack([x, [[3.0, 3.0, 3.0]]]), np.vstack([v, np.zeros((1, 3))])
+    v = v + 0.1 * (masses_of(system) > 0)[:, None]  # the remover takes that away
+    ends = []
+    for given in ({"atoms": named}, {}):
+        bath = Isokinetic(300.0, **given)
+        context = run(system, integrator := ProjectedIntegrator(1e-3, ensemble=bath), x, v, 10)
+        assert bath.count(integrator) == 42
+        assert integrator.computeSystemTemperature().value_in_unit(unit.kelvin) == pytest.approx(300, rel=1e-12)
+        ends.append(state_of(context))
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-10)
