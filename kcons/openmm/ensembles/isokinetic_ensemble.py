@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints.arguments import positive
+from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import (
     NONE,
@@ -28,7 +29,7 @@ from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
-from kcons.openmm.quantities import masses_of, number
+from kcons.openmm.quantities import number
 from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
@@ -243,16 +244,7 @@ class Isokinetic(Value):
                 f"the isokinetic thermostat in OpenMM needs constant targets, but those of {moving[0]!r} move; use "
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
-        masses, v = _masses(self.atoms, integrator, context), velocities_of(context)
-        if _everyone(self.atoms, integrator, context) and removes_centre_of_mass_motion(context.getSystem()):
-            v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover would do
-        found = float(masses @ np.einsum("ij,ij->i", v, v))
-        if not found > 0:
-            raise InputError(
-                "the isokinetic thermostat needs non-zero kinetic energy: call "
-                "integrator.setVelocitiesToTemperature(context, T) first",
-                item="velocities",
-            )
+        masses, v, found = _in_motion(self.atoms, integrator, context)
         momenta = self._momenta(integrator, context)
         twice = self._twice_kinetic(_count(self.atoms, integrator, context, momenta), int(np.sum(masses > 0)), found)
         turns = momenta.turns and self.temperature is not None
@@ -268,6 +260,10 @@ class Isokinetic(Value):
         if abs(found / twice - 1) > ROUNDING[precision]:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
+
+    def go_on(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Raise `InputError` for velocities that are all zero: K cannot be brought back by scaling them."""
+        _in_motion(self.atoms, integrator, context)
 
     def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if kicks have lost digits."""
@@ -371,7 +367,7 @@ def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np
     """Of thermostatted particles; 0 for others."""
     system = context.getSystem()
     n = system.getNumParticles()
-    masses = masses_of(system)
+    masses: FloatArray = integrator._watch(context).rows.masses
     if atoms is None:
         return masses
     inside = np.zeros(n, dtype=bool)
@@ -392,9 +388,31 @@ def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np
     return np.where(inside, masses, 0.0)
 
 
+def _in_motion(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+    """Masses that are thermostatted, velocities as a CMMotionRemover leaves them, and 2K.
+
+    Raises
+    ------
+    InputError
+        All velocities are zero.
+    """
+    masses, v = _masses(atoms, integrator, context), velocities_of(context)
+    if _everyone(atoms, integrator, context) and removes_centre_of_mass_motion(context.getSystem()):
+        v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)
+    found = float(masses @ np.einsum("ij,ij->i", v, v))
+    if not found > 0:
+        raise InputError(
+            "the isokinetic thermostat needs non-zero kinetic energy: call "
+            "integrator.setVelocitiesToTemperature(context, T) first",
+            item="velocities",
+        )
+    return masses, v, found
+
+
 def _everyone(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> bool:
     """Whether all particles with a mass are thermostatted: total momentum may be conserved then."""
-    return atoms is None or np.array_equal(_masses(atoms, integrator, context), masses_of(context.getSystem()))
+    masses, everyones = (_masses(these, integrator, context) for these in (atoms, None))
+    return np.array_equal(masses, everyones)
 
 
 def _count(atoms: Atoms, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:

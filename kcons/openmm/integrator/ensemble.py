@@ -120,6 +120,10 @@ class Ensemble(Protocol):
         """
         ...
 
+    def go_on(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Others may have moved x or v in the middle of a run; raise `InputError` if it cannot go on from there."""
+        ...
+
     def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if something went wrong since the last check."""
         ...
@@ -154,6 +158,9 @@ class Value:
         pass
 
     def take_back(self, program: Program) -> None:
+        pass
+
+    def go_on(self, integrator: Integrator, context: openmm.Context) -> None:
         pass
 
     def _keep(self, **attributes: Any) -> None:

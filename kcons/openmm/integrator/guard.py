@@ -253,8 +253,8 @@ class Guard:
                     part.check(context, velocities=not self.late)
                 elif not self._steered_away(part):
                     self._refuse(part.worst_miss(context, velocities=not self.late))
-            if not self.started:
-                integrator.ensemble.begin(integrator, context)
+            ensemble = integrator.ensemble
+            (ensemble.go_on if self.started else ensemble.begin)(integrator, context)
         except Exception:
             context.setPositions(x)
             context.setVelocities(v)

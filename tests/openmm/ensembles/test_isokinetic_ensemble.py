@@ -270,6 +270,27 @@ def test_of_velocities_set_between_calls_only_the_direction_counts(platform):
         assert np.abs(end - ends[0]).max() < (1e-12 if platform == "Reference" else 1e-6)
 
 
+@pytest.mark.parametrize("remover", [False, True])
+def test_a_run_does_not_go_on_from_rest(remover):
+    """There is no direction to scale; nothing moves until velocities are set."""
+    system, x, v = dumbbell()
+    if remover:
+        system.addForce(openmm.CMMotionRemover())
+    integrator = ProjectedIntegrator(1e-4, ensemble=Isokinetic(300.0, momentum="free"))
+    context = run(system, integrator, x, v, 5)
+    before, rest = state_of(context)[0], np.full((2, 3), 0.5 * remover)
+    context.setVelocities(rest)
+    for _ in range(2):
+        with pytest.raises(InputError, match="setVelocitiesToTemperature") as caught:
+            integrator.step(5)
+        assert caught.value.item == "velocities"
+        np.testing.assert_array_equal(state_of(context), [before, rest])
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(5)
+    assert context.getStepCount() == 10
+    assert twice_kinetic(system, state_of(context)[1]) == pytest.approx(4 * GAS_CONSTANT * 300, rel=1e-12)
+
+
 def unlike(dt):
     """How far a picosecond's tenth of unseen steps of two sums leads from those of three; w.M.w/2K - 1 at the end."""
     system, x, v = alanine()
