@@ -141,7 +141,7 @@ class Ensemble(Protocol):
         ...
 
     def follow(self, integrator: Integrator) -> None:
-        """The integrator has taken this ensemble in the middle of a run."""
+        """The integrator takes this ensemble, perhaps in the middle of a run; raise `KconsError` if it cannot."""
         ...
 
 

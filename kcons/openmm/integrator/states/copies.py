@@ -19,7 +19,7 @@ from kcons.steppers.splitting import Splitting
 
 _Kind = TypeVar("_Kind", bound=Integrator)
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
-RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"lost"}
+RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"lost", "two_k"}
 
 
 def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:

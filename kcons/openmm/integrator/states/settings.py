@@ -111,10 +111,10 @@ class Settings(Integrator):
         return value
 
     def _take(self, ensemble: Ensemble) -> None:
+        ensemble.follow(self)  # first, as it may refuse
         self._ensemble = ensemble
         for name, value in ensemble.settings().items():
             self.program.set(name, value)
-        ensemble.follow(self)
 
     # -- steps, tolerance, variables, force groups ------------------------------------------------------------
 

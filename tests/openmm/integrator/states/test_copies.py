@@ -9,14 +9,17 @@ import numpy as np
 import openmm
 import pytest
 from openmm_systems import (
+    dumbbell,
     holding,
     loose_alanine,
+    masses_of,
     started,
     state_of,
 )
 
 from kcons.errors import InputError
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import Isokinetic, ProjectedIntegrator
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.integrator.states.copies import program_of
 from kcons.openmm.integrator.states.serialization import read_plain
@@ -100,3 +103,28 @@ def test_copies(scheme, how):
     else:
         np.testing.assert_array_equal(state_of(context), state_of(other))
     assert other.getStepCount() == 3
+
+
+COPIES = {
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda integrator: pickle.loads(pickle.dumps(integrator)),
+    "XML": lambda integrator: openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(integrator)),
+}
+
+
+@pytest.mark.parametrize("way", COPIES)
+def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(way):
+    """Although the original has run: the new one acts at the first step, and an unchanged copy goes on as it was."""
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-4, ensemble=Isokinetic(300.0, momentum="free"))
+    context = started(system, integrator, x, v)
+    integrator.step(5)
+    warmer, same = (COPIES[way](integrator) for _ in range(2))
+    warmer.setTemperature(310)
+    contexts = [started(system, one, *state_of(context)) for one in (warmer, same)]
+    for one in (integrator, warmer, same):
+        one.step(3)
+    found = masses_of(system) @ np.sum(state_of(contexts[0])[1] ** 2, axis=1)
+    assert found == pytest.approx(4 * GAS_CONSTANT * 310, rel=1e-12)
+    np.testing.assert_allclose(state_of(contexts[1]), state_of(context), rtol=0, atol=1e-12)

@@ -10,11 +10,11 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
-from openmm_systems import potential_energy, state_of
+from openmm_systems import potential_energy, started, state_of
 from tied_cluster import EVERYTHING, MASSES, X, begun, cluster, thermostatted
 
-from kcons.constraints import Distance, Sphere
-from kcons.errors import InputError, KconsError
+from kcons.constraints import Distance, Plane, Sphere
+from kcons.errors import InputError, KconsError, OverdeterminedError
 from kcons.openmm import (
     CollectiveRows,
     Isokinetic,
@@ -180,6 +180,23 @@ def test_the_kinetic_energy_of_isokinetic_stays(way):
     v = state_of(other.context)[1]
     count = other.integrator.ensemble.count(other.integrator)
     assert abs(MASSES @ np.sum(v**2, axis=1) / ((count - 1) * GAS_CONSTANT * 400) - 1) < 1e-12
+
+
+def test_a_temperature_that_is_refused_changes_nothing():
+    """Of one degree of freedom there is none, and its run goes on."""
+    system, field = openmm.System(), openmm.CustomExternalForce("5*x")
+    field.addParticle(system.addParticle(20.0), [])
+    system.addForce(field)
+    part = hold(system, [Plane([0], [0, 1, 0], 0.0), Plane([0], [0, 0, 1], 0.0)], np.zeros((1, 3)))
+    bath = Isokinetic(kinetic_energy=2.0)
+    integrator = ProjectedIntegrator(0.002, parts=[part], ensemble=bath)
+    context = started(system, integrator, np.zeros((1, 3)), np.array([[0.1, 0, 0]]))
+    integrator.step(1)
+    with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
+        integrator.setTemperature(300)
+    assert integrator.ensemble is bath
+    integrator.step(1)
+    assert 10 * np.sum(state_of(context)[1] ** 2) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("way", ["State", "checkpoint"])
