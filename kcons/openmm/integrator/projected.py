@@ -96,7 +96,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
         self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
-        if not hasattr(self._ensemble, "check"):
+        if isinstance(ensemble, type) or not hasattr(self._ensemble, "check"):
             raise InputError(
                 f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin(temperature, friction)",
                 item="ensemble",

@@ -15,6 +15,7 @@ from typing import Any
 import openmm
 from openmm import unit
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.guard import Guard, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
@@ -172,9 +173,10 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         ConvergenceError, NonFiniteError
             A check failed, or a NaN appeared: positions, velocities, time and step count are those of the last check.
         InputError, UnsupportedError
-            At the first step: the System cannot be propagated, or the start is not on the constraints.
+            `steps` is no whole number. At the first step: the System cannot be propagated, or the start is not on the
+            constraints.
         """
-        ends = self._ends
+        steps, ends = whole_number(steps, "steps", 0), self._ends
         begun = bool(ends._take_owed())
         guard = self._watch()
         if guard.disturbed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import re
 
 import numpy as np
 import openmm
@@ -26,7 +27,7 @@ from openmm_systems import (
 
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import Isokinetic, ProjectedIntegrator
 from kcons.openmm.integrator.states.copies import program_of
 from kcons.openmm.integrator.system_checks import refuse_barostat
 from kcons.steppers import Geodesic
@@ -53,9 +54,11 @@ def test_units_and_arguments():
         ProjectedIntegrator(0.001, "rattel")
     with pytest.raises(InputError, match="check_every"):
         ProjectedIntegrator(0.001, check_every=-1)
-    for ensemble in ("langevin", 300):
-        with pytest.raises(InputError, match=f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin"):
+    for ensemble in ("langevin", 300, Isokinetic):
+        words = re.escape(f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin")
+        with pytest.raises(InputError, match=words) as caught:
             ProjectedIntegrator(0.001, ensemble=ensemble)
+        assert caught.value.item == "ensemble"
     for parts in (Distance([[0, 1]]), [Distance([[0, 1]])]):
         with pytest.raises(InputError, match=r"no part of an integrator; kcons\.openmm\.hold"):
             ProjectedIntegrator(0.001, parts=parts)

@@ -13,6 +13,7 @@ from weakref import WeakValueDictionary
 import openmm
 from openmm import unit
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import KconsError
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.interface import Integrator
@@ -94,9 +95,10 @@ class Calls(Integrator):
             step, `error.step` is its number. (What barostats and CMMotionRemover did at its beginning stays.) Or a
             check failed, or a NaN appeared: they are those of the last check.
         InputError, UnsupportedError
-            At the first step: the System cannot be propagated, or the start is not on the constraints.
+            `steps` is no whole number. At the first step: the System cannot be propagated, or the start is not on the
+            constraints.
         """
-        steps += self._take_owed()
+        steps = whole_number(steps, "steps", 0) + self._take_owed()
         guard = self._watch()
         if guard.disturbed:
             guard.begin()

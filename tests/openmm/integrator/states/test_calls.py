@@ -11,7 +11,7 @@ import pytest
 from openmm import app, unit
 from openmm_systems import alanine, context_of, dumbbell, residuals, started, state_of
 
-from kcons.errors import KconsError, NonFiniteError
+from kcons.errors import InputError, KconsError, NonFiniteError
 from kcons.openmm import Langevin, ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.integrator.states import calls
 from tests.openmm.integrator.states.test_settings import KINDS, carried_at
@@ -306,3 +306,17 @@ def test_what_is_put_off_keeps_no_integrator():
     del context, integrator
     gc.collect()
     assert address not in calls._OWING
+
+
+@pytest.mark.parametrize("kind", ["constant energy", "RattleIntegrator", "sphere"])
+def test_a_number_of_steps_that_is_none_is_refused(kind):
+    """Nothing moves; whole numbers of any kind are taken."""
+    made = KINDS[kind]()
+    for wrong in (2.5, "3", None, -1, True):
+        with pytest.raises(InputError, match=r"steps is .*; give a whole number, 0 or more") as caught:
+            made.integrator.step(wrong)
+        assert caught.value.item == "steps"
+    assert made.context.getStepCount() == 0
+    for steps in (0, 2, 3.0, np.int64(4)):
+        made.integrator.step(steps)
+    assert made.context.getStepCount() == 9
