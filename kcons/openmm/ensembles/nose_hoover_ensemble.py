@@ -116,6 +116,15 @@ class NoseHoover(ConstantEnergy):
         if scheme.order != 2:
             raise UnsupportedError(f"{scheme!r} has order {scheme.order}, the chain 2; use scheme='rattle'")
 
+    def check_timestep(self, dt: float) -> None:
+        """Raise `InputError` for a time step that the chain cannot follow."""
+        if dt * self.frequency > _FASTEST:
+            raise InputError(
+                f"a chain of frequency {self.frequency:g}/ps cannot follow a time step of {dt:g} ps; take a frequency "
+                f"of at most {0.1 / dt:.3g}/ps, or a time step of at most {0.1 / self.frequency:.3g} ps",
+                item="frequency",
+            )
+
     def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
         """The chain moves before the scheme's own operations and after them."""
         return HALF, *operations_of(scheme), HALF
@@ -226,13 +235,7 @@ class NoseHoover(ConstantEnergy):
             raise UnsupportedError(
                 f"targets of {moving[0]!r} move, and scaled velocities would not follow them; use Langevin"
             )
-        dt = float(integrator.getStepSize()._value)
-        if dt * self.frequency > _FASTEST:
-            raise InputError(
-                f"a chain of frequency {self.frequency:g}/ps cannot follow a time step of {dt:g} ps; take a frequency "
-                f"of at most {0.1 / dt:.3g}/ps",
-                item="frequency",
-            )
+        self.check_timestep(float(integrator.getStepSize()._value))
         system = context.getSystem()
         momenta = conserved_momenta(integrator, context, self.momentum)
         count = self._count(integrator, momenta)

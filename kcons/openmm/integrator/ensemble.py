@@ -43,6 +43,10 @@ class Ensemble(Protocol):
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
         ...
 
+    def check_timestep(self, dt: float) -> None:
+        """Raise `InputError` for a time step (ps) that the ensemble cannot follow."""
+        ...
+
     def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
         """What a step consists of. Where there is an `Exchange`, `middle` writes it."""
         ...
@@ -150,6 +154,9 @@ class Value:
 
     owes = False
     measures = False
+
+    def check_timestep(self, dt: float) -> None:
+        pass
 
     def open(self, program: Program) -> None:
         pass

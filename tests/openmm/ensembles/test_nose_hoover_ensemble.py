@@ -439,6 +439,18 @@ def test_what_cannot_be_thermostatted_is_refused():
         run(one, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0)), np.zeros((1, 3)), np.ones((1, 3)), 1)
 
 
+def test_step_sizes_that_the_chain_cannot_follow_are_refused_in_a_run():
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-4, ensemble=NoseHoover(300.0, 1000.0))
+    context = run(system, integrator, x, v, 1)
+    with pytest.raises(InputError, match=r"take a frequency of at most 50/ps, or a time step of at most 0.0001 ps"):
+        integrator.setStepSize(2 * unit.femtosecond)
+    assert integrator.getStepSize() == 1e-4 * unit.picosecond
+    integrator.setStepSize(1.3e-3)
+    integrator.step(1)
+    assert context.getStepCount() == 2
+
+
 def test_the_chain_belongs_to_the_state_and_temperature_to_the_integrator():
     system, x, v = alanine()
     first = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0))

@@ -128,9 +128,11 @@ class Settings(Integrator):
         Raises
         ------
         InputError
-            It is no positive number.
+            It is no positive number, or more than the ensemble can follow.
         """
-        super().setStepSize(picoseconds(size))
+        dt = picoseconds(size)
+        self.ensemble.check_timestep(dt)
+        super().setStepSize(dt)
 
     def setConstraintTolerance(self, tol: float) -> None:
         """Change the relative tolerance of the System's constraints.
