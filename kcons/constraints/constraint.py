@@ -194,16 +194,6 @@ class Constraint(ABC):
         `first_row` is the number of this object's first row in its set, for messages.
         """
 
-    def check_target(self, time: float, first_row: int) -> None:
-        """Raise `InputError` where derivatives of a moving target that were given contradict it."""
-        said = self.target.contradiction(time, self.n_rows) if isinstance(self.target, MovingTarget) else ""
-        if said:
-            raise InputError(
-                f"{self!r}, row {first_row} on: the target contradicts itself: {said}; correct it, or leave the "
-                "derivatives out",
-                item="target",
-            )
-
     def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
         """Raise where rows are undefined.
 

@@ -117,7 +117,7 @@ class ConstraintSet(InCell):
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)
             item.check(r, time, int(start))
-            item.check_target(time, int(start))
+            _check_derivatives(item, time)
             if item.target is None:
                 item = item.with_target(
                     item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
@@ -337,6 +337,15 @@ class ConstraintSet(InCell):
 
     def __repr__(self) -> str:
         return f"<ConstraintSet: {self.n_rows} rows on {self.n_atoms} atoms>"
+
+
+def _check_derivatives(item: Constraint, time: float) -> None:
+    """Refuse derivatives of a moving target that contradict it: atoms would leave it without another sign."""
+    said = item.target.contradiction(time, item.n_rows) if isinstance(item.target, MovingTarget) else ""
+    if said:
+        raise InputError(
+            f"{item!r}: the target contradicts itself: {said}; correct it, or leave the derivatives out", item="target"
+        )
 
 
 def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:

@@ -226,6 +226,37 @@ MUTANTS = [
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_of_velocities_set_between_calls_only_the_direction_counts",
     ),
     (
+        "constraints/constraint.py",
+        "if self.squared and not (target > 0).all():",
+        "if not self.squared and not (target > 0).all():",
+        "tests/constraints/test_target.py::test_a_distance_that_moves_below_zero_is_refused_there",
+    ),
+    (
+        "constraints/target.py",
+        "wrong = (np.abs(fine - derivative) > 0.01 * size)",
+        "wrong = (np.abs(fine - derivative) > 100 * size)",
+        "tests/constraints/test_target.py::test_derivatives_that_contradict_a_moving_target_are_refused",
+    ),
+    (
+        "ase/topology.py",
+        "if guessed and said != stamp:",
+        "if not guessed and said != stamp:",
+        "tests/ase/test_topology.py::test_guessed_bonds_are_guessed_anew_for_sorted_and_cut_atoms",
+    ),
+    (
+        "topology/rows_by_name.py",
+        "long > np.minimum(longest, FAR * radii)",
+        "long > longest",
+        "tests/ase/test_topology.py::test_bonds_that_are_far_too_long_are_not_held",
+    ),
+    (
+        "openmm/ensembles/conserved_momenta.py",
+        "if not removed:  # what a remover takes",
+        "if True:  # what a remover takes",
+        "tests/openmm/ensembles/test_conserved_momenta.py::"
+        "test_a_motion_remover_takes_momentum_beside_particles_without_mass",
+    ),
+    (
         "openmm/integrator/guard.py",
         'write("coarse", float(self.constraints.precision.name == "single"))',
         'write("coarse", 0.0)',
