@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import lent, numbers, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows.flow import FloatArray, Flow, jacobian_by_differences
 
@@ -92,6 +92,19 @@ class HamiltonianFlow(Flow):
         X = lent(self._state(X))
         return float(self.hamiltonian(X[: self.f], X[self.f :], *self._at(t)))
 
+    def _require_separable(self, X: FloatArray, t: float) -> None:
+        """Refuse H that is no T(p) + U(q) about X: an explicit step would be of another system."""
+        near = X + 1e-2 * (np.abs(X) + 1.0) * np.random.default_rng(0).uniform(0.5, 1.0, X.shape)
+        f = self.f
+        both = [self.energy(np.concatenate([a[:f], b[f:]]), t) for a, b in ((X, X), (near, X), (X, near), (near, near))]
+        mixed, change = both[3] - both[1] - both[2] + both[0], np.ptp(both)
+        if abs(mixed) > 1e-6 * change + 1e-12 * np.abs(both).max():
+            raise InputError(
+                f"H is not T(p) + U(q): q and p change it together by {mixed:.3g} beside {change:.3g}; use "
+                "separable=False and method='gauss6'",
+                item="separable",
+            )
+
     def gradient_q(self, q: FloatArray, p: FloatArray, t: float = 0.0) -> FloatArray:
         """dH/dq, shape (f,)."""
         if self._dH_dq is not None:
@@ -147,9 +160,12 @@ class HamiltonianFlow(Flow):
             raise InputError(f"there is no method {method!r}; choose gauss6, leapfrog or suzuki4", item="method")
         if method != "gauss6" and not self.separable:
             raise InputError(f"{method} needs H = T(p) + U(q): say separable=True, or use gauss6", item="method")
-        if not np.isfinite(dt) or dt == 0.0 or steps < 0 or every < 1 or not np.isfinite(t0):
-            raise InputError("dt is finite and not zero, steps not negative, every at least 1, t0 finite", item="dt")
+        steps, every = whole_number(steps, "steps", 0), whole_number(every, "every")
+        if not np.isfinite(dt) or dt == 0.0 or not np.isfinite(t0):
+            raise InputError("dt is finite and not zero, t0 finite", item="dt")
         X = self._state(np.concatenate([np.atleast_1d(numbers(q0, "q0")), np.atleast_1d(numbers(p0, "p0"))]))
+        if method != "gauss6":
+            self._require_separable(X, t0)
         parts = [1.0] if method == "leapfrog" else list(SUZUKI)
         kept = [X]
         for step in range(1, steps + 1):

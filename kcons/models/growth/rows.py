@@ -239,7 +239,14 @@ class LinearRow(HolonomicRow):
     def _moved(self, p: Populations, item: int) -> FloatArray:
         moving = self.moving
         assert moving is not None
-        return np.asarray(np.vectorize(lambda t: moving(t)[item], otypes=[np.float64])(p.time))
+        return np.asarray(np.vectorize(lambda t: self._pair(moving(t), t)[item], otypes=[np.float64])(p.time))
+
+    def _pair(self, given: tuple[float, float], t: float) -> tuple[float, float]:
+        if np.shape(given) != (2,):
+            raise InputError(
+                f"the target of {self.name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
+            )
+        return given
 
     def value(self, p: Populations) -> FloatArray:
         return self.measure(p) - self._moved(p, 0) if self.moving else super().value(p)

@@ -169,3 +169,12 @@ def test_bad_input_is_refused():
         flow.symplectic([0.0, 1j], [0.0, 0.0], 0.1, 1)
     with pytest.raises(ConvergenceError, match="smaller"):
         HamiltonianFlow(lambda q, p: float(p[0] ** 2 + q[0] ** 4), 1).symplectic(30.0, 0.0, 1.0, 1)
+
+
+def test_hamiltonians_that_are_said_to_be_separable_are_looked_at():
+    mixed = HamiltonianFlow(lambda q, p: float(p @ p / 2 + q @ q / 2 + 0.5 * q @ p), 1, separable=True)
+    for method in ("leapfrog", "suzuki4"):
+        with pytest.raises(InputError, match=r"not T\(p\) \+ U\(q\)"):
+            mixed.symplectic([1.0], [0.0], 0.1, 10, method)
+    with pytest.raises(InputError, match="steps"):
+        mixed.symplectic([1.0], [0.0], 0.1, 2.5)

@@ -120,3 +120,5 @@ def test_derivatives_that_contradict_their_function_are_refused(p):
     LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, 0.1)).bind(p)
     with pytest.raises(InputError, match="another rate of its target"):
         LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, -5.0)).bind(p)
+    with pytest.raises(InputError, match=r"give \(value, rate\)"):
+        LinearRow([1, 1, 1], lambda t: 1 + 0.1 * t).bind(p)
