@@ -41,6 +41,17 @@ def test_alanine_dipeptide_against_mbar():
     assert len(found["doubtful windows"]) == 1 and "two sides of one window differ" in TEXT
 
 
+def test_alanine_dipeptide_once_more():
+    found = FOUND["alanine dipeptide"]
+    second = found["again"]
+    rms, most = second["root mean square difference"], second["largest difference below 30 kJ/mol"]
+    apart = second["root mean square difference of both runs"]
+    assert f"{rms:.2f} and {most:.2f} from the same MBAR, {apart:.2f} from the first run" in TEXT
+    low = [k for k, energies in enumerate(zip(found["held"], found["MBAR"], strict=True)) if max(energies) < 30]
+    expected = 2**0.5 * sum(found["error"][k] for k in low) / len(low)
+    assert apart < 1.5 * expected
+
+
 def test_pulls_against_windows():
     found = FOUND["alanine dipeptide"]["pulls"]
     for name in ("BAR", "Jarzynski", "windows"):
