@@ -35,8 +35,8 @@ from kcons.topology.rigid_groups import (
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
 from kcons.topology.virtual_sites import VirtualSites
 
-#: No bond is that long, in angstrom, and none of water.
-TORN, TORN_WATER = 10.0, 3.0
+#: No bond is that long, in angstrom, whatever its atoms.
+TORN = 10.0
 
 
 class HeldRows(list[Constraint]):
@@ -201,7 +201,7 @@ def rows_of(
         groups = [kept for kept in (g[selected[g].all(axis=1)] for g in groups) if len(kept)]
     groups = _without_waters(groups, waters.triples)
     groups += listed_bodies(snapshot, bodies)
-    _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2), TORN_WATER)
+    _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))
     bonds = snapshot.topology.bonds
     _refuse_torn(snapshot, bonds[inside_bodies(snapshot.topology.n_atoms, bonds, groups)])
     rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
@@ -387,10 +387,10 @@ def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
 # -- checks ---------------------------------------------------------------------------------------
 
 
-def _refuse_torn(snapshot: Snapshot, bonds: IntArray, longest: float = TORN) -> None:
-    """Raise `InputError` for bonds that are too long for their atoms, or longer than `longest` angstrom."""
+def _refuse_torn(snapshot: Snapshot, bonds: IntArray) -> None:
+    """Raise `InputError` for bonds that are too long for their atoms, or longer than any bond."""
     long, radii = reaches(snapshot, bonds)
-    torn = long > np.minimum(longest, FAR * radii)
+    torn = long > np.minimum(TORN, FAR * radii)
     if torn.any():
         k = int(np.argmax(np.where(torn, long, 0.0)))
         i, j = bonds[k].tolist()

@@ -245,8 +245,8 @@ MUTANTS = [
     ),
     (
         "topology/rows_by_name.py",
-        "long > np.minimum(longest, FAR * radii)",
-        "long > longest",
+        "long > np.minimum(TORN, FAR * radii)",
+        "long > TORN",
         "tests/ase/test_topology.py::test_bonds_that_are_far_too_long_are_not_held",
     ),
     (
@@ -935,8 +935,8 @@ MUTANTS = [
     # -- topology: all angles --
     (
         "topology/rows_by_name.py",
-        "reshape(-1, 2), TORN_WATER)",
-        "reshape(-1, 2), np.inf)",
+        "_refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))",
+        "pass",
         "tests/topology/test_rows_by_name.py::test_bodies_that_a_missing_cell_tears_are_refused",
     ),
     (
