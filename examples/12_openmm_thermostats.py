@@ -91,29 +91,36 @@ def started(system: openmm.System, positions: Any, integrator: openmm.Integrator
 # -- what is measured -------------------------------------------------------------------------------
 
 
-def speed(full: bool) -> dict[str, Any]:
-    """Steps a second relative to VerletIntegrator, by CPU time. Where arrays lie in memory matters: Contexts are new
-    from build to build."""
-    system, positions = water(3.0 if full else 2.0)
-    makers: dict[str, Callable[[], openmm.Integrator]] = {
-        "VerletIntegrator": partial(openmm.VerletIntegrator, 0.002),
-        "LangevinMiddleIntegrator": partial(middle, 0.002),
-        "kcons RattleIntegrator": partial(RattleIntegrator, 0.002),
-        "kcons rattle": partial(ProjectedIntegrator, 0.002),
-        "kcons Isokinetic": partial(isokinetic, 0.002),
-        "kcons Isokinetic, leapfrog": partial(ProjectedIntegrator, 0.002, "leapfrog", ensemble=Isokinetic(TEMPERATURE)),
-        "kcons Langevin": partial(langevin, 0.002),
-        "kcons NoseHoover": partial(nose_hoover, 0.002),
-    }
+#: What is timed; the first is what others are relative to.
+MAKERS: dict[str, Callable[[], openmm.Integrator]] = {
+    "VerletIntegrator": partial(openmm.VerletIntegrator, 0.002),
+    "LangevinMiddleIntegrator": partial(middle, 0.002),
+    "kcons RattleIntegrator": partial(RattleIntegrator, 0.002),
+    "kcons rattle": partial(ProjectedIntegrator, 0.002),
+    "kcons Isokinetic": partial(isokinetic, 0.002),
+    "kcons Isokinetic, leapfrog": partial(ProjectedIntegrator, 0.002, "leapfrog", ensemble=Isokinetic(TEMPERATURE)),
+    "kcons Langevin": partial(langevin, 0.002),
+    "kcons NoseHoover": partial(nose_hoover, 0.002),
+}
+
+
+def start_of(system: openmm.System, positions: Any) -> openmm.State:
     context = started(system, positions, openmm.VerletIntegrator(0.002))
     openmm.LocalEnergyMinimizer.minimize(context, 50, 50)
     context.applyConstraints(TOLERANCE)
     context.setVelocitiesToTemperature(TEMPERATURE, 1)
-    state = context.getState(positions=True, velocities=True)
+    return context.getState(positions=True, velocities=True)
+
+
+def speed(full: bool) -> dict[str, Any]:
+    """Steps a second relative to VerletIntegrator, by CPU time. Where arrays lie in memory matters: Contexts are new
+    from build to build."""
+    system, positions = water(3.0 if full else 2.0)
+    state = start_of(system, positions)
     steps, rounds, builds = (20, 10, 7) if full else (5, 3, 1)
-    seconds: dict[str, list[float]] = {name: [] for name in makers}
+    seconds: dict[str, list[float]] = {name: [] for name in MAKERS}
     for _ in range(builds):
-        integrators = {name: make() for name, make in makers.items()}
+        integrators = {name: make() for name, make in MAKERS.items()}
         contexts = {name: started(system, positions, integrator) for name, integrator in integrators.items()}
         for name, each in contexts.items():
             each.setState(state)
@@ -123,10 +130,35 @@ def speed(full: bool) -> dict[str, Any]:
             integrators[name].step(steps)
             contexts[name].getState(positions=True)
 
-        for name, found in scripts.in_turn({name: partial(call, name) for name in makers}, rounds).items():
+        for name, found in scripts.in_turn({name: partial(call, name) for name in MAKERS}, rounds).items():
             seconds[name] += found
     rows = scripts.speeds(seconds, steps)
     return {"title": f"Rigid water, {system.getNumParticles()} atoms, PME, 2 fs", "rows": rows}
+
+
+def in_simulation(full: bool) -> dict[str, Any]:
+    """What `Simulation.step`, which calls `step(10)`, takes of the time of one call for as many steps: medians of
+    quotients of CPU times of runs that follow one another, with the standard error of a median."""
+    system, positions = water(3.0 if full else 2.0)
+    state = start_of(system, positions)
+    steps, rounds = (100, 60) if full else (20, 3)
+    rows = {}
+    for name, make in MAKERS.items():
+        integrator = make()
+        integrator.setConstraintTolerance(TOLERANCE)
+        platform = openmm.Platform.getPlatformByName("CPU")
+        simulation = app.Simulation(app.Topology(), system, integrator, platform, {"Threads": "1"})
+        simulation.context.setState(state)
+        simulation.step(20)
+        calls = {"simulation": partial(simulation.step, steps), "one call": partial(integrator.step, steps)}
+        seconds = scripts.in_turn(calls, rounds)
+        quotients = np.array(seconds["simulation"]) / np.array(seconds["one call"])
+        rows[name] = {
+            "ms": 1e3 * float(np.median(seconds["one call"])) / steps,
+            "quotient": float(np.median(quotients)),
+            "error": float(1.25 * quotients.std(ddof=1) / np.sqrt(rounds)),
+        }
+    return {"title": f"Simulation.step beside one call, {system.getNumParticles()} atoms, 2 fs", "rows": rows}
 
 
 def mean_energy(
@@ -213,7 +245,7 @@ def kinetic(full: bool) -> dict[str, Any]:
 
 
 def show(result: dict[str, Any], console: Console) -> None:
-    fast, sampled = (result["measurements"].get(name) for name in ("speed", "sampling"))
+    fast, called, sampled = (result["measurements"].get(name) for name in ("speed", "simulation", "sampling"))
     if fast:
         headings = ("integrator", "ms a step", "steps a second, relative")
         table = scripts.table(fast["title"], headings, {"integrator"})
@@ -221,6 +253,13 @@ def show(result: dict[str, Any], console: Console) -> None:
             table.add_row(name, f"{row['ms']:.2f}", f"{row['ratio']:.2f}")
         console.print(table)
         console.print(_made_on(fast["machine"]))
+    if called:
+        columns = ("integrator", "ms a step", "Simulation.step, relative")
+        table = scripts.table(called["title"], columns, {"integrator"})
+        for name, row in called["rows"].items():
+            table.add_row(name, f"{row['ms']:.2f}", f"{row['quotient']:.3f} ± {row['error']:.3f}")
+        console.print(table)
+        console.print(_made_on(called["machine"]))
     if sampled and "reference" in sampled:
         headings = ("integrator", "step/fs", "mean U, kJ/mol", "less that at 1 fs")
         table = scripts.table(sampled["title"], headings, {"integrator"})
@@ -253,7 +292,9 @@ def _made_on(machine: dict[str, Any]) -> str:
 def main() -> None:
     parser = scripts.options(__doc__, full="the sizes of the committed results")
     parser.add_argument(
-        "--only", choices=["speed", "sampling", "kinetic"], help="one measurement; others in --out are kept"
+        "--only",
+        choices=["speed", "simulation", "sampling", "kinetic"],
+        help="one measurement; others in --out are kept",
     )
     options = parser.parse_args()
     console = Console(width=120)
@@ -272,6 +313,8 @@ def main() -> None:
 
     if options.only in (None, "speed"):
         keep("speed", speed(options.full))
+    if options.only in (None, "simulation"):
+        keep("simulation", in_simulation(options.full))
     if options.only in (None, "kinetic"):
         keep("kinetic", kinetic(options.full))
     if options.only in (None, "sampling"):
