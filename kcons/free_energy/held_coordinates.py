@@ -176,7 +176,7 @@ class HeldCoordinates:
         if bonds is not None:
             pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
             for k, row in enumerate(self.rows.tolist()):
-                turn = rigid_turn(_row(held, row), pairs, x)
+                turn = rigid_turn(_row(held, row), pairs, x, held.lattice)
                 if turn is not None and leaves_the_rest(turn, row, held, others, x, time):
                     self._turns[k] = turn
 

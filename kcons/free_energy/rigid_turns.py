@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 
 #: A trial turn in radian, what it may change of other rows, and by which factor a bond may change before it is broken.
@@ -56,7 +57,9 @@ class RigidTurn(NamedTuple):
         return e / np.linalg.norm(e)
 
 
-def rigid_turn(coordinate: Constraint, bonds: IntArray, x: FloatArray) -> RigidTurn | None:
+def rigid_turn(
+    coordinate: Constraint, bonds: IntArray, x: FloatArray, lattice: FloatArray | None = None
+) -> RigidTurn | None:
     """The smaller group of one torsion; None of another coordinate, or where the middle bond is missing or in a ring.
 
     Parameters
@@ -65,6 +68,8 @@ def rigid_turn(coordinate: Constraint, bonds: IntArray, x: FloatArray) -> RigidT
         One row.
     bonds : ndarray of int, shape (n, 2)
     x : ndarray, shape (n_atoms, 3)
+    lattice : ndarray, shape (2, 3, 3), optional
+        In which bonds have their lengths, also where a box has cut them.
     """
     if coordinate.family != "Dihedral":
         return None
@@ -79,7 +84,7 @@ def rigid_turn(coordinate: Constraint, bonds: IntArray, x: FloatArray) -> RigidT
     beyond = [(np.flatnonzero(part == part[near]), far, near) for near, far in ((k, j), (j, k))]
     atoms, far, near = min(beyond, key=lambda side: len(side[0]))
     own = bonds[middle | (part[bonds[:, 0]] == part[near])]
-    lengths = np.linalg.norm(x[own[:, 0]] - x[own[:, 1]], axis=1)
+    lengths = np.linalg.norm(minimum_image(x[own[:, 0]] - x[own[:, 1]], lattice), axis=1)
     return RigidTurn(np.array([far, near]), atoms[atoms != near], own, lengths)
 
 

@@ -107,3 +107,19 @@ def test_a_molecule_across_a_box_is_not_turned():
     there[turn.axis[0]] += 10.0  # cut in the middle: the axis is none
     assert np.isnan(turn.force(there, np.ones((6, 3))))
     assert np.isnan(HeldCoordinates(ConstraintSet([PHI], X, MASSES), {"phi": PHI}, X).sample(X, X, X).turned[0])
+
+
+@pytest.mark.parametrize(("cut", "known"), [(None, True), (5, True), (4, False), (3, False), (2, False)])
+def test_a_molecule_that_a_cell_has_cut_from_the_start_is_not_turned(cut, known):
+    """The torsion is right in any image, and nothing else that is held tells of the cut."""
+    bonds, there = np.array([[0, 1], [1, 5], [1, 2], [2, 3], [3, 4]]), X.copy()
+    assert rigid_turn(PHI, bonds, X).group.tolist() == [3, 4]
+    if cut is not None:
+        there[cut, 0] += 12.0
+    held = HeldCoordinates(
+        ConstraintSet([PHI], there, MASSES, cell=12 * np.eye(3), pbc=True), {"phi": PHI}, there, bonds=bonds
+    )
+    turned = held.sample(there, np.zeros((6, 3)), -gradient(X)).turned[0]
+    assert turned == (
+        pytest.approx(rigid_turn(PHI, bonds, X).force(X, -gradient(X))) if known else pytest.approx(np.nan, nan_ok=True)
+    )
