@@ -155,7 +155,9 @@ class HeldCoordinatesReporter:
         known = all(isinstance(part, CollectiveRows | CarriedConstraints) for part in parts)
         virtual = np.array([system.isVirtualSite(k) for k in range(len(masses))])
         free = known and bool(np.all((masses > 0) | virtual))
-        bonds = bonds_of(system, x) if free else None
+        # Forces on virtual sites are in those of the particles that they depend on: sites belong to no group.
+        bonds = bonds_of(system, x)
+        bonds = bonds[~virtual[bonds].any(axis=1)] if free else None
         self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
         self._context = simulation.context
         self.series = Series(self._held.names, self._held.periods)

@@ -151,6 +151,44 @@ def test_files_are_gone_on_with(tmp_path):
     assert [line.split(",")[0] for line in lines] == ['#"Step"', "2", "4", "2", "4"]
 
 
+def test_a_bond_to_a_virtual_site_does_not_count_its_force_twice():
+    system, bonds, charges = openmm.System(), openmm.HarmonicBondForce(), openmm.NonbondedForce()
+    for mass in (1.0, 16.0, 12.0, 14.0, 1.0, 1.0, 0.0):
+        system.addParticle(mass)
+    system.setVirtualSite(6, openmm.TwoParticleAverageSite(2, 3, -0.5, 1.5))
+    x = np.array([[0, 0, 0], [12, 0, 0], [16, 11, 0], [28, 12, 5], [40, 30, 30], [11, -8, 5], [0, 0, 0]]) / 100
+    for i, j in ((0, 1), (1, 2), (2, 3), (1, 5), (3, 6)):
+        bonds.addBond(i, j, np.linalg.norm(x[i] - x[j]) if j < 6 else 0.06, 1000.0)
+    for charge in (0, 0, 0, 0, 0.7, 0, -0.9):
+        charges.addParticle(charge, 1.0, 0.0)
+    system.addForce(bonds)
+    system.addForce(charges)
+    integrator = ProjectedIntegrator(0.001, parts=[CollectiveRows(system, [torsion([0, 1, 2, 3])], positions=x)])
+    topology = app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for _ in range(7):
+        topology.addAtom("X", None, residue)
+    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    reporter = HeldCoordinatesReporter(io.StringIO(), 1, {"t": Dihedral([[0, 1, 2, 3]])})
+
+    def energy(angle):
+        place, axis = x.copy(), (x[2] - x[1]) / np.linalg.norm(x[2] - x[1])
+        arm = x[3] - x[2]
+        place[3] += np.sin(angle) * np.cross(axis, arm) + (1 - np.cos(angle)) * (axis @ arm * axis - arm)
+        simulation.context.setPositions(place)
+        simulation.context.computeVirtualSites()
+        groups = integrator.getIntegrationForceGroups()
+        return simulation.context.getState(energy=True, groups=groups).getPotentialEnergy()._value
+
+    slope = (energy(1e-4) - energy(-1e-4)) / 2e-4
+    energy(0.0)
+    groups = integrator.getIntegrationForceGroups()
+    reporter.report(
+        simulation, simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups)
+    )
+    assert reporter.series.turned[0, 0] == pytest.approx(slope, rel=1e-5)
+
+
 def test_bad_input():
     with pytest.raises(InputError, match="reportInterval is 0"):
         HeldCoordinatesReporter(io.StringIO(), 0, {"phi": Dihedral([PHI])})
