@@ -27,7 +27,6 @@ from kcons.free_energy import (
     OpenMMWindows,
     Settings,
     Windows,
-    fit_surface,
     plot_profile,
     plot_surface,
 )
@@ -123,9 +122,7 @@ def torsions(folder: Path, full: bool) -> dict[str, object]:
     found = sampled(sampler, np.array(grid), folder / "torsions", settings, full, both_sides=False)
     if not full:
         return {}
-    # A part of both turns is no period: `found.surface` would go around.
-    x, f, c = (np.array([getattr(w, name) for w in found.windows]) for name in ("value", "force", "covariance"))
-    surface = fit_surface(x, f, c)
+    surface = found.surface
     pictured(plot_surface(surface, coordinates=("phi / rad", "psi / rad"), energy="kJ/mol"), "torsions")
     inside = [m.x for m in surface.minima() if PHI[0] <= m.x[0] <= PHI[-1] and PSI[0] <= m.x[1] <= PSI[-1]]
     minima = []

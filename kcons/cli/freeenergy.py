@@ -62,13 +62,13 @@ def _free_energy(chosen: argparse.Namespace) -> int:
         found = windows.run(plan.targets, **how)
         if plan.improve and not found.failed:
             found = windows.improve(**plan.improve, **how)
+        # Before pulls, which may fail.
+        written = windows_report.write(found, folder, windows.angles)
         if plan.pulls:
             # A folder belongs to settings, and pulls are slower than the way to a window.
             settings = replace(plan.settings, pull=plan.pull_steps)
             pulled = Windows(plan.sampler, folder / "pulls", settings, **plan.options).pull(**plan.pulls, **how)
-    degrees = windows.angles
-    show(windows_report.table(found, degrees), windows_report.summary(found), console())
-    written = windows_report.write(found, folder, degrees)
+    show(windows_report.table(found, windows.angles), windows_report.summary(found), console())
     if plan.pulls and pulled is not None:
         numbers, said = windows_report.of_pulls(found, pulled, plan.pulls["start"], plan.pulls["end"])
         print(said)

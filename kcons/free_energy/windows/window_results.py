@@ -16,9 +16,12 @@ from kcons.free_energy.mean_forces import MeanForce
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.windows.window import Sampler
+from kcons.thermostats import Estimate
 
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
 UNLIKELY = 0.01
+#: Windows of a torsion do not go around a gap that is wider than any other by more than this.
+_HOLE = 2.001
 
 
 @dataclass(frozen=True)
@@ -88,10 +91,8 @@ class FreeEnergy:
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
         f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
-        x, period = self._places()[:, 0], float(self.periods[0]) or None
-        spread = np.ptp(x) if len(x) else 0.0
-        whole = period is not None and spread + np.diff(np.sort(x)).max(initial=0.0) >= period * (1 - 1e-6)
-        return integrate(x, f, e, period=period if whole else None)
+        x, periods = self._places()
+        return integrate(x[:, 0], f, e, period=periods[0])
 
     @cached_property
     def surface(self) -> Surface:
@@ -102,17 +103,44 @@ class FreeEnergy:
         InputError
             Too few windows.
         """
-        x, f = self._places(), np.array([w.force for w in self.windows])
-        covariances = np.array([w.covariance for w in self.windows])
-        return fit_surface(x, f, covariances, periods=[period or None for period in self.periods.tolist()])
+        x, periods = self._places()
+        f = np.array([w.force for w in self.windows])
+        return fit_surface(x, f, np.array([w.covariance for w in self.windows]), periods=periods)
 
-    def _places(self) -> FloatArray:
-        """Where the windows are, within one period where they are further apart, shape (n, d)."""
+    def between(self, a: float, b: float) -> Estimate | None:
+        """F(b) - F(a) of the profile, in whichever turn the places are given; None where it does not reach both."""
+        profile, period = self.profile, float(self.periods[0])
+        ends = np.array([a, b])
+        if period:
+            ends += period * np.ceil((profile.x[0] - ends) / period - 1e-9)
+        slack = 1e-9 * np.ptp(profile.x)
+        if ends.min() < profile.x[0] - slack or ends.max() > profile.x[-1] + slack:
+            return None
+        return profile.difference(*ends.tolist())
+
+    def _places(self) -> tuple[FloatArray, list[float | None]]:
+        """Where the windows are, shape (n, d), and the period of each coordinate that they go all around."""
         x = np.array([w.value for w in self.windows]).reshape(-1, len(self.names))
-        for column, period in zip(x.T, self.periods.tolist(), strict=True):
-            if period and len(column) and np.ptp(column) > period:
-                column[:] = column.min() + (column - column.min()) % period
-        return x
+        around = [self._in_one_turn(column, period) for column, period in zip(x.T, self.periods.tolist(), strict=True)]
+        return x, [period if whole else None for whole, period in zip(around, self.periods.tolist(), strict=True)]
+
+    @staticmethod
+    def _in_one_turn(x: FloatArray, period: float) -> bool:
+        """Put places into one turn, in place, which begins beyond a gap that is far wider than all others.
+
+        Whether they go all around: the gap from the last to the first is no wider than another.
+        """
+        if not period or not len(x):
+            return False
+        if np.ptp(x) > period:
+            x[:] = x.min() + (x - x.min()) % period
+        ordered = np.sort(x)
+        gaps = np.append(np.diff(ordered), ordered[0] + period - ordered[-1])
+        widest = int(np.argmax(gaps))
+        if widest < len(x) - 1 and gaps[widest] > _HOLE * np.delete(gaps, widest).max():
+            x[x <= ordered[widest]] += period
+            return False
+        return bool(gaps[-1] <= gaps[:-1].max(initial=0.0) + 1e-6 * period)
 
     def numbers(self) -> dict[str, Any]:
         """All of it as plain data."""

@@ -109,7 +109,9 @@ def of_pulls(found: FreeEnergy, pulled: Pulled, start: FloatArray, end: FloatArr
     numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
     said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol are lost)"
     if len(found.names) == 1 and len(found.windows) >= FEWEST:
-        windows = found.profile.difference(float(start[0]), float(end[0]))
+        windows = found.between(float(start[0]), float(end[0]))
+        if windows is None:
+            return numbers, f"{said}; the windows do not reach both ends"
         numbers["windows"] = [windows.value, windows.error]
         away = (best.value - windows.value) / math.hypot(best.error, windows.error)
         said += f", windows {windows.value:.2f} ± {windows.error:.2f}: {away:+.1f} standard errors"
@@ -129,10 +131,8 @@ def _draw(found: FreeEnergy, file: Path, degrees: bool) -> None:
         turn * profile.x, profile.F - 2 * profile.error, profile.F + 2 * profile.error, color="tab:blue", alpha=0.25
     )
     above.set_ylabel("F (kJ/mol), band 2 standard errors")
-    x = turn * np.array([w.value[0] for w in found.windows])
-    below.errorbar(
-        x, [w.force[0] for w in found.windows], [2 * w.error[0] for w in found.windows], fmt="o", ms=4, capsize=2
-    )
+    windows = (turn * profile.windows, profile.mean_forces, 2 * profile.mean_force_errors)
+    below.errorbar(*windows, fmt="o", ms=4, capsize=2)
     below.axhline(0, color="0.6", lw=0.8)
     below.set_ylabel("dF/dq (kJ/mol by " + ("radian)" if degrees else "angstrom)"))
     below.set_xlabel(f"{found.names[0]} ({'degrees' if degrees else 'angstrom'})")

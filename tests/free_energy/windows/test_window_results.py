@@ -62,6 +62,33 @@ def test_half_a_turn_is_not_closed():
     assert profile.closure is None and profile.difference(0, np.pi / 2).value == pytest.approx(-2.0, abs=0.02)
 
 
+@pytest.mark.parametrize("there", [[150, 165, 180, 195, 210], [150, 165, 180, -165, -150], [510, -195, 180, 195, -150]])
+def test_windows_across_the_end_of_a_turn_are_a_part_of_it(there):
+    """However they are written, no profile is made where there are no windows."""
+    part = found(there)
+    np.testing.assert_allclose(np.degrees(part.profile.x[-1] - part.profile.x[0]), 60.0)
+    assert part.profile.closure is None and part.profile.error.max() < 0.1
+    for a, b in ((150, 180), (-210, -180), (150, -180)):
+        assert part.between(*np.radians([a, b])).value == pytest.approx(0.5, abs=0.01)
+    assert part.between(*np.radians([140, 180])) is None
+    assert max(np.degrees(part.profile.next_windows(3))) <= np.degrees(part.profile.x[-1]) + 1e-9
+
+
+def test_a_turn_with_gaps_of_any_width_is_closed():
+    for there in ([0, 90, 135, 180, 202, 225, 270, 292, 315], [0, 120, 240], np.arange(-180, 181, 30)):
+        assert found(there).profile.closure is not None
+    assert found(np.arange(0, 181, 90)).profile.closure is None
+
+
+def test_surfaces_of_a_part_of_a_turn_have_no_minima_beyond():
+    windows = [
+        WindowResult(0, np.radians(p), 9 * np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2), 0.0)
+        for p in [(a, b) for a in (40, 60, 80, 100) for b in (-40, -15, 15, 40)]
+    ]
+    surface = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows).surface
+    assert surface.periods == (None, None) and surface.minima() == []
+
+
 def test_surfaces_of_torsions_beyond_their_period():
     pairs = [(a, b) for a in (0, 120, 600) for b in (-60, 60, 180)]
     windows = [

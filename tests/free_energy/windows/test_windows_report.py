@@ -9,7 +9,7 @@ import pytest
 from window_samplers import Fake
 
 from kcons.cli.terminal import rendered
-from kcons.free_energy import Settings, Windows
+from kcons.free_energy import Settings, Windows, pull_free_energy
 from kcons.free_energy.windows import windows_report
 
 
@@ -41,3 +41,13 @@ def test_files(found, tmp_path):
     numbers = np.loadtxt(paths[1], delimiter=",", skiprows=1)
     np.testing.assert_allclose(numbers[:, 1], found.profile.F, rtol=1e-6, atol=1e-9)
     assert paths[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_pulls_beside_windows_that_do_not_reach_their_ends(found):
+    pulled = pull_free_energy(np.linspace(0, 1, 20), thermal_energy=2.5)
+    numbers, said = windows_report.of_pulls(found, pulled, np.array([0.1]), np.array([4.0]))
+    assert numbers["windows"][0] == pytest.approx(found.profile.difference(0.1, 4.0 - 2 * np.pi).value)
+    found.windows[:] = found.windows[:4]
+    del found.profile
+    numbers, said = windows_report.of_pulls(found, pulled, np.array([0.1]), np.array([4.0]))
+    assert "windows" not in numbers and said.endswith("; the windows do not reach both ends")
