@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
+from kcons.ase.binding import FORCES_ONLY
 from kcons.errors import InputError, UnsupportedError, did_you_mean
 
 #: Endings of files that say what a calculator computes, not what it writes.
@@ -69,15 +70,16 @@ def described(calculator: Any, atoms: Atoms) -> list[Any]:
     """What tells a calculator from others: its kind, its parameters, and the calculators that it is made of.
 
     Initial charges and magnetic moments of the atoms, which it may take for the charge and the spin, are in it where
-    there are any. Plain data, the same in each process; of parameters that are files of weights, the contents. What a
-    calculator does not give as parameters is not in it.
+    there are any, and constraints of ASE that add forces. Plain data, the same in each process; of parameters that are
+    files of weights, the contents. What a calculator does not give as parameters is not in it.
     """
     initial = {
         name: atoms.arrays[name].tolist()
         for name in ("initial_charges", "initial_magmoms")
         if name in atoms.arrays and atoms.arrays[name].any()
     }
-    return [*_kind(calculator), *([initial] if initial else [])]
+    added = [_plain(item.todict()) for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+    return [*_kind(calculator), *([initial] if initial else []), *added]
 
 
 def _kind(calculator: Any) -> list[Any]:

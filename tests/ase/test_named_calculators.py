@@ -10,6 +10,7 @@ from ase import Atoms
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from ase.calculators.mixing import SumCalculator
+from ase.constraints import ExternalForce, FixAtoms, Hookean
 
 from kcons.ase.named_calculators import described, named_calculator
 from kcons.errors import InputError
@@ -67,3 +68,12 @@ def test_charges_and_moments_that_calculators_read_belong_to_them():
     found = [json.dumps(described(EMT(), atoms)) for atoms in (plain, spins, Atoms("H2", charges=[1.0, 0.0]))]
     assert len(set(found)) == 3
     assert described(EMT(), Atoms("H2", charges=[0.0, 0.0])) == described(EMT(), plain)
+
+
+def test_constraints_that_add_forces_belong_to_it():
+    atoms = Atoms("H2", positions=np.eye(3)[:2])
+    found = [json.dumps(described(EMT(), atoms))]
+    for item in (ExternalForce(0, 1, 0.5), ExternalForce(0, 1, 0.6), Hookean(0, 1, 2.0, 1.0)):
+        atoms.set_constraint([FixAtoms([0]), item])
+        found.append(json.dumps(described(EMT(), atoms)))
+    assert len(set(found)) == 4

@@ -9,7 +9,7 @@ import pytest
 from ase import Atoms
 from ase.build import molecule
 from ase.calculators.emt import EMT
-from ase.constraints import FixAtoms, Hookean
+from ase.constraints import ExternalForce, FixAtoms, Hookean
 from scan_systems import chain, threefold, two_wells
 
 from kcons.ase import constrain
@@ -221,6 +221,9 @@ def test_a_folder_of_another_scan_is_refused(tmp_path):
         scan(atoms, TURN, [0.5], folder=tmp_path, fmax=0.02)
     with pytest.raises(OccupiedError, match="held"):
         scan(atoms, TURN, [0.5], folder=tmp_path, held=Distance([[0, 1]]))
+    atoms.set_constraint(ExternalForce(0, 3, 0.01))
+    with pytest.raises(OccupiedError, match="calculator"):
+        scan(atoms, TURN, [0.5], folder=tmp_path)
 
 
 def test_bad_coordinates():
