@@ -16,7 +16,7 @@ from openmm import app, unit
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Formula
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import named
 from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
 from kcons.free_energy.series import Series
@@ -32,6 +32,8 @@ from kcons.openmm.topology import bonds_of
 
 #: What a relaxation leaves of the forces, kJ/mol/nm.
 _FORCE = 50.0
+#: Part of the box by which files round it.
+_SAME_BOX = 1e-3
 
 
 class OpenMMWindows:
@@ -40,20 +42,24 @@ class OpenMMWindows:
     Parameters
     ----------
     topology : openmm.app.Topology
+        Of the same number of atoms, and the same box, as the System.
     system : openmm.System
         Without a barostat; its constraints are kept.
     positions : Quantity or array_like, shape (n_particles, 3)
         The structure that all windows start from, in nm if without unit.
     coordinates : mapping of str to Constraint
-        by the windows.
+        What they are held at is set by the windows, in angstrom and radian; of a `Formula` in the unit that its text
+        gives from positions in nm.
     platform : str, optional
     properties : mapping of str to str
         Of the platform.
 
     Raises
     ------
+    InputError
+        A Topology of another number of atoms, or of another box.
     UnsupportedError
-        A coordinate of another kind, or of virtual sites.
+        A coordinate of another kind, or of virtual sites; a barostat.
     KconsError
         At `begin`: a coordinate that is undefined at the structure or depends on the constraints of the System.
     """
@@ -71,6 +77,7 @@ class OpenMMWindows:
         properties: Mapping[str, str] | None = None,
     ) -> None:
         n = system.getNumParticles()
+        _refuse_another(topology, system)
         self.positions = nanometers(positions, n)
         self.coordinates = named(coordinates)
         self.names = tuple(self.coordinates)
@@ -81,7 +88,7 @@ class OpenMMWindows:
         self.digest = digest_of(self._system, self.positions, list(self.coordinates.values()))
         self._bonds: IntArray = bonds_of(system, self.positions)
         # A Topology cannot be pickled where its elements are; what a Simulation needs of it is the number of atoms.
-        self._n = topology.getNumAtoms()
+        self._n = n
         for name, item in self.coordinates.items():
             _force_of(name, item, system.usesPeriodicBoundaryConditions())
 
@@ -190,6 +197,29 @@ class OpenMMWindows:
         for _ in range(self._n):
             topology.addAtom("X", None, residue)
         return app.Simulation(topology, system, integrator, *chosen)
+
+
+def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
+    """Refuse a Topology that is not of this System, and Systems whose box would change."""
+    if topology.getNumAtoms() != system.getNumParticles():
+        raise InputError(
+            f"the Topology has {topology.getNumAtoms()} atoms and the System {system.getNumParticles()} particles; "
+            "give those of one structure",
+            item="topology",
+        )
+    box = topology.getPeriodicBoxVectors()
+    if box is not None and system.usesPeriodicBoundaryConditions():
+        mine, its = cell_of(box), cell_of(system.getDefaultPeriodicBoxVectors())
+        if np.abs(mine - its).max() > _SAME_BOX * np.abs(its).max():
+            raise InputError(
+                f"the box of the Topology is {mine.tolist()} nm, and that of the System, which windows are sampled in, "
+                f"{its.tolist()}; give it by system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors()), "
+                "or take the structure that the System was made for",
+                item="topology",
+            )
+    barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
+    if barostats:
+        raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
 
 
 def _without_momentum(context: openmm.Context, held: Held) -> None:

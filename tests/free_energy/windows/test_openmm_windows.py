@@ -78,6 +78,33 @@ def test_coordinates_that_cannot_be_held():
         sampler({"q": Angle([[4, 6, 8]])}, tight).begin()
 
 
+def test_structures_that_are_not_of_the_system():
+    made, topology, x = openmm.System(), app.Topology(), np.eye(3)[:2]
+    residue = topology.addResidue("X", topology.addChain())
+    for _ in x:
+        made.addParticle(1.0)
+    distance = {"r": Distance([[0, 1]])}
+    with pytest.raises(InputError, match="Topology has 0 atoms and the System 2 particles"):
+        OpenMMWindows(topology, made, x, distance)
+    for _ in x:
+        topology.addAtom("X", None, residue)
+    topology.setPeriodicBoxVectors(3.0 * np.eye(3))
+    OpenMMWindows(topology, made, x, distance)
+    bonds = openmm.HarmonicBondForce()
+    bonds.setUsesPeriodicBoundaryConditions(True)
+    made.addForce(bonds)
+    made.setDefaultPeriodicBoxVectors(*(3.1 * np.eye(3)))
+    with pytest.raises(
+        InputError, match=r"box of the Topology is \[\[3\.0.*System.*\[\[3\.1.*setDefaultPeriodicBoxVectors"
+    ):
+        OpenMMWindows(topology, made, x, distance)
+    made.setDefaultPeriodicBoxVectors(*(3.0001 * np.eye(3)))
+    OpenMMWindows(topology, made, x, distance)
+    made.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
+    with pytest.raises(UnsupportedError, match="MonteCarloBarostat; windows are sampled in a box at rest"):
+        OpenMMWindows(topology, made, x, distance)
+
+
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
     settings = Settings(pull=100, equilibration=20, production=320, every=10, relax=3)
     sampler({"phi": PHI}).pull(Window(0, "forward", (-1.2,), (-1.0,), 5), settings, tmp_path / "pull.npz")
