@@ -56,7 +56,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
 
         how: dict[str, Any] = {
             "executor": executor,
-            "workers": chosen.workers or plan.processes,
+            "workers": plan.processes if chosen.workers is None else chosen.workers,
             "progress": progress,
         }
         found = windows.run(plan.targets, **how)

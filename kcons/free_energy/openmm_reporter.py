@@ -36,7 +36,7 @@ class HeldCoordinatesReporter:
     ----------
     file : path or text file
         Comma-separated columns: step, time in ps, then value and multiplier of each coordinate in kJ/mol, nm and
-        radian, ln det Z, and the work that moving targets did so far.
+        radian, ln det Z, and the work that moving targets did since the first report of this reporter.
     reportInterval : int
         Steps from one report to the next.
     coordinates : mapping of str to Constraint
@@ -157,8 +157,8 @@ class HeldCoordinatesReporter:
         free = known and bool(np.all((masses > 0) | virtual))
         # Forces on virtual sites are in those of the particles that they depend on: sites belong to no group.
         bonds = bonds_of(system, x)
-        bonds = bonds[~virtual[bonds].any(axis=1)] if free else None
-        self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
+        turned = bonds[~virtual[bonds].any(axis=1)] if free else None
+        self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=turned)
         self._context = simulation.context
         self.series = Series(self._held.names, self._held.periods)
         if not self._titled:

@@ -139,10 +139,26 @@ class Windows:
         FreeEnergy
             One failed window does not stop the others; `failed` says why.
         """
-        places = places_of(targets, self.sampler.names)
+        numbers: list[int] = []
+        for place in map(tuple, places_of(targets, self.sampler.names).tolist()):
+            asked = [n for n, target in enumerate(self._targets) if target == place and n not in numbers]
+            numbers += asked[:1] or self._added([place])
+        return self._run(numbers, executor, workers, progress)
+
+    def _added(self, places: Iterable[Sequence[float]]) -> list[int]:
+        """Numbers of new windows."""
         first = len(self._targets)
-        self._targets += [tuple(row) for row in places.tolist()]
-        jobs = [job for number in range(first, len(self._targets)) for job in self._jobs(number)]
+        self._targets += map(tuple, places)
+        return list(range(first, len(self._targets)))
+
+    def _run(
+        self,
+        numbers: Sequence[int],
+        executor: Executor | None,
+        workers: int | None,
+        progress: Callable[[int, int, float], None] | None,
+    ) -> FreeEnergy:
+        jobs = [job for number in numbers for job in self._jobs(number)]
         missing = [job for job in jobs if not self._finished(job)]
         failed = self._sample(missing, executor, workers, progress, len(jobs))
         return self.result(failed)
@@ -177,17 +193,18 @@ class Windows:
             if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
                 break
             places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
-            result = self.run(places, executor=executor, workers=workers, progress=progress)
+            result = self._run(self._added([place] for place in places), executor, workers, progress)
             if result.failed:
                 break
         return result
 
     def _jobs(self, number: int) -> list[Window]:
-        """The runs of a window; the same ones whenever they are asked for."""
+        """The runs of a window; the same ones whenever they are asked for. Without a pull they begin where they end."""
         target = np.array(self._targets[number])
+        approach = self.approach if self.settings.pull else 0.0
         jobs = []
         for k, side in enumerate(SIDES if self.both_sides else SIDES[:1]):
-            start = target + (-1 if side == "up" else 1) * self.approach
+            start = target + (-1 if side == "up" else 1) * approach
             seed = int(np.random.SeedSequence([self.seed, number, k]).generate_state(1)[0])
             begin, end = (tuple((q / self.sampler.scales).tolist()) for q in (start, target))
             jobs.append(Window(number, side, begin, end, seed))
@@ -277,8 +294,9 @@ class Windows:
         failed: dict[str, str] = {}
         tries: dict[str, int] = dict.fromkeys((job.name for job in jobs), 0)
         left, began, done = list(jobs), time.monotonic(), 0
+        cores = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         while left:
-            pool = executor or _processes(workers or os.cpu_count() or 1, len(left))
+            pool = executor or _processes(cores, len(left))
             again: list[Window] = []
             try:
                 running: dict[Future[None], Window] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from ase.constraints import FixAtoms
 
 from kcons.constraints import Dihedral, Distance
 from kcons.errors import InputError, SingularGeometryError, UnsupportedError
-from kcons.free_energy import AseWindows, Series, Settings, Window
+from kcons.free_energy import AseWindows, Series, Settings, Window, Windows
 
 CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)
 TURN = Dihedral([[2, 0, 1, 3]])
@@ -45,6 +46,13 @@ def test_a_window_far_from_the_structure(tmp_path, thermostat):
     np.testing.assert_allclose(series.value, np.pi / 3, atol=1e-12)
     assert np.array_equal(series.multiplier, Series.load(tmp_path / "two").multiplier)
     assert series.isokinetic_degrees_of_freedom == (3 if thermostat == "isokinetic" else 0)
+
+
+def test_a_window_without_a_pull(tmp_path):
+    found = Windows(sampler(), tmp_path, Settings(**{**SHORT.__dict__, "pull": 0}), both_sides=False)
+    with ThreadPoolExecutor(1) as executor:
+        result = found.run([np.pi / 3], executor=executor)
+    assert result.failed == {} and len(result.windows) == 1
 
 
 def test_a_calculator_that_fails_is_named(tmp_path):

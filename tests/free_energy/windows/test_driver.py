@@ -84,6 +84,23 @@ def test_one_failed_window_does_not_stop_the_others_and_is_tried_again(tmp_path)
     assert not list((tmp_path / "out").glob("*.failed.txt"))
 
 
+def test_the_same_object_asked_again_has_the_same_windows(tmp_path):
+    """Those that failed are tried again; a place that is given twice is two windows."""
+    windows, first = run(tmp_path, [-1.0, 0.0, 1.0, 1.0], fails=("window-0001-up",))
+    windows.sampler.fails = ()
+    with ThreadPoolExecutor(1) as executor:
+        again = windows.run([1.0, 0.0, -1.0, 1.0], executor=executor)
+        assert again.failed == {} and len(first.windows) == len(again.windows) == 4
+        assert len(diary(tmp_path)) == 9
+        assert sorted(w.number for w in windows.run([0.0, 2.0], executor=executor).windows) == [0, 1, 2, 3, 4]
+
+
+def test_without_a_pull_windows_begin_where_they_end(tmp_path):
+    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(pull=0, production=320, every=10))
+    windows.run([0.5], executor=ThreadPoolExecutor(1))
+    assert [(job.start, job.target) for job in windows._jobs(0)] == [((0.5,), (0.5,))] * 2
+
+
 def test_hysteresis_is_seen(tmp_path):
     _, result = run(tmp_path, shift=1.5)
     assert max(w.hysteresis for w in result.windows) < 1e-4
@@ -210,6 +227,9 @@ def test_bad_input(tmp_path):
     for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1))):
         with pytest.raises(InputError, match="targets must be finite"):
             windows.run(wrong)
+    for wrong in (0, -1, 1.5):
+        with pytest.raises(InputError, match=f"workers is {wrong}; give a whole number, 1 or more"):
+            windows.run([0.0], workers=wrong)
     with pytest.raises(InputError, match="count is 4; give a whole number, 5 or more"):
         windows.pull(0, 1, 4)
     for more in ({"approach": [1.0, 2.0]}, {"approach": np.nan}, {"approach": "x"}, {"seed": None}):
