@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import ANGLE, numbers
+from kcons.constraints.arguments import ANGLE, LENGTH, numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 
@@ -93,8 +93,8 @@ class Grid:
 
     @property
     def units(self) -> list[str]:
-        """Of the values as they are shown."""
-        return ["degrees" if turn else "angstrom" for turn in self.in_degrees]
+        """Of the values as they are shown; formulas and functions have their own."""
+        return [{ANGLE: "degrees", LENGTH: "angstrom"}.get(item.held, "own unit") for item in self.coordinates]
 
     def held_at(self, point: Point) -> list[Constraint]:
         """The coordinates with their values at a point as targets."""

@@ -106,9 +106,9 @@ class Windows:
             opened.write(text(mine).encode())
 
     @property
-    def angles(self) -> list[bool]:
-        """Which coordinates are angles."""
-        return [bool(angle) for angle in self.sampler.angles]
+    def angles(self) -> list[bool | None]:
+        """Which coordinates are angles; None where the unit is that of a formula or a function."""
+        return list(self.sampler.angles)
 
     # -- running --------------------------------------------------------------------------------
 

@@ -109,8 +109,8 @@ class Sampler(Protocol):
         Its unit of energy in kJ/mol.
     scales : ndarray, shape (d,)
         The units of its coordinates in angstrom and radian.
-    angles : tuple of bool
-        Which coordinates are angles.
+    angles : tuple of bool or None
+        Which coordinates are angles; None where the unit is that of a formula or a function.
     digest : str
         Of structure, forces and constraints: what a folder of windows belongs to.
     """
@@ -118,7 +118,7 @@ class Sampler(Protocol):
     names: tuple[str, ...]
     kJ: float
     scales: FloatArray
-    angles: tuple[bool, ...]
+    angles: tuple[bool | None, ...]
 
     @property
     def digest(self) -> str:
@@ -140,9 +140,9 @@ def scales_of(coordinates: Mapping[str, Constraint], angstrom: float) -> FloatAr
     return np.array([angstrom if c.held is LENGTH and c.family != "Formula" else 1.0 for c in coordinates.values()])
 
 
-def angles_of(coordinates: Mapping[str, Constraint]) -> tuple[bool, ...]:
-    """Which coordinates are angles."""
-    return tuple(c.held is ANGLE for c in coordinates.values())
+def angles_of(coordinates: Mapping[str, Constraint]) -> tuple[bool | None, ...]:
+    """Which coordinates are angles; None where the unit is that of a formula or a function."""
+    return tuple({ANGLE: True, LENGTH: False}.get(c.held) for c in coordinates.values())
 
 
 def digest_of(*parts: Any) -> str:

@@ -146,7 +146,7 @@ class FreeEnergy:
         """All of it as plain data."""
         return {
             "names": list(self.names),
-            "units": "kJ/mol, angstrom, radian",
+            "units": "kJ/mol, angstrom, radian; of formulas and functions their own",
             "windows": [
                 {
                     "number": w.number,

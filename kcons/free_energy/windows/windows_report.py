@@ -20,21 +20,24 @@ if TYPE_CHECKING:
 
 #: Least windows that a profile is drawn through.
 FEWEST = 4
+#: Of angles, of lengths, and of formulas and functions: as places are shown, and what mean forces are by.
+_SHOWN = {True: "degrees", False: "angstrom", None: "own unit"}
+_PER = {**_SHOWN, True: "radian"}
 
 
-def table(found: FreeEnergy, degrees: Sequence[bool]) -> Table:
+def table(found: FreeEnergy, degrees: Sequence[bool | None]) -> Table:
     """The windows, one in a line.
 
     Parameters
     ----------
-    degrees : sequence of bool
-        Which coordinates are angles.
+    degrees : sequence of bool or None
+        Which coordinates are angles; None where the unit is that of a formula or a function.
     """
     from rich.table import Table
 
-    made = Table(title="mean force (kJ/mol by angstrom or radian)")
+    made = Table(title=f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in degrees))})")
     for name, angle in zip(found.names, degrees, strict=True):
-        made.add_column(f"{name} ({'degrees' if angle else 'angstrom'})", justify="right")
+        made.add_column(f"{name} ({_SHOWN[angle]})", justify="right")
     for name in found.names:
         made.add_column(f"dF/d {name}" if len(found.names) > 1 else "dF/dq", justify="right")
     made.add_column("raw multiplier", justify="right")
@@ -81,7 +84,7 @@ def summary(found: FreeEnergy) -> str:
     return "\n".join(lines)
 
 
-def write(found: FreeEnergy, folder: Path, degrees: Sequence[bool]) -> list[Path]:
+def write(found: FreeEnergy, folder: Path, degrees: Sequence[bool | None]) -> list[Path]:
     """free_energy.json, and for one coordinate profile.csv and profile.png; returns their paths."""
     written = [folder / "free_energy.json"]
     with in_one_piece(written[0]) as opened:
@@ -90,8 +93,7 @@ def write(found: FreeEnergy, folder: Path, degrees: Sequence[bool]) -> list[Path
         profile = found.profile
         written.append(folder / "profile.csv")
         with in_one_piece(written[-1]) as opened:
-            unit = "radian" if degrees[0] else "angstrom"
-            opened.write(f"{found.names[0]} ({unit}),F (kJ/mol),error (kJ/mol)\n".encode())
+            opened.write(f"{found.names[0]} ({_PER[degrees[0]]}),F (kJ/mol),error (kJ/mol)\n".encode())
             np.savetxt(opened, np.column_stack([profile.x, profile.F, profile.error]), fmt="%.8g", delimiter=",")
         written.append(folder / "profile.png")
         _draw(found, written[-1], degrees[0])
@@ -118,7 +120,7 @@ def of_pulls(found: FreeEnergy, pulled: Pulled, start: FloatArray, end: FloatArr
     return numbers, said
 
 
-def _draw(found: FreeEnergy, file: Path, degrees: bool) -> None:
+def _draw(found: FreeEnergy, file: Path, degrees: bool | None) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -134,6 +136,6 @@ def _draw(found: FreeEnergy, file: Path, degrees: bool) -> None:
     windows = (turn * profile.windows, profile.mean_forces, 2 * profile.mean_force_errors)
     below.errorbar(*windows, fmt="o", ms=4, capsize=2)
     below.axhline(0, color="0.6", lw=0.8)
-    below.set_ylabel("dF/dq (kJ/mol by " + ("radian)" if degrees else "angstrom)"))
-    below.set_xlabel(f"{found.names[0]} ({'degrees' if degrees else 'angstrom'})")
+    below.set_ylabel(f"dF/dq (kJ/mol by {_PER[degrees]})")
+    below.set_xlabel(f"{found.names[0]} ({_SHOWN[degrees]})")
     figure.savefig(file, dpi=150)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraints import Dihedral, Distance
+from kcons.constraints import Dihedral, Distance, Formula
 from kcons.errors import InputError
 from kcons.free_energy.scans.grid import Grid
 
@@ -30,6 +30,8 @@ def test_two_coordinates():
     held = grid.held_at((2, 1))
     assert held[0].target == pytest.approx([np.radians(240)]) and held[1].target == pytest.approx([1.4])
     assert grid.names == ["Dihedral(0, 1, 2, 3)", "Distance(0, 1)"] and grid.in_degrees == [True, False]
+    assert grid.units == ["degrees", "angstrom"]
+    assert Grid([Formula("x1 * x2", [[0, 1]]), TURN], [[0.1], [0.2]]).units == ["own unit", "degrees"]
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,10 @@ import pytest
 from window_samplers import Fake
 
 from kcons.cli.terminal import rendered
+from kcons.constraints import Dihedral, Distance, Formula
 from kcons.free_energy import Settings, Windows, pull_free_energy
 from kcons.free_energy.windows import windows_report
+from kcons.free_energy.windows.window import angles_of
 
 
 @pytest.fixture
@@ -41,6 +43,16 @@ def test_files(found, tmp_path):
     numbers = np.loadtxt(paths[1], delimiter=",", skiprows=1)
     np.testing.assert_allclose(numbers[:, 1], found.profile.F, rtol=1e-6, atol=1e-9)
     assert paths[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_formula_has_its_own_unit(found, tmp_path):
+    """Of OpenMM it is in nm, and nobody knows whether it is a length."""
+    coordinates = {"f": Formula("x1 * x2", [[0, 1]]), "r": Distance([[0, 1]]), "t": Dihedral([[0, 1, 2, 3]])}
+    assert angles_of(coordinates) == (None, False, True)
+    text = rendered(windows_report.table(found, [None]))
+    assert "torsion (own unit)" in text and "kJ/mol by own unit" in text and "angstrom" not in text
+    (_, columns, _) = windows_report.write(found, tmp_path, [None])
+    assert columns.read_text().startswith("torsion (own unit),F")
 
 
 def test_pulls_beside_windows_that_do_not_reach_their_ends(found):
