@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms
 from kcons.constraints.arguments import whole_number
@@ -25,7 +26,7 @@ from kcons.steppers.files import as_path
 
 #: Tables of a plan, and what the values of their keys are.
 TABLES: dict[str, dict[str, str]] = {
-    "structure": {"file": "a text", "count_from": "a whole number"},
+    "structure": {"file": "a text", "count_from": "0 or 1"},
     "forces": {
         **dict.fromkeys(("calculator", "system", "platform"), "a text"),
         **dict.fromkeys(("settings", "properties"), "a table"),
@@ -40,7 +41,7 @@ TABLES: dict[str, dict[str, str]] = {
     "held": {"constrain": "a text", "fixed": "whole numbers", "distances": "pairs of whole numbers"},
     # What there is more to say of settings, they say themselves.
     "sampling": {**dict.fromkeys((f.name for f in fields(Settings)), ""), "both_sides": "true or false"}
-    | {"approach": "", "seed": ""},
+    | {"approach": "a number, or numbers", "seed": ""},
     "improve": {
         **dict.fromkeys(("error", "below"), "a number above 0"),
         **dict.fromkeys(("most", "at_once"), "a whole number above 0"),
@@ -147,6 +148,8 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
         raise InputError("the plan has no [[coordinate]]", item="coordinate")
     settings = dict(data.get("sampling", {}))
     options = {key: settings.pop(key) for key in ("both_sides", "approach", "seed") if key in settings}
+    if "approach" in options:
+        options["approach"] = _in_radian("approach", options["approach"], coordinates)
     workers = data.get("workers", {})
     targets = np.array(list(product(*values)))
     if "improve" in data and (len(coordinates) > 1 or len(targets) < 3):
@@ -197,6 +200,8 @@ def _is(value: Any, wanted: str) -> bool:
         return isinstance(value, list) and all(_is(pair, "whole numbers") and len(pair) == 2 for pair in value)
     if wanted == "a number, or numbers":
         return _is(value, "a number") or _is(value, "numbers")
+    if wanted == "0 or 1":
+        return _is(value, "a whole number") and value in (0, 1)
     if wanted.endswith("numbers"):
         return isinstance(value, list) and bool(value) and all(_is(v, "a " + wanted[:-1]) for v in value)
     kinds = int if "whole" in wanted else (int, float)
@@ -243,19 +248,23 @@ def _pulls(entry: Mapping[str, Any], coordinates: Mapping[str, Constraint], targ
     found = {key: entry[key] for key in ("count", "both_ways") if key in entry}
     for key, argument, place in (("from", "start", targets[0]), ("to", "end", targets[-1])):
         if key in entry:
-            given = np.atleast_1d(np.array(entry[key], dtype=np.float64))
-            if given.shape != place.shape:
-                raise InputError(
-                    f"{key} of [pulls] has {given.size} values; give one for each of {', '.join(coordinates)}", item=key
-                )
-            lengths = [isinstance(item, Distance) for item in coordinates.values()]
-            place = np.where(lengths, given, np.radians(given))
+            place = _in_radian(f"{key} of [pulls]", np.atleast_1d(entry[key]), coordinates)
         found[argument] = place
     for key, low in (("count", 5), ("steps", 1)):
         whole_number(entry.get(key, low), f"{key} of [pulls]", low)
     if np.array_equal(found["start"], found["end"]):
         raise InputError("[pulls] begin where they end; give from and to", item="pulls")
     return found
+
+
+def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]) -> FloatArray:
+    """Values of the coordinates, or one for all of them, angles of degrees in radian."""
+    values = np.array(given, dtype=np.float64)
+    if values.shape not in ((), (len(coordinates),)):
+        raise InputError(
+            f"{key} has {values.size} values; give one for each of {', '.join(coordinates)}", item=key.split()[0]
+        )
+    return np.where([isinstance(item, Distance) for item in coordinates.values()], values, np.radians(values))
 
 
 def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Constraint]) -> Sampler:

@@ -123,6 +123,15 @@ def test_a_plan_for_openmm(folder):
     np.testing.assert_allclose(plan.targets[:, 0], [2.8, 3.0, 3.2, 3.4])
 
 
+def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
+    assert read(folder, PLAN.replace("seed = 4", "approach = 6")).options["approach"] == pytest.approx(np.radians(6))
+    more = PLAN.replace("[held]", "[[coordinate]]\ndistance = [1, 4]\nvalues = [2.0]\n[held]").replace(IMPROVE, "")
+    found = read(folder, more.replace("seed = 4", "approach = [6, 0.2]")).options["approach"]
+    assert found == pytest.approx([np.radians(6), 0.2])
+    with pytest.raises(InputError, match="approach has 3 values; give one for each of turn, distance-1-4"):
+        read(folder, more.replace("seed = 4", "approach = [6, 0.2, 1]"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
@@ -162,6 +171,12 @@ def test_a_plan_for_openmm(folder):
         ("temperature = 310", 'temperature = "x"', "temperature is 'x'"),
         ("most = 20", "", r"\[improve\] has no most"),
         ("error = 0.5", 'error = "x"', "give a number above 0"),
+        (
+            'file = "methanol.xyz"',
+            'file = "methanol.xyz"\ncount_from = -1',
+            "count_from of .structure. is -1; give 0 or 1",
+        ),
+        ("seed = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
         ("processes = 3", "processes = 0", r"processes of \[workers\] is 0"),
         ("[workers]", "[pull]\ncount = 5\n[workers]", r"unknown key 'pull' .did you mean 'pulls'"),
         (
