@@ -34,6 +34,8 @@ _POINTS = 201
 _MANY, _COEFFICIENTS = 7, 6
 #: Standard errors by which a closed profile may miss its beginning before that is warned of.
 _CLOSES = 4.0
+#: Part of the largest variance of a mean force that is rounding.
+_KNOWN = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +158,10 @@ class Profile:
 
     def lower_than(self, energy: float, at: FloatArray | None = None) -> NDArray[np.bool_]:
         """At which places (those of the profile by default) F is at most so much above its lowest value there."""
-        F = self.F if at is None else self._known.values(self.method, at, self._closed)[0]
+        F = self.F
+        if at is not None:
+            F = self._known.values(self.method, at, self._closed)[0]
+            F = F if self._added is None else F + self._added(at)
         return np.asarray(F - F.min() <= energy)
 
     def without_jacobian(
@@ -242,11 +247,13 @@ class Profile:
         covariance = known.process(closed).posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
         noise = np.interp(grid, known.x, known.e**2, period=known.period)
         m = len(aims)
+        # What is known exactly has a variance of rounding, from which nothing more is to be learned.
+        least = _KNOWN * float((np.diag(covariance)[m:] + noise).max())
         chosen = []
         for _ in range(whole_number(count, "count")):
             shared = covariance[:m, m:]
-            variance = np.maximum(np.diag(covariance)[m:], 0.0) + noise
-            gain = ((shared - shared.mean(axis=0)) ** 2).sum(axis=0) / np.maximum(variance, np.finfo(float).tiny)
+            variance = np.maximum(np.maximum(np.diag(covariance)[m:], 0.0) + noise, least)
+            gain = ((shared - shared.mean(axis=0)) ** 2).sum(axis=0) / variance
             best = int(np.argmax(gain))
             column = covariance[:, m + best]
             covariance = covariance - np.outer(column, column) / variance[best]

@@ -163,7 +163,8 @@ def digest_of(*parts: Any) -> str:
 
 def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[str]) -> FloatArray:
     """Values of the coordinates, one row for each window, shape (n, d)."""
-    places = np.array(numbers(targets if isinstance(targets, np.ndarray) else list(targets), "targets"))  # type: ignore[arg-type]
+    listed = list(targets) if isinstance(targets, Iterable) and not isinstance(targets, np.ndarray) else targets
+    places = np.array(numbers(listed, "targets"))
     places = places[:, None] if places.ndim == len(names) == 1 else places
     if places.ndim != 2 or places.shape[1] != len(names) or not len(places) or not np.all(np.isfinite(places)):
         raise InputError("targets must be finite numbers, one row for each window", item="targets")

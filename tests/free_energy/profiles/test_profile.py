@@ -300,6 +300,20 @@ def test_windows_that_help_what_is_low():
             profile.next_window(**wrong)
 
 
+def test_what_is_low_without_the_jacobian():
+    """F of two particles that do not interact falls all the way; W is the same everywhere."""
+    r = np.linspace(1.0, 4.0, 10)
+    flat = integrate(r, -5.0 / r, np.full(10, 1e-3), zero=4.0).without_jacobian("distance", 2.5)
+    assert flat.lower_than(1.0).all() and flat.lower_than(1.0, r).all()
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-14])
+def test_windows_beside_exact_ones_are_not_proposed_twice(error):
+    x = np.linspace(0.0, 3.0, 6)
+    places = integrate(x, np.sin(x), np.full(6, error)).next_windows(10)
+    assert len(set(places)) == 10 and np.diff(np.sort([*places, *x])).min() > 0.01
+
+
 @pytest.mark.parametrize(
     ("x", "f", "e", "options", "item", "message"),
     [

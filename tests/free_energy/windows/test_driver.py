@@ -224,7 +224,7 @@ def test_bad_input(tmp_path):
         with pytest.raises(UnreadableError, match=r"settings\.json cannot be read"):
             Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
     windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
-    for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1))):
+    for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1)), 1.1):
         with pytest.raises(InputError, match="targets must be finite"):
             windows.run(wrong)
     for wrong in (0, -1, 1.5):
