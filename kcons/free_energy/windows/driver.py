@@ -15,6 +15,7 @@ from itertools import chain
 from multiprocessing import get_context
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,34 +77,9 @@ class Windows:
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
         self.approach = approach_of(approach, sampler.names)
-        self._keep_settings()
-
-    def _keep_settings(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        mine = {
-            "coordinates": list(self.sampler.names),
-            "system": self.sampler.digest,
-            "settings": asdict(self.settings),
-            "seed": self.seed,
-        }
-        mine |= {"both sides": self.both_sides, "approach": self.approach.tolist(), "start": self.start.tolist()}
-        known = self.folder / "settings.json"
-        if known.exists():
-            try:
-                theirs = dict(json.loads(known.read_text(encoding="utf-8")))
-            except (ValueError, TypeError) as error:
-                raise UnreadableError(
-                    f"{known} cannot be read ({error}); choose another folder", item="folder"
-                ) from error
-            differ = [key for key in mine if theirs.get(key) != json.loads(text(mine))[key]]
-            if differ:
-                raise OccupiedError(
-                    f"{self.folder} has windows of other {', '.join(differ)}; choose another folder",
-                    item=differ[0],
-                )
-            return
-        with in_one_piece(known) as opened:
-            opened.write(text(mine).encode())
+        mine: dict[str, Any] = {"coordinates": list(sampler.names), "system": sampler.digest}
+        mine |= {"settings": asdict(self.settings), "seed": self.seed, "both sides": both_sides}
+        _keep(self.folder, mine | {"approach": self.approach.tolist(), "start": self.start.tolist()})
 
     @property
     def angles(self) -> list[bool | None]:
@@ -353,6 +329,25 @@ class Windows:
                 found.append(together(number, np.array(target), sides, self.sampler, seconds))
         found.sort(key=lambda w: w.value.tolist())
         return FreeEnergy(self.sampler.names, self.periods, found, problems)
+
+
+def _keep(folder: Path, mine: Mapping[str, Any]) -> None:
+    """Make a folder of windows with these settings, or refuse one of others."""
+    folder.mkdir(parents=True, exist_ok=True)
+    known = folder / "settings.json"
+    if known.exists():
+        try:
+            theirs = dict(json.loads(known.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise UnreadableError(f"{known} cannot be read ({error}); choose another folder", item="folder") from error
+        differ = [key for key in mine if theirs.get(key) != json.loads(text(mine))[key]]
+        if differ:
+            raise OccupiedError(
+                f"{folder} has windows of other {', '.join(differ)}; choose another folder", item=differ[0]
+            )
+        return
+    with in_one_piece(known) as opened:
+        opened.write(text(mine).encode())
 
 
 #: What is said of a window whose process was killed, or whose worker was lost.
