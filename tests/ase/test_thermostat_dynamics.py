@@ -257,6 +257,20 @@ def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
     assert equal(state(atoms), state(again))
 
 
+def test_isokinetic_goes_on_at_another_temperature(tmp_path):
+    atoms = waters()
+    moving = made("isokinetic", atoms)
+    moving.run(3)
+    moving.save(tmp_path / "restart.npz")
+    twice = 2 * atoms.get_kinetic_energy()
+    again = waters(momenta=False)
+    hotter = IsokineticDynamics(again, FS, 600, restart=tmp_path / "restart.npz")
+    for _ in range(2):
+        assert 2 * again.get_kinetic_energy() == pytest.approx(2 * twice, rel=1e-12)
+        hotter.run(3)
+    assert hotter.get_temperature() == pytest.approx(600) and hotter.nsteps == 9
+
+
 def test_files_that_hold_no_restart(tmp_path):
     atoms = waters()
     before = state(atoms)

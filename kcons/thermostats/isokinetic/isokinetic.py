@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import positive
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
 from kcons.steppers.stepper import stays
 from kcons.thermostats.freedom import (
-    Freedom,
     Momentum,
     carried,
     freedom,
@@ -35,6 +35,8 @@ Convention = Literal["exact", "notes"]
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
 ROUNDING = 1e-12
+#: The same of a state that goes on, whose velocities went through steps, or through momenta.
+KEPT = 1e-9
 
 _S6 = (0.0792036964311957, 0.353172906049774, -0.0420650803577195)
 _S6_OTHER = (0.209515106613362, -0.143851773179818)
@@ -132,6 +134,8 @@ class Isokinetic(Splitting):
         self.atoms = None if atoms is None else np.asarray(atoms)
         self.momentum: Momentum = momentum
         self._shares: tuple[System, Share] | None = None
+        #: Variables of the state that the last step ended in, whose velocities have their length.
+        self._left: FloatArray | None = None
         operations: list[Operation] = []
         for operation in splitting(*SCHEMES[order]):
             # Velocities are on the constraints whenever they turn.
@@ -169,7 +173,7 @@ class Isokinetic(Splitting):
         """The state with its forces, and with the kinetic energy that the thermostat keeps.
 
         Velocities off the constraints are projected, then scaled; those that are right to rounding stay as they are to
-        the last bit.
+        the last bit. A state with variables of another temperature or energy, or of other atoms, begins anew.
 
         Raises
         ------
@@ -185,14 +189,14 @@ class Isokinetic(Splitting):
             state = replace(state, forces=None, thermostat=None)  # degrees of freedom are those of another system, too
         elif not state.has_forces_of(system):
             state = replace(state, forces=None)
-        if carried(state, 4, "Isokinetic"):
+        share = self._share(system)
+        if carried(state, 4, "Isokinetic") and self._goes_on_from(share, state):
             if state.forces is None and state.thermostat is not None:
                 state = system.with_forces(state)
                 variables = np.array(state.thermostat)
-                variables[2] = self._share(system).push_square(system, state)
+                variables[2] = share.push_square(system, state)
                 state = replace(state, thermostat=variables)
             return state
-        share = self._share(system)
         state = system.with_forces(state)
         assert state.forces is not None
         drive, rest = split(system, state.positions, state.velocities, state.time)
@@ -205,7 +209,7 @@ class Isokinetic(Splitting):
                 item="velocities",
             )
         free = freedom(system, state, state.forces, self.atoms, self.momentum)
-        twice = self._twice_kinetic(share, free, found)
+        twice = self._twice_kinetic(share, free.count, found)
         turns = free.turns and self.thermal_energy is not None
         warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=5)
         velocities = rest if drive is None else drive + rest
@@ -218,19 +222,27 @@ class Isokinetic(Splitting):
         variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
 
-    def _twice_kinetic(self, share: Share, free: Freedom, found: float) -> float:
+    def _goes_on_from(self, share: Share, state: State) -> bool:
+        """Whether the variables of the state are those of this temperature or energy, and of these atoms."""
+        assert state.thermostat is not None
+        twice, _, _, count = state.thermostat.tolist()
+        if abs(self._twice_kinetic(share, count, twice) - twice) > ROUNDING * twice:
+            return False
+        return state.thermostat is self._left or abs(share.square(state.velocities) - twice) <= KEPT * twice
+
+    def _twice_kinetic(self, share: Share, count: float, found: float) -> float:
         if self.kinetic_energy is not None:
             return 2 * self.kinetic_energy
         if self.thermal_energy is None:
             return found
         if self.convention == "notes":
             return 3 * share.n_moving * self.thermal_energy
-        if free.count < 2:
+        if count < 2:
             raise OverdeterminedError(
                 "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; give kinetic_energy, or "
                 "use Langevin"
             )
-        return (free.count - 1) * self.thermal_energy
+        return (count - 1) * self.thermal_energy
 
     def _share(self, system: System) -> Share:
         known = self._shares
@@ -249,7 +261,9 @@ class Isokinetic(Splitting):
         still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
         if still is not None:
             return still
-        return isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
+        after = isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
+        self._left = after.thermostat
+        return after
 
     # -- what can be read -----------------------------------------------------------------------
 

@@ -295,3 +295,23 @@ def test_kinetic_energy_is_constant():
 @pytest.mark.validation
 def test_kinetic_energy_is_constant_over_a_million_steps():
     assert constancy(1_000_000, 1000) <= 1e-13
+
+
+@pytest.mark.parametrize("changed", ["temperature", "attribute", "energy", "convention", "atoms"])
+def test_a_run_that_goes_on_with_other_settings_takes_them(changed):
+    held, x = dumbbells(3)
+    thermostat = Isokinetic(1.0)
+    state = run(held, State(x, thermal_velocities(held, x, 1.0, 1)), 0.01, 5, stepper=thermostat)
+    g, others = int(state.thermostat[3]), held.masses > 0
+    if changed == "temperature":
+        thermostat, wanted = Isokinetic(2.0), 2.0 * (g - 1)
+    elif changed == "attribute":
+        thermostat.thermal_energy, wanted = 2.0, 2.0 * (g - 1)
+    elif changed == "energy":
+        thermostat, wanted = Isokinetic(kinetic_energy=30.0), 60.0
+    elif changed == "convention":
+        thermostat, wanted = Isokinetic(1.0, convention="notes"), 18.0
+    else:
+        thermostat, wanted, others = Isokinetic(1.0, atoms=[2, 3]), 4.0, np.isin(np.arange(6), [2, 3])
+    after = run(held, state, 0.01, 5, stepper=thermostat)
+    assert (held.masses[others, None] * after.velocities[others] ** 2).sum() == pytest.approx(wanted, rel=1e-12)
