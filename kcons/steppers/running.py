@@ -171,7 +171,7 @@ def run(
     if dt == 0 or not getattr(stepper, "holds", True):
         check_every = 0
     schedule = system.schedule
-    if state.barostat is None and hasattr(stepper, "barostat"):
+    if hasattr(stepper, "barostat"):
         state = stepper.start(system, state)  # type: ignore[attr-defined]  # the first state shown has a cell
     kept = Trajectory()
     rhythms = [(observer, every) for observer in observers] + ([(kept, record)] if record is not None else [])

@@ -60,7 +60,8 @@ class State:
     time_remainder : float
         What rounding took from the time, so that a million steps of dt are a million dt.
     thermostat, barostat : ndarray or None
-        Their variables, if there are such; those of a barostat begin with the cell.
+        Their variables, if there are such; those of a barostat begin with the cell, which stands alone before its
+        first step.
     origin : tuple of a weak reference to System, or None, and of positions; or None
         Whose forces these are, and where: those of another System or of other positions are evaluated anew. Without a
         System, as of a state that was loaded or made by hand, they are taken by any.
@@ -109,7 +110,7 @@ class State:
 
     @property
     def cell(self) -> FloatArray | None:
-        """The cell that a barostat has come to, vectors as rows, shape (3, 3); None without one."""
+        """Where it is not always the same, vectors as rows, shape (3, 3); otherwise None."""
         return None if self.barostat is None else self.barostat[:9].reshape(3, 3)
 
     def later(self, dt: float) -> tuple[float, float]:

@@ -125,7 +125,6 @@ def added_cost(system: CellSystem, state: State, dt: float, stepper: ConstantPre
         spent: dict[Any, float] = {alone: 0.0, stepper: 0.0}
         for k in range(STRETCHES):
             for one in (alone, stepper) if k % 2 else (stepper, alone):
-                system.set_cell(state.cell, state.positions)  # type: ignore[arg-type]
                 begun = time.process_time()
                 ends[one] = run(system, state, dt, every, stepper=one, check_every=0)
                 spent[one] += time.process_time() - begun

@@ -63,6 +63,7 @@ class Frame:
             remainder = x - (positions - self.shift)
         system, number = self.system, self.number
         origin = ref(system), positions
-        last = State(positions, v, self.time, forces, number, remainder, self.left_over, thermostat, origin=origin)
+        more = thermostat, self.start.barostat
+        last = State(positions, v, self.time, forces, number, remainder, self.left_over, *more, origin=origin)
         system.last = last
         return last

@@ -117,7 +117,8 @@ def fused_steps(
         flights.motion.took(found)
     x, remainder = _relative(x, shift, work) if shift is not None or far else (x, None)
     forces = start.forces if force is None else f.copy()
-    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, origin=(ref(system), x))
+    more = None, start.barostat, (ref(system), x)
+    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, *more)
     return state, steps
 
 

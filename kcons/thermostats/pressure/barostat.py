@@ -194,7 +194,7 @@ class Barostat:
 
     def acceptance(self, state: State) -> FloatArray:
         """Mean probability of acceptance of each mode so far; NaN before the first trial."""
-        if state.barostat is None:
+        if not has_begun(state):
             return np.full(len(self.strains), np.nan)
         tried, taken = self._modes(state.barostat)[:2]
         with np.errstate(invalid="ignore"):
@@ -234,7 +234,8 @@ class Barostat:
             check_finite(positions, "position", state.step)
             try:
                 self._enter(system, before.cell @ matrix, positions)
-                after = self._place(system, system.cell, positions, replace(state, positions=positions, forces=None))
+                there = replace(state, positions=positions, forces=None, barostat=None)
+                after = self._place(system, system.cell, positions, there)
                 log = self._log_chance(pieces, before, after, trial, thermal_energy)
                 log += self._reverse(system, pieces, after, trial, state, thermal_energy, dt) - trial.forward
                 chance = math.exp(min(0.0, log))
@@ -325,6 +326,11 @@ def _added(x: FloatArray, d: FloatArray, remainder: FloatArray | None) -> tuple[
         return y, None
     part = y - x
     return y, remainder + ((x - (y - part)) + (d - part))
+
+
+def has_begun(state: State) -> bool:
+    """Whether a state carries variables of a barostat, besides its cell."""
+    return state.barostat is not None and len(state.barostat) > WORK
 
 
 def require_barostat(given: object) -> Barostat:

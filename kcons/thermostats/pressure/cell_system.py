@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from kcons.constraints.arguments import as_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.steppers import System
+from kcons.steppers import State, System
 
 #: A function of positions, time and cell (vectors as rows, shape (3, 3)).
 InCellFunction = Callable[[FloatArray, float, FloatArray], ArrayLike]
@@ -36,7 +37,7 @@ class CellSystem(System):
     ----------
     cell : ndarray, shape (3, 3)
         Vectors as rows; a unit vector normal to the others where it is not periodic, so that a pressure is an energy
-        over an area there.
+        over an area there. That of the last state that a step began or ended with, or whose energy was asked for.
     periodic : ndarray of bool, shape (3,)
 
     Raises
@@ -99,8 +100,8 @@ class CellSystem(System):
     def set_cell(self, cell: FloatArray, positions: FloatArray) -> None:
         """Change the cell; `positions` are those in it.
 
-        Forces and energies that states carry are of the cell that was: go on with `dataclasses.replace(state,
-        positions=positions, forces=None)`.
+        Forces and energies that states carry are of the cell that was, which steps take again: go on with
+        `dataclasses.replace(state, positions=positions, forces=None, barostat=None)`.
 
         Raises
         ------
@@ -109,6 +110,40 @@ class CellSystem(System):
         """
         self.motion.set_cell(cell, self._pbc, positions)
         self._matrix = np.array(cell)
+
+    def initial_state(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike | None = None,
+        *,
+        time: float = 0.0,
+        project: bool = False,
+    ) -> State:
+        """As `System.initial_state`; the state knows the present cell."""
+        state = super().initial_state(positions, velocities, time=time, project=project)
+        return replace(state, barostat=self.cell.flatten())
+
+    def enter(self, state: State) -> None:
+        """Take the cell of a state that knows one.
+
+        Raises
+        ------
+        InputError, ImageError
+            As `set_cell`.
+        """
+        cell = state.cell
+        if cell is not None and not (cell == self.cell).all():
+            self.set_cell(cell.copy(), state.positions.copy())  # arrays of a state that is shown cannot be written to
+
+    def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """As `System.taken`, in the cell of the state."""
+        self.enter(state)
+        return super().taken(state)
+
+    def total_energy(self, state: State) -> float:
+        """As `System.total_energy`, in the cell of the state."""
+        self.enter(state)
+        return super().total_energy(state)
 
     def energy(self, x: FloatArray, time: float, step: int) -> float:
         """The potential energy; infinite where atoms overlap.

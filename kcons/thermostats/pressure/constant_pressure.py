@@ -13,7 +13,7 @@ from kcons.steppers.stepper import Listed
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
-from kcons.thermostats.pressure.barostat import WORK, Barostat, require_barostat
+from kcons.thermostats.pressure.barostat import WORK, Barostat, has_begun, require_barostat
 from kcons.thermostats.pressure.cell_system import CellSystem
 
 
@@ -89,22 +89,19 @@ class ConstantPressure(Listed):
         """
         self.check(system)
         assert isinstance(system, CellSystem)
-        if state.barostat is None:
+        known = state.barostat if has_begun(state) else None
+        if known is not None and not self.barostat.goes_on_from(known):
+            raise InputError(
+                f"the state carries variables of another barostat, not of {self.barostat!r}; start with "
+                f"dataclasses.replace(state, barostat=state.barostat[:{WORK}]), which is its cell",
+                item="barostat",
+            )
+        system.enter(state)
+        if known is None:
             self.barostat.pieces(system, state.positions, state.time)
             state = replace(state, barostat=self.barostat.begin(system))
             if self.barostat.needs_stress:
                 system.stress(state.positions, state.time)
-            return state
-        if not self.barostat.goes_on_from(state.barostat):
-            raise InputError(
-                f"the state carries variables of another barostat, not of {self.barostat!r}; start with "
-                "dataclasses.replace(state, barostat=None)",
-                item="barostat",
-            )
-        cell = state.cell
-        assert cell is not None
-        if not (cell == system.cell).all():
-            system.set_cell(cell, state.positions)
         return state
 
     def step(self, system: System, state: State, dt: float) -> State:
@@ -139,7 +136,6 @@ class ConstantPressure(Listed):
             after = state
             for _ in range(steps):
                 after = self.stepper.step(system, after, dt)
-        after = replace(after, barostat=state.barostat)
         if dt and after.step % self.barostat.every == 0:
             after = self._pressed(system, after, dt)
         return after
@@ -165,8 +161,9 @@ class ConstantPressure(Listed):
 
     def conserved_energy(self, system: System, state: State) -> float:
         """What the thermostat conserves, less the energy that trials have brought."""
-        work = 0.0 if state.barostat is None else float(state.barostat[WORK])
-        return float(self.stepper.conserved_energy(system, state)) - work  # type: ignore[attr-defined]
+        state = self.start(system, state)
+        assert state.barostat is not None
+        return float(self.stepper.conserved_energy(system, state)) - float(state.barostat[WORK])  # type: ignore[attr-defined]
 
 
 def in_cell(variables: FloatArray | None, cell: FloatArray) -> FloatArray | None:

@@ -11,7 +11,7 @@ from scipy import stats
 from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import Rattle, State, run
+from kcons.steppers import ProjectedVerlet, Rattle, State, Suzuki4, run
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
@@ -134,3 +134,31 @@ def test_a_failing_trial_leaves_the_cell():
     assert found.value.step == 3
     assert np.array_equal(system.cell, SIDE * np.eye(3))
     assert np.array_equal(system.motion.lattice[0], SIDE * np.eye(3))
+
+
+def swaying(x, t, h):
+    """A field as wide as the cell."""
+    return -np.sin(2 * np.pi * x @ np.linalg.inv(h))
+
+
+def test_a_second_run_from_one_state_is_the_first_again():
+    system, state = begun(force=swaying, potential=lambda x, t, h: 0.0)
+    first, second = (run(system, state, 0.05, 9, stepper=made("langevin", 3)) for _ in range(2))
+    assert np.array_equal(first.positions, second.positions)
+    assert np.array_equal(first.barostat, second.barostat)
+    assert not np.array_equal(first.cell, SIDE * np.eye(3))
+
+
+@pytest.mark.parametrize(
+    "stepper", [*(make() for make in STEPPERS.values()), Rattle(), Suzuki4(), ProjectedVerlet()], ids=repr
+)
+def test_other_steppers_go_on_in_the_cell_of_the_state(stepper):
+    """Which they keep, wherever the System has been since."""
+    system, state = begun(force=swaying, potential=lambda x, t, h: 0.0)
+    there = replace(run(system, state, 0.05, 6, stepper=made("langevin")), thermostat=None)
+    first = run(system, there, 0.05, 2, stepper=stepper)
+    run(system, there, 0.05, 6, stepper=made("langevin"))
+    assert not np.array_equal(system.cell, there.cell)
+    second = run(system, there, 0.05, 2, stepper=stepper)
+    assert np.array_equal(first.positions, second.positions)
+    assert np.array_equal(first.cell, there.cell) and np.array_equal(system.cell, there.cell)

@@ -14,6 +14,7 @@ from kcons.steppers import run
 from kcons.thermostats import Langevin, thermal_velocities
 from kcons.thermostats.pressure import (
     CellSystem,
+    ConstantPressure,
     MonteCarloBarostat,
     PressureObserver,
     find_pieces,
@@ -69,6 +70,20 @@ def test_three_ways_to_one_pressure(shape):
     assert abs(atomic - molecular).max() > 1e-4  # in single directions they are equal in the mean only
     assert molecular == pytest.approx(molecular.T, abs=1e-14)
     assert system.cell == pytest.approx(SIDE * np.eye(3), abs=0)
+
+
+def test_the_pressure_of_an_earlier_cell():
+    """What is asked of a state is answered in its cell."""
+    system, early = started()
+    told = [instantaneous_pressure(system, early, way) for way in ("molecular", "atomic", "difference")]
+    energy = system.total_energy(early)
+    barostat = MonteCarloBarostat(1.0, every=1, width=0.2)
+    run(system, early, 0.05, 5, stepper=ConstantPressure(Langevin(1.0, 1.0, seed=1), barostat))
+    assert system.volume != pytest.approx(SIDE**3, rel=1e-3)
+    for way, value in zip(("molecular", "atomic", "difference"), told, strict=True):
+        assert instantaneous_pressure(system, early, way) == pytest.approx(value, abs=1e-13)
+    system.set_cell(1.1 * system.cell, early.positions)
+    assert system.total_energy(early) == pytest.approx(energy, rel=1e-14)
 
 
 def test_a_rod_that_is_made_longer():
