@@ -20,6 +20,7 @@ from kcons.errors import (
     ReversibilityError,
     UnsupportedError,
 )
+from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
 from kcons.openmm.integrator.ensemble import ConstantEnergy
@@ -29,6 +30,7 @@ from kcons.openmm.integrator.system_checks import forces_of
 from kcons.openmm.quantities import masses_of
 from kcons.steppers import State
 from kcons.thermostats import Counts, best_share
+from kcons.thermostats.freedom import drift_velocity
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     ACCEPTED,
     CHANGE,
@@ -77,7 +79,7 @@ class HamiltonianMonteCarlo:
     keep : float
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     conserve_momentum : bool
-        Velocities are drawn relative to the centre of mass.
+        Velocities are drawn relative to the centre of mass, in the directions in which no row knows a place in space.
     tolerance : float
         Distance in nm by which a way back may miss its start; other solutions are off by a part of a bond.
     restart : path, optional
@@ -89,7 +91,8 @@ class HamiltonianMonteCarlo:
         Temperature not positive, fewer than one step, `keep` out of range; a file of other particles.
     UnsupportedError
         Another integrator, one with an ensemble, or the leapfrog; parts that move; barostats, AndersenThermostat or
-        CMMotionRemover in the System.
+        CMMotionRemover in the System. At the first step: momentum is to be conserved where rows or particles without
+        mass hold all directions.
 
     Notes
     -----
@@ -122,6 +125,8 @@ class HamiltonianMonteCarlo:
             self._weights = np.where(self._masses > 0, 1 / self._masses, 0.0)
         self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
         self._expected: tuple[FloatArray, Any] | None = None
+        #: In which total momentum stays, found with the first proposal.
+        self._directions: FloatArray | None = None
         #: Proposals so far.
         self.number = 0
         if restart is not None:
@@ -273,9 +278,11 @@ class HamiltonianMonteCarlo:
         noise = random.standard_normal(v.shape) * np.sqrt((1 - self.keep**2) * self.thermal_energy * self._weights)
         kept = self.keep * v
         if self.conserve_momentum:
-            total = self._masses.sum()
-            noise -= (self._masses * noise).sum(axis=0) / total * (self._weights > 0)
-            kept += (1 - self.keep) * (self._masses * v).sum(axis=0) / total * (self._weights > 0)
+            if self._directions is None:
+                self._directions = conserved_momenta(self.integrator, self.context, "conserved").directions
+            masses, moving = self._masses[:, 0], self._weights > 0
+            noise -= drift_velocity(noise, masses, self._directions) * moving
+            kept += (1 - self.keep) * drift_velocity(v, masses, self._directions) * moving
         self.context.setVelocities(kept + noise)
         self.integrator.applyVelocityConstraints(self.context)
         return velocities_of(self.context)

@@ -13,6 +13,7 @@ from ensemble_runs import twice_kinetic
 from openmm import app, unit
 from openmm_systems import GPUS, context_of, loose_alanine, potential_energy, state_of, water_box
 
+from kcons.constraints import Plane, Sphere
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, WaysBackIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
@@ -175,6 +176,27 @@ def test_a_free_angle_has_the_average_of_its_metric():
     momentum = np.array([10.0, 1.0, 10.0]) @ state_of(sampler.context)[1]
     assert np.abs(momentum).max() < 1e-10
     assert sampler.counts.accepted < 600
+
+
+def test_momentum_along_rows_that_know_a_place_is_drawn():
+    """Of particles on a plane that of two directions stays; on a sphere of none, which is refused."""
+    x = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    for row, free in ((Plane([0, 1], normal=[1.0, 0, 0]), [1, 2]), (Sphere([0, 1], [0, 0, 0], 1.0), None)):
+        system = openmm.System()
+        for _ in x:
+            system.addParticle(2.0)
+        places = x if free is None else x * [0, 1, 1] + [1, 0, 0]
+        context = context_of(system, ProjectedIntegrator(0.01, parts=[hold(system, row, positions=places)]))
+        context.setPositions(places)
+        sampler = HamiltonianMonteCarlo(context, 300, 3, 5, conserve_momentum=True)
+        if free is None:
+            with pytest.raises(UnsupportedError, match="rows or particles without mass are held"):
+                sampler.step(1)
+            assert sampler.number == 0 and not state_of(context)[1].any()
+        else:
+            sampler.step(2)
+            v = state_of(context)[1]
+            assert np.abs(v.sum(axis=0)).max() < 1e-12 < np.abs(v[:, free]).min()
 
 
 def test_other_constraints_are_held_and_taken_back():
