@@ -14,7 +14,6 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.steppers import State, Stepper
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Tuned, tune
-from kcons.thermostats.freedom import open_directions
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL
 
 
@@ -128,13 +127,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         held = last.thermostat.copy()
         held[POTENTIAL] = math.nan  # to be asked for again
         return held
-
-    @property
-    def thermostat_degrees_of_freedom(self) -> int:
-        count = self.degrees_of_freedom
-        if self._options["conserve_momentum"]:
-            count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
-        return count
 
     def get_conserved_energy(self) -> NoReturn:
         """Nothing is conserved.

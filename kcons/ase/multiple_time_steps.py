@@ -167,11 +167,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
         """Calls of the fast and of the slow forces so far."""
         return dict(self.groups.evaluations)
 
-    @property
-    def thermostat_degrees_of_freedom(self) -> int:
-        """3 N less the rank of everything that is held."""
-        return self.degrees_of_freedom
-
     def get_temperature(self) -> float:
         """Kinetic temperature in K; on spheres by the kinetic energy that is expected there, which says little."""
         stepper = self.stepper

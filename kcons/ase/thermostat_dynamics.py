@@ -112,11 +112,14 @@ class ThermostattedDynamics(ConstrainedDynamics):
 
     @property
     def thermostat_degrees_of_freedom(self) -> int:
-        """g: 3 N less the rank of the rows and less the components of total momentum that are conserved."""
+        """g: 3 N less the rank of the rows and less the components of total momentum that are left alone."""
         state = self._state
-        if state is None or state.thermostat is None:
-            return self.degrees_of_freedom
-        return int(state.thermostat[-1])
+        if isinstance(self.stepper, Isokinetic | NoseHooverChain) and state is not None:
+            return self.degrees_of_freedom if state.thermostat is None else int(state.thermostat[-1])
+        count = self.degrees_of_freedom
+        if getattr(self.stepper, "conserve_momentum", False):
+            count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
+        return count
 
     def get_temperature(self) -> float:
         """Kinetic temperature in K by the degrees of freedom that the thermostat acts on."""
@@ -260,13 +263,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
     def set_temperature(self, temperature_K: float) -> None:
         """Use another temperature from now on."""
         self.stepper = self._stepper(temperature_K, cast(Langevin, self.stepper).friction)
-
-    @property
-    def thermostat_degrees_of_freedom(self) -> int:
-        count = self.degrees_of_freedom
-        if self._options["conserve_momentum"]:
-            count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
-        return count
 
 
 class ConstrainedNoseHoover(ThermostattedDynamics):

@@ -158,6 +158,9 @@ def test_temperatures():
     langevin.run(40)
     assert langevin.get_conserved_energy() == pytest.approx(start, abs=5e-4)
     assert langevin.get_temperature() > 0
+    drifting = MultipleTimeSteps(waters(), FS, fast=Waves(), slow=Waves(0.05), conserve_momentum=True, **TWO)
+    assert drifting.thermostat_degrees_of_freedom == 9
+    assert drifting.get_temperature() == pytest.approx(2 * drifting.atoms.get_kinetic_energy() / (9 * units.kB))
 
 
 @pytest.mark.parametrize(
