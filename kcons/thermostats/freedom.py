@@ -18,6 +18,9 @@ from kcons.steppers import State, System
 
 Momentum = Literal["auto", "conserved", "free"]
 
+#: What no energy, heat or link of a chain is.
+MARK = -(2.0**61 + 2.0**31)
+
 #: Sum of all forces (or torques) over the sum of their sizes that is taken for rounding, single precision included.
 BALANCED = 1e-6
 #: The same where it holds in some directions only: near a symmetric place, forces that have no axis almost have one.
@@ -344,8 +347,18 @@ def refuse_friction(system: System) -> None:
         )
 
 
-def carried(state: State, size: int, name: str) -> bool:
+def carried(state: State, size: int, name: str, *, marked: bool = False) -> bool:
     """Whether the state carries the variables of this thermostat.
+
+    Parameters
+    ----------
+    state : State
+    size : int
+        How many variables there are.
+    name : str
+        Of the thermostat.
+    marked : bool
+        Whether they begin with `MARK`, since there may be as many of another thermostat.
 
     Raises
     ------
@@ -354,7 +367,8 @@ def carried(state: State, size: int, name: str) -> bool:
     """
     if state.thermostat is None:
         return False
-    if getattr(state.thermostat, "shape", None) != (size,):  # np.shape takes a microsecond
+    shape = getattr(state.thermostat, "shape", None)  # np.shape takes a microsecond
+    if shape != (size,) or (state.thermostat[0] == MARK) != marked:
         raise InputError(
             f"the state carries variables of another thermostat, not of {name}; start with "
             "dataclasses.replace(state, thermostat=None)",

@@ -48,10 +48,10 @@ class GroupedForces:
         variables: int,
         name: str,
         *,
-        mark: float | None = None,
+        marked: bool = False,
         middle: bool = False,
     ) -> tuple[GroupedForces, FloatArray | None]:
-        """Forces at a state, evaluated where it has none, and the variables of its thermostat, which begin with `mark`.
+        """Forces at a state, evaluated where it has none, and the variables of its thermostat (see `carried`).
 
         Raises
         ------
@@ -60,9 +60,7 @@ class GroupedForces:
         """
         size = 3 * system.n_atoms
         stored = len(names) * size + 1 if len(names) > 1 and not middle else 0
-        if mark is not None and state.thermostat is not None and state.thermostat.flat[0] != mark:
-            carried(state, -1, name)
-        known = carried(state, variables + stored, name)
+        known = carried(state, variables + stored, name, marked=marked)
         x, _, forces = system.taken(state)
         found = cls(system, names, {}, middle)
         if middle:

@@ -21,6 +21,7 @@ from kcons.steppers import State, System
 from kcons.steppers.executors.piecewise import ArrayStep
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Operation, Project, Turn
 from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.thermostats.freedom import MARK
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
 from kcons.thermostats.multistep.force_groups import group_names
@@ -183,10 +184,8 @@ class SphereStep(ArrayStep):
     ) -> None:
         n, auxiliary = len(squares), bath.auxiliary
         names = tuple(level.group for level in bath.levels)
-        #: What the variables begin with, since those of another thermostat may be as many.
-        self.mark = -1.0 - n * auxiliary
         self.groups, known = GroupedForces.of(
-            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", mark=self.mark, middle=bath.middle
+            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", marked=True, middle=bath.middle
         )
         super().__init__(system, start, dt)
         self.bath, self.squares = bath, squares
@@ -237,4 +236,4 @@ class SphereStep(ArrayStep):
 
     def end(self) -> State:
         check_finite(self.v, "velocity", self.number)
-        return self.frame.closed(self.x, self.v, self.groups.total(), self.groups.closed(np.append(self.mark, self.w)))
+        return self.frame.closed(self.x, self.v, self.groups.total(), self.groups.closed(np.append(MARK, self.w)))

@@ -7,12 +7,20 @@ import math
 
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, molecules, quartic, springs, system, waves
+from thermostat_systems import dumbbells, molecules, quartic, quartic_potential, springs, system, waves
 
 from kcons.constraints import Distance, Plane, Sphere
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, System, run
-from kcons.thermostats import ForceGroups, Isokinetic, IsokineticSpheres, thermal_velocities
+from kcons.thermostats import (
+    ForceGroups,
+    HamiltonianMonteCarlo,
+    Isokinetic,
+    IsokineticSpheres,
+    Langevin,
+    NoseHooverChain,
+    thermal_velocities,
+)
 from kcons.thermostats.multistep import sphere_kernels as kernels
 
 TWO = {"slow": 1, "fast": 4}
@@ -179,6 +187,29 @@ def test_spheres_of_radius_zero():
     held, state = molecules("bent", 2)
     with pytest.raises(InputError, match="have the radius 0"):
         IsokineticSpheres(0.5, 1.0, 3, spheres="axes", auxiliary=0).step(held, state, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("atoms", "auxiliary", "other"),
+    [
+        (3, 0, Langevin(1.0, 1.0, 3)),
+        (3, 1, Isokinetic(1.0)),
+        (2, 1, NoseHooverChain(1.0, 5.0, length=1)),
+        (3, 3, HamiltonianMonteCarlo(1.0, 2, 3)),
+    ],
+    ids=lambda value: type(value).__name__ if not isinstance(value, int) else str(value),
+)
+def test_as_many_variables_of_another_thermostat(atoms, auxiliary, other):
+    x = np.random.default_rng(1).normal(size=(atoms, 3))
+    held = System(system([], x, np.ones(atoms)).motion, quartic, potential=quartic_potential)
+    spheres = IsokineticSpheres(0.5, 1.0, 3, spheres="cluster", auxiliary=auxiliary)
+    state = spheres.step(held, State(x, x), 0.01)
+    with pytest.raises(InputError, match="variables of another thermostat"):
+        other.step(held, state, 0.01)
+    state = other.step(held, State(x, x), 0.01)
+    assert state.thermostat.shape == (1 + atoms * auxiliary,)
+    with pytest.raises(InputError, match="variables of another thermostat, not of IsokineticSpheres"):
+        spheres.step(held, state, 0.01)
 
 
 def test_what_has_no_spheres():
