@@ -270,7 +270,7 @@ def _expression(chosen: argparse.Namespace) -> str:
     said |= {"quick": True} if chosen.quick else {}
     said |= _molecules(chosen)
     words = [f"{name}={_literal(value)}" for name, value in said.items()]
-    if test_systems.is_file(chosen.scene):
+    if chosen.scene not in test_systems.SYSTEMS:
         return f"test_systems.from_file({', '.join([_literal(chosen.scene), *words])})"
     size = [] if chosen.size is None else [str(chosen.size)]
     return f"test_systems.build({', '.join([_literal(chosen.scene), *size, *words])})"
@@ -369,7 +369,7 @@ def _molecules(chosen: argparse.Namespace) -> dict[str, Any]:
         "force_field": chosen.forcefield,
         "add_hydrogens": chosen.add_hydrogens or None,
         "platform": chosen.platform,
-        "coordinates": chosen.coordinates,
+        "coordinates": None if chosen.coordinates is None else str(chosen.coordinates),
         "forces": chosen.forces,
         "select": chosen.select,
         "rigid_residues": chosen.rigid_residues,

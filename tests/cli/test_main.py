@@ -210,6 +210,25 @@ def test_own_file_in_openmm(tmp_path, monkeypatch, capsys):
     assert data["remarks"]
 
 
+def test_own_topology_with_coordinates(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("MDAnalysis")
+    monkeypatch.chdir(tmp_path)
+    lines = ["3", "water", "O 0 0 0", "H 0.9572 0 0", "H -0.2400 0.9266 0"]
+    for name in ("water.xyz", "start.xyz"):
+        Path(name).write_text("\n".join(lines) + "\n")
+    words = ["--coordinates", "start.xyz", "--forces", "tip3p", "--methods", "rattle", "--dt", "4"]
+    assert run("compare", "water.xyz", *words) == 0
+    data = json.loads(Path("compare-water/compare.json").read_text())
+    assert data["settings"]["coordinates"] == "start.xyz"
+    printed = capsys.readouterr().out
+    start = printed.index("from ase import units")
+    code = printed[start : printed.index(")\n", printed.index("dynamics.run(", start)) + 1]
+    made: dict[str, object] = {}
+    with pytest.warns(UserWarning, match="were guessed"):
+        exec(code, made)  # the lines of Python run as they are
+    assert len(made["atoms"]) == 3
+
+
 @needs_openmm
 def test_plan_of_own_file(capsys):
     assert run("plan", ALANINE, "--constrain", "hangles") == 0
