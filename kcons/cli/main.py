@@ -250,9 +250,11 @@ def _compare(chosen: argparse.Namespace) -> int:
     terminal = console()
     explained = report.explanation(result)
     ranked = answer.answer(result, chosen.criterion or "error", target)
-    first = [recommendation.sentences(result)] if result.recommendation is not None else []
-    first += [] if ranked is None else [answer.text(ranked)]
-    if ranked is not None and ranked.ranked and target is None:  # a recommendation has its lines of code
+    first = [] if ranked is None else [answer.text(ranked)]
+    if result.recommendation is not None:  # which has its own sentence and lines of code
+        first = [recommendation.sentences(result)]
+        first += [answer.places(ranked)] if ranked is not None and ranked.ranked else []
+    elif ranked is not None and ranked.ranked:
         best = ranked.ranked[0].point
         first.append(f"In Python:\n\n{code(test_system, best.method, best.number, _expression(chosen))}".rstrip())
     for words in first:

@@ -8,7 +8,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from kcons.comparison.study.tables import Table, duration, plain_text
-from kcons.comparison.work_precision.fronts import COSTS, SAME_ERROR, SAME_EVALUATIONS, cost_of, verdict
+from kcons.comparison.work_precision.fronts import (
+    COSTS,
+    SAME_ERROR,
+    SAME_EVALUATIONS,
+    cost_of,
+    resolution_of,
+    verdict,
+)
 from kcons.comparison.work_precision.measurement import Comparison, Measurement
 
 if TYPE_CHECKING:
@@ -103,9 +110,11 @@ def answer(comparison: Comparison, criterion: Criterion = "error", limit: float 
     criterion : {'error', 'drift'}
         The error of the trajectory, or the drift of its energy: its slope and twice the standard error of it.
     limit : float, optional
-        The largest value that is good enough; by default what the usual method makes at its usual step.
+        The largest value that is good enough; by default what the usual method makes at its usual step, and what
+        cannot be told from it.
     """
     judged = verdict(comparison)
+    least = resolution_of(comparison) if criterion == "error" else 0.0
     units = comparison.scene["units"]
     pairs = []
     for m in comparison.measurements:
@@ -115,11 +124,15 @@ def answer(comparison: Comparison, criterion: Criterion = "error", limit: float 
             pairs.append((m, Point(m.method, m.title, setting, value, cost_of(m, judged.decides), m.setting)))
     if not pairs:
         return None
-    limit_is = "asked for"
+    limit_is, slack = "asked for", 0.0
     if limit is None:
         limit, limit_is = _usual(pairs, units["time"])
+        if limit < least:
+            limit, limit_is = least, "the least that the reference can tell apart"
+        slack = SAME_ERROR
     by_time = judged.decides == "wall"
-    found = _ranked([point for _, point in pairs], limit, judged.margin if by_time else SAME_EVALUATIONS)
+    margin = judged.margin if by_time else SAME_EVALUATIONS
+    found = _ranked([point for _, point in pairs], limit, margin, slack=slack, least=least)
     drift = criterion == "drift"
     return replace(
         found,
@@ -210,11 +223,14 @@ def _usual(pairs: Sequence[tuple[Measurement, Point]], time: str) -> tuple[float
     return values[len(values) // 2], "what half of the points make"
 
 
-def _ranked(points: Sequence[Point], limit: float, margin: float) -> Answer:
+def _ranked(
+    points: Sequence[Point], limit: float, margin: float, *, slack: float = SAME_ERROR, least: float = 0.0
+) -> Answer:
+    """Those of at most `limit`, and a fraction `slack` more; values below `least` are taken as equal to it."""
     good: dict[str, Point] = {}
     other: dict[str, Point] = {}
     for point in points:
-        if point.value <= limit * (1 + SAME_ERROR):
+        if max(point.value, least) <= limit * (1 + slack):
             if point.method not in good or point.cost < good[point.method].cost:
                 good[point.method] = point
         elif point.method not in other or point.value < other[point.method].value:
@@ -244,6 +260,8 @@ def sentence(found: Answer) -> str:
     limit = f"{found.what} of at most {found.limit:.2g} {found.unit} ({found.limit_is})"
     if not found.ranked:
         best = found.beyond[0]
+        if best.value <= found.limit:
+            return f"No method makes {limit}, which cannot be told from none: the reference is no better."
         return f"No method makes {limit}; the least is {best.value:.2g}, by {best.title} at {best.setting}."
     first = found.ranked[0].point
     text = f"Use {first.title} at {first.setting}: the least {found.cost}, {_spent(first.cost, found)}, for {limit}"
@@ -274,7 +292,12 @@ def ranking(found: Answer) -> Table:
 
 def text(found: Answer) -> str:
     """Sentence, ranking, and who is not in it."""
-    lines = [sentence(found), ""]
+    return "\n\n".join(filter(None, (sentence(found), places(found))))
+
+
+def places(found: Answer) -> str:
+    """The ranking, what it means, and who is not in it."""
+    lines: list[str] = []
     if math.isinf(found.limit):
         lines += [plain_text(ranking(found)), ""]
         lines += [
@@ -284,7 +307,7 @@ def text(found: Answer) -> str:
     elif found.ranked:
         lines += [plain_text(ranking(found)), ""]
         lines += [f"cost: {found.cost}; =: equal within {100 * found.margin:.0f} %, which is how well costs repeat."]
-    if found.beyond:
+    if found.beyond and found.beyond[0].value > found.limit:
         lines += [f"Above {found.limit:.2g}: " + ", ".join(f"{p.title} {p.value:.1e}" for p in found.beyond) + "."]
     return "\n".join(lines)
 

@@ -175,11 +175,14 @@ def recommend(
     able = [m for m in everything if target >= resolution and _reaches(m, target)]
     entry: dict[str, Any] = {"target": target, "decides": COSTS[decides][1], "reached": bool(able)}
     if able:
-        best = min(able, key=lambda m: (cost_of(m, decides), cost_of(m, "wall")))
-        entry |= {**_facts(best), "code": code(test_system, best.method, best.setting, made_by)}
-        default, more = _default(bench, comparison, best, target)
-        entry["default"] = default
+        best = _cheapest(able, decides)
+        default, more = _default(bench, comparison, METHODS[best.method].md_engine, target)
         found += more
+        # It may be the default itself.
+        best = _cheapest([best, *(m for m in more if _reaches(m, target))], decides)
+        entry |= {**_facts(best), "code": code(test_system, best.method, best.setting, made_by), "default": default}
+        if default is not None and "needs" in default:
+            default["gain"] = {cost: default["needs"][COSTS[cost][0]] / cost_of(best, cost) for cost in COSTS}
     else:
         entry["why"] = _why_not(test_system, comparison, target, resolution, everything)
         usable = [m for m in everything if m.error]
@@ -295,17 +298,21 @@ def _reaches(m: Measurement, target: float) -> bool:
     return m.status == "ok" and m.error is not None and m.error <= target and cost_of(m, "wall") > 0
 
 
+def _cheapest(measurements: Sequence[Measurement], decides: Cost) -> Measurement:
+    return min(measurements, key=lambda m: (cost_of(m, decides), cost_of(m, "wall")))
+
+
 def _facts(m: Measurement) -> dict[str, Any]:
     names = ("method", "title", "setting", "adaptive", "error", "evaluations_per_time", "seconds_per_time", "steps")
     return {name: getattr(m, name) for name in names}
 
 
 def _default(
-    bench: Bench, comparison: Comparison, best: Measurement, target: float
+    bench: Bench, comparison: Comparison, md_engine: str, target: float
 ) -> tuple[dict[str, Any] | None, list[Measurement]]:
-    """What the MD engine of the best method does unless told otherwise: at its usual step, and at this error."""
+    """What an MD engine does unless told otherwise: at its usual step, and at this error."""
     test_system = bench.test_system
-    name = default_method(test_system, METHODS[best.method].md_engine)
+    name = default_method(test_system, md_engine)
     if name is None:
         return None, []
     method = METHODS[name]
@@ -318,9 +325,12 @@ def _default(
     first = next((m for m in curve if abs(m.setting - setting) < 1e-9 * setting), None)
     if first is None:
         warm_up(test_system, [method])
-        internal = setting if method.adaptive else setting * test_system.units.time_unit
-        (first,), _ = bench.timed_again([bench.measure(method, internal)])
+        unit = 1.0 if method.adaptive else test_system.units.time_unit
+        (first,), _ = bench.timed_again([bench.measure(method, setting * unit)])
         found.append(first)
+        if not curve and first.error:  # one point has no order
+            another = setting / 10 if method.adaptive else horizon / max(1, first.steps // 2)
+            found += bench.timed_again([bench.measure(method, another * unit)])[0]
     entry: dict[str, Any] = {**_facts(first), "status": first.status, "note": first.note}
     points = _sorted([*curve, *(m for m in found if m.status == "ok" and m.error)])
     reached = [m for m in points if _reaches(m, target)]
@@ -330,20 +340,13 @@ def _default(
         found += more
         reached += [m for m in more if _reaches(m, target)]
     if reached:
-        cheapest = min(reached, key=lambda m: cost_of(m, "wall"))
-        entry["needs"] = {**_facts(cheapest), "measured": True}
+        entry["needs"] = {**_facts(_cheapest(reached, "wall")), "measured": True}
     elif (far := predicted(points, target, resolution_of(comparison))) is not None:
         entry["needs"] = {
             "setting": far.setting,
             "seconds_per_time": far.wall,
             "evaluations_per_time": far.evaluations,
             "measured": False,
-        }
-    if "needs" in entry:
-        needs = entry["needs"]
-        entry["gain"] = {
-            "wall": needs["seconds_per_time"] / cost_of(best, "wall"),
-            "evaluations": needs["evaluations_per_time"] / cost_of(best, "evaluations"),
         }
     return entry, found
 

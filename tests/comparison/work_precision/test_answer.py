@@ -82,6 +82,26 @@ def test_a_limit_that_is_asked_for():
     assert "Above 1e-09: kcons RATTLE 2.5e-04." in answer.text(none)
 
 
+def test_a_limit_that_is_asked_for_is_kept_to_the_digit():
+    near = made(*RATTLE, point("suzuki4", 4.0, 9.9e-4, 1.2))
+    assert [r.point.method for r in answer.answer(near, limit=9.95e-4).ranked] == ["suzuki4", "rattle"]
+    found = answer.answer(near, limit=9.95e-4).ranked[1].point
+    assert found.setting == "1 fs"  # at 2 fs it makes 1e-3
+
+
+def test_errors_that_the_reference_cannot_tell_apart():
+    """A reference that is good to 1e-4 tells errors from 3e-4 on."""
+    comparison = replace(made(*RATTLE, point("suzuki4", 4.0, 3e-5, 1.2)), reference={"error": 1e-4, "how": ""})
+    asked = answer.answer(comparison, limit=1e-4)
+    assert not asked.ranked
+    assert "cannot be told from none" in answer.sentence(asked) and "Above" not in answer.text(asked)
+    # 2.5e-4 and 3e-5 are the same, and the limit.
+    fine = replace(made(*RATTLE[1:], point("suzuki4", 4.0, 3e-5, 1.9)), reference={"error": 1e-3, "how": ""})
+    found = answer.answer(fine)
+    assert found.limit == 3e-3 and "the reference can tell apart" in found.limit_is
+    assert [(r.point.method, r.point.setting) for r in found.ranked] == [("rattle", "2 fs"), ("suzuki4", "4 fs")]
+
+
 def test_drift_counts_with_twice_its_error():
     drifting = [
         point("rattle", 2.0, 1e-3, 1.0, energy_slope=-1e-4, energy_slope_error=5e-5),

@@ -109,6 +109,26 @@ def test_the_default_is_at_its_usual_step_and_at_the_error(found):
     assert default["gain"]["evaluations"] == pytest.approx(expected)
 
 
+def test_a_default_that_was_not_compared_is_asked_at_two_steps(chain, reference):
+    """At 2 fs it makes far less than is asked for: what it needs is a longer step."""
+    plain = measure.compare(chain, methods=["blanes-moan4"], reference=reference, budget=20)
+    found = recommendation.recommend(chain, plain, 1e-3, reference=reference, made_by=CHAIN, budget=20)
+    default = found.recommendation["default"]
+    assert default["method"] == "ase-bonds" and default["error"] < 1e-4
+    assert default["needs"]["measured"] and default["needs"]["setting"] > 4.0
+    assert 1e-4 < default["needs"]["error"] <= 1e-3
+
+
+def test_the_default_itself_may_be_the_cheapest(chain, reference, monkeypatch):
+    plain = measure.compare(chain, methods=["rattle"], reference=reference, budget=20)
+    slow = replace(plain, measurements=[replace(m, seconds_per_time=1e6) for m in plain.measurements], timing={})
+    found = recommendation.recommend(chain, slow, 1e-4, reference=reference, made_by=CHAIN, budget=20)
+    entry = found.recommendation
+    assert entry["method"] == entry["default"]["method"] == "ase-bonds"
+    assert "FixBondLengths" in entry["code"]
+    assert entry["default"]["gain"]["wall"] == pytest.approx(1.0)
+
+
 def test_what_was_found_is_said(found):
     text = recommendation.sentences(found)
     assert f"the cheapest in {found.recommendation['decides']}: kcons BlanesMoan4 at" in text
@@ -193,6 +213,7 @@ def test_command(tmp_path, capsys):
     assert main.main([*arguments, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "For an error of at most 1e-05 R at 2 τ" in printed
+    assert "\nUse " not in printed  # the ranking has no sentence of its own
     entry = json.loads((out / "compare.json").read_text(encoding="utf-8"))["recommendation"]
     assert entry["reached"] and entry["error"] <= 1e-5
     assert 'test_system = test_systems.build("sphere-pendulum", quick=True)' in entry["code"]
