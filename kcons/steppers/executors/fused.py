@@ -166,4 +166,4 @@ def _relative(x: FloatArray, shift: FloatArray | None, work: Any) -> tuple[Float
 def _at(begin: tuple[FloatArray, FloatArray, float, float], start: State, made: int) -> State:
     """Where a step began, `made` steps after `start`; its forces have been forgotten since."""
     x, v, time, left_over = begin
-    return State(x, v.copy(), time, None, start.step + made, None, left_over) if made else start
+    return State(x, v.copy(), time, None, start.step + made, None, left_over, None, start.barostat) if made else start
