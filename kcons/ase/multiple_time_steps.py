@@ -158,7 +158,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
     def _begin(self) -> None:
         """Find the spheres, so that what cannot be is refused before the first step."""
         if isinstance(self.stepper, IsokineticSpheres):
-            self.stepper.layout(self._systems(), self.atoms.positions)
+            self.stepper.radii(self._systems(), self.atoms.positions)
 
     # -- what can be read -----------------------------------------------------------------------
 

@@ -60,11 +60,10 @@ class State:
     time_remainder : float
         What rounding took from the time, so that a million steps of dt are a million dt.
     thermostat, barostat : ndarray or None
-        Their variables, if there are such; those of a barostat begin with the cell, which stands alone before its
-        first step.
+        Their variables, if there are such; those of a barostat begin with the cell, alone before its first step.
     origin : tuple of a weak reference to System, or None, and of positions; or None
         Whose forces these are, and where: those of another System or of other positions are evaluated anew. Without a
-        System, as of a state that was loaded or made by hand, they are taken by any.
+        System (of a state that was loaded or made by hand) they are taken by any.
     """
 
     positions: FloatArray
@@ -197,7 +196,7 @@ def _lent(array: FloatArray | None) -> FloatArray | None:
 
 
 class System:
-    """Constraints, masses and applied forces.
+    """Constraints, masses and applied forces; for one thread at a time. Threads can share steppers.
 
     Parameters
     ----------

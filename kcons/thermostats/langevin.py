@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import numpy as np
 
@@ -17,9 +18,20 @@ from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 
 
-def wind(bits: np.random.Philox, key: tuple[int, int], number: int, part: int = 0) -> None:
-    """Set a counter-based generator to the stretch of the key's stream that belongs to a part of a step."""
-    bits.state = {
+class _Generator(threading.local):
+    """A counter-based generator for each thread."""
+
+    def __init__(self) -> None:
+        self.bits = np.random.Philox(0)
+        self.numbers = np.random.Generator(self.bits)
+
+
+_GENERATOR = _Generator()
+
+
+def wound(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
+    """The generator of this thread at the stretch of the key's stream that belongs to a part of a step."""
+    _GENERATOR.bits.state = {
         "bit_generator": "Philox",
         "state": {
             "counter": np.array([0, 0, number, part], dtype=np.uint64),
@@ -30,6 +42,7 @@ def wind(bits: np.random.Philox, key: tuple[int, int], number: int, part: int = 
         "has_uint32": 0,
         "uinteger": 0,
     }
+    return _GENERATOR.numbers
 
 
 class SeededBath(Listed):
@@ -54,8 +67,6 @@ class SeededBath(Listed):
             raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
         self.seed = seed_number(seed)
         self.substeps = whole_number(substeps, "substeps")
-        self._bits = np.random.Philox(0)
-        self._normal = np.random.Generator(self._bits)
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
@@ -96,8 +107,7 @@ class SeededBath(Listed):
 
     def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
         """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
-        wind(self._bits, (self.seed, 0), number, part)
-        return self._normal.standard_normal(shape)
+        return wound((self.seed, 0), number, part).standard_normal(shape)
 
 
 class Langevin(SeededBath):
@@ -167,9 +177,10 @@ class Langevin(SeededBath):
 
     def directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
         """Those in which no row knows a place in space."""
-        if self._open is None or self._open[0] is not system:
-            self._open = (system, open_directions(system.motion, x, time))
-        return self._open[1]
+        known = self._open
+        if known is None or known[0] is not system:
+            known = self._open = (system, open_directions(system.motion, x, time))
+        return known[1]
 
     def conserved_energy(self, system: System, state: State) -> float:
         """Total energy less the heat that has flowed in."""

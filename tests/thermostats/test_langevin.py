@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -156,6 +158,21 @@ def test_heat_is_counted():
 def test_bad_parameters(options, words):
     with pytest.raises(InputError, match=words):
         Langevin(**{"thermal_energy": 1.0, "friction": 1.0, "seed": 0, **options})
+
+
+def test_threads_share_a_bath():
+    """Each with a System of its own."""
+    bath, interval = Langevin(0.5, 1.0, 3), sys.getswitchinterval()
+    begun = [started() for _ in range(3)]
+    alone = [run(held, state, 0.01, 200, stepper=bath) for held, state in begun]
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(3) as threads:
+            together = list(threads.map(lambda made: run(*made, 0.01, 200, stepper=bath), begun))
+    finally:
+        sys.setswitchinterval(interval)
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one.positions, other.positions)
 
 
 def test_steps_that_cannot_be():

@@ -268,7 +268,7 @@ class HamiltonianMonteCarlo(Portable):
         KconsError
             As the stepper.
         """
-        steps = self._steps_of(system, state)
+        steps = self._found(system, state)[1]
         for _ in range(count):
             state = steps.step(self.stepper, state, dt)
         return state
@@ -301,24 +301,20 @@ class HamiltonianMonteCarlo(Portable):
         noise *= np.sqrt((1 - self.keep**2) * self.thermal_energy * system.inverse_masses)
         kept = self.keep * v
         if self.conserve_momentum:
-            directions = self._directions(system, state)
+            directions = self._found(system, state)[2]
             noise -= drift_velocity(noise, system.masses, directions)
             kept += (1 - self.keep) * drift_velocity(v, system.masses, directions)
         return system.motion.project_velocities(x, kept + noise, time=state.time)
 
-    def _steps_of(self, system: System, state: State) -> ReversedSteps:
-        if self._known is None or self._known[0] is not system:
-            steps = ReversedSteps(system, self.tolerance)
-            self._known = system, steps, np.zeros((0, 3))
+    def _found(self, system: System, state: State) -> tuple[System, ReversedSteps, FloatArray]:
+        """Steps of the system that are taken back, and directions in which no row knows a place in space."""
+        known = self._known
+        if known is None or known[0] is not system:
+            directions = np.zeros((0, 3))
             if self.conserve_momentum:
-                self._known = system, steps, open_directions(system.motion, state.positions, state.time)
-        return self._known[1]
-
-    def _directions(self, system: System, state: State) -> FloatArray:
-        """Those in which no row knows a place in space."""
-        self._steps_of(system, state)
-        assert self._known is not None
-        return self._known[2]
+                directions = open_directions(system.motion, state.positions, state.time)
+            known = self._known = system, ReversedSteps(system, self.tolerance), directions
+        return known
 
 
 def energy_at(system: System, state: State) -> float:

@@ -112,7 +112,7 @@ class IsokineticSpheres(SeededBath):
         self._in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
         self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
         self.force_evaluations = sum(evaluations(self._in_flights).values())
-        self._known: tuple[System, SphereLayout, FloatArray] | None = None
+        self._known: tuple[System, SphereLayout] | None = None
         self._told = False
 
     def __repr__(self) -> str:
@@ -144,30 +144,28 @@ class IsokineticSpheres(SeededBath):
 
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
-        return self._spheres(system, positions)[0]
+        known = self._known
+        if known is None or known[0] is not system:
+            known = self._known = (system, SphereLayout.of(system, positions, self.spheres))
+        return known[1]
 
     def radii(self, system: System, positions: FloatArray) -> FloatArray:
         """R^2 of each sphere, (g + L - 1) k_B T."""
-        return self._spheres(system, positions)[1]
+        return self.layout(system, positions).squares(self.thermal_energy, self.auxiliary)
 
     def kinetic_energy(self, system: System, positions: FloatArray) -> float:
         """What the kinetic energy is on average, (k_B T/2) times the sum of g (G - 1)/G over the spheres."""
-        g = self._spheres(system, positions)[0].freedom
+        g = self.layout(system, positions).freedom
         whole = g + self.auxiliary
         return 0.5 * self.thermal_energy * float((g * (whole - 1) / whole).sum())
 
     def begun(self, system: System, state: State, dt: float) -> ArrayStep:
-        layout, squares = self._spheres(system, state.positions)
+        layout = self.layout(system, state.positions)
+        squares = layout.squares(self.thermal_energy, self.auxiliary)
         if not self._told:
             self._told = True
             logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
         return SphereStep(system, state, dt, self, layout, squares)
-
-    def _spheres(self, system: System, positions: FloatArray) -> tuple[SphereLayout, FloatArray]:
-        if self._known is None or self._known[0] is not system:
-            layout = SphereLayout.of(system, positions, self.spheres)
-            self._known = (system, layout, layout.squares(self.thermal_energy, self.auxiliary))
-        return self._known[1:]
 
 
 class SphereStep(ArrayStep):

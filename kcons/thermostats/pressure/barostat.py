@@ -17,7 +17,7 @@ from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.thermostats.langevin import wind
+from kcons.thermostats.langevin import wound
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
 from kcons.thermostats.pressure.strains import Kind, Strains
@@ -147,8 +147,6 @@ class Barostat:
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
-        self._bits = np.random.Philox(0)
-        self._random = np.random.Generator(self._bits)
         self._pieces: WeakKeyDictionary[CellSystem, Pieces] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -214,14 +212,14 @@ class Barostat:
         """
         assert state.barostat is not None and state.cell is not None
         pieces = self.pieces(system, state.positions, state.time)
-        wind(self._bits, (self.seed, 1), state.step)
         before = self._place(system, state.cell, state.positions, state)
         if not math.isfinite(before.energy):
             raise NonFiniteError(
                 f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
                 "atoms overlap, or the force field returns what is no energy"
             )
-        trial = self._trial(system, pieces, before, state, thermal_energy, dt, self._random)
+        numbers = wound((self.seed, 1), state.step)
+        trial, drawn = self._trial(system, pieces, before, state, thermal_energy, dt, numbers), numbers.random()
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)
         kept = np.abs(trial.e) <= self.strains.most
@@ -242,7 +240,7 @@ class Barostat:
             except BaseException:
                 system.set_cell(before.cell, state.positions)
                 raise
-        accepted = self._random.random() < chance
+        accepted = drawn < chance
         self._adapt(trial.mode, chance, tried, taken, adapted)
         if not accepted:
             if after is not before:

@@ -126,6 +126,16 @@ def test_great_circles_are_flown_exactly():
     np.testing.assert_allclose(has, wanted, rtol=1e-13)
 
 
+def test_another_temperature_from_now_on():
+    held, x = dumbbells(2)
+    stepper = IsokineticSpheres(0.5, 1.0, 3, auxiliary=0)
+    state = run(held, State(x, thermal_velocities(held, x, 0.5, 4)), 0.05, 3, stepper=stepper)
+    twice = held.kinetic_energy(state.velocities)
+    stepper.thermal_energy = 1.0
+    state = run(held, state, 0.05, 3, stepper=stepper)
+    assert held.kinetic_energy(state.velocities) == pytest.approx(2 * twice, rel=1e-12)
+
+
 @pytest.mark.parametrize("auxiliary", [0, 1])
 def test_from_rest(auxiliary):
     held, x = dumbbells(3)
