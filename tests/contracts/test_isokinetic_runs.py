@@ -281,3 +281,4 @@ def test_momentum_stays_zero():
 def test_repr_shows_what_differs():
     assert repr(Isokinetic(0.5)) == "Isokinetic(0.5)"
     assert repr(Isokinetic(kinetic_energy=1.0, order=4)) == "Isokinetic(kinetic_energy=1.0, order=4)"
+    assert repr(Isokinetic(0.5, atoms=3)) == "Isokinetic(0.5, atoms=<1 atoms>)"

@@ -131,7 +131,7 @@ class Isokinetic(Splitting):
         self.thermal_energy = None if thermal_energy is None else positive(thermal_energy, "thermal_energy")
         self.kinetic_energy = None if kinetic_energy is None else positive(kinetic_energy, "kinetic_energy")
         self.convention: Convention = convention
-        self.atoms = None if atoms is None else np.asarray(atoms)
+        self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum
         self._shares: tuple[System, Share] | None = None
         #: Variables of the state that the last step ended in, whose velocities have their length.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, positive
 from kcons.errors import InputError
 
 #: Fewest values from which correlations are taken.
@@ -54,6 +54,4 @@ def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:
     InputError
         As for `autocorrelation_time`; evaluations not positive.
     """
-    if not (np.isfinite(evaluations) and evaluations > 0):
-        raise InputError(f"evaluations is {evaluations!r}; give a positive number", item="evaluations")
-    return autocorrelation_time(values) * float(evaluations)
+    return positive(evaluations, "evaluations") * autocorrelation_time(values)

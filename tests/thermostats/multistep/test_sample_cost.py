@@ -31,3 +31,5 @@ def test_bad_input():
         autocorrelation_time([np.nan] * 40)
     with pytest.raises(InputError, match="evaluations is 0"):
         evaluations_per_sample(np.zeros(40), 0)
+    with pytest.raises(InputError, match=r"evaluations is .* give a positive number"):
+        evaluations_per_sample(np.zeros(40), {"slow": 8})
