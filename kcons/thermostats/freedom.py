@@ -368,7 +368,7 @@ def carried(state: State, size: int, name: str, *, marked: bool = False) -> bool
     if state.thermostat is None:
         return False
     shape = getattr(state.thermostat, "shape", None)  # np.shape takes a microsecond
-    if shape != (size,) or (state.thermostat[0] == MARK) != marked:
+    if shape != (size,) or (state.thermostat.item(0) == MARK) != marked:
         raise InputError(
             f"the state carries variables of another thermostat, not of {name}; start with "
             "dataclasses.replace(state, thermostat=None)",

@@ -134,8 +134,8 @@ class Isokinetic(Splitting):
         self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum
         self._shares: tuple[System, Share] | None = None
-        #: Variables of the state that the last step ended in, whose velocities have their length.
-        self._left: FloatArray | None = None
+        #: Variables of the state that the last step ended in, and what was asked of it.
+        self._left: tuple[FloatArray | None, float | None, float | None] = None, None, None
         operations: list[Operation] = []
         for operation in splitting(*SCHEMES[order]):
             # Velocities are on the constraints whenever they turn.
@@ -224,11 +224,14 @@ class Isokinetic(Splitting):
 
     def _goes_on_from(self, share: Share, state: State) -> bool:
         """Whether the variables of the state are those of this temperature or energy, and of these atoms."""
+        left = self._left
+        if state.thermostat is left[0] and self.thermal_energy == left[1] and self.kinetic_energy == left[2]:
+            return True  # most often, and in no time
         assert state.thermostat is not None
         twice, _, _, count = state.thermostat.tolist()
         if abs(self._twice_kinetic(share, count, twice) - twice) > ROUNDING * twice:
             return False
-        return state.thermostat is self._left or abs(share.square(state.velocities) - twice) <= KEPT * twice
+        return abs(share.square(state.velocities) - twice) <= KEPT * twice
 
     def _twice_kinetic(self, share: Share, count: float, found: float) -> float:
         if self.kinetic_energy is not None:
@@ -262,7 +265,7 @@ class Isokinetic(Splitting):
         if still is not None:
             return still
         after = isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
-        self._left = after.thermostat
+        self._left = after.thermostat, self.thermal_energy, self.kinetic_energy
         return after
 
     # -- what can be read -----------------------------------------------------------------------

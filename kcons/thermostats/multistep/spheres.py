@@ -112,7 +112,7 @@ class IsokineticSpheres(SeededBath):
         self._in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
         self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
         self.force_evaluations = sum(evaluations(self._in_flights).values())
-        self._known: tuple[System, SphereLayout] | None = None
+        self._known: tuple[System, SphereLayout, FloatArray, float] | None = None
         self._told = False
 
     def __repr__(self) -> str:
@@ -144,14 +144,11 @@ class IsokineticSpheres(SeededBath):
 
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
-        known = self._known
-        if known is None or known[0] is not system:
-            known = self._known = (system, SphereLayout.of(system, positions, self.spheres))
-        return known[1]
+        return self._found(system, positions)[1]
 
     def radii(self, system: System, positions: FloatArray) -> FloatArray:
         """R^2 of each sphere, (g + L - 1) k_B T."""
-        return self.layout(system, positions).squares(self.thermal_energy, self.auxiliary)
+        return self._found(system, positions)[2]
 
     def kinetic_energy(self, system: System, positions: FloatArray) -> float:
         """What the kinetic energy is on average, (k_B T/2) times the sum of g (G - 1)/G over the spheres."""
@@ -160,12 +157,18 @@ class IsokineticSpheres(SeededBath):
         return 0.5 * self.thermal_energy * float((g * (whole - 1) / whole).sum())
 
     def begun(self, system: System, state: State, dt: float) -> ArrayStep:
-        layout = self.layout(system, state.positions)
-        squares = layout.squares(self.thermal_energy, self.auxiliary)
+        _, layout, squares, _ = self._found(system, state.positions)
         if not self._told:
             self._told = True
             logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
         return SphereStep(system, state, dt, self, layout, squares)
+
+    def _found(self, system: System, positions: FloatArray) -> tuple[System, SphereLayout, FloatArray, float]:
+        known, kt = self._known, self.thermal_energy
+        if known is None or known[0] is not system or known[3] != kt:
+            layout = SphereLayout.of(system, positions, self.spheres)
+            known = self._known = system, layout, layout.squares(kt, self.auxiliary), kt
+        return known
 
 
 class SphereStep(ArrayStep):
