@@ -137,7 +137,7 @@ def answer(comparison: Comparison, criterion: Criterion = "error", limit: float 
     return replace(
         found,
         what="a drift of the energy" if drift else "an error",
-        unit=f"{units['energy']}/{units['long_time']} a degree of freedom" if drift else units["length"],
+        unit=f"{units['energy']}/{units['long_time']} a degree of freedom" if drift else comparison.error_unit,
         limit_is=limit_is,
         cost=f"{COSTS[judged.decides][1]} a {units['long_time']}",
         seconds=by_time,

@@ -301,7 +301,7 @@ def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measu
 # -- in words ---------------------------------------------------------------------------------------
 
 
-def sentence(loss: Loss, length: str) -> str:
+def sentence(loss: Loss, unit: str) -> str:
     """One loss in words."""
     low, high = loss.errors
     where = f"at an error of {low:.0e}" if low == high else f"at errors from {low:.0e} to {high:.0e}"
@@ -311,10 +311,10 @@ def sentence(loss: Loss, length: str) -> str:
         much = f"up to {100 * (1 - 1 / loss.factor):.0f} % cheaper"
     else:
         much = f"up to {loss.factor:.2g} times cheaper"
-    return f"{loss.title} {where} {length}: {much} ({COSTS[loss.cost][1]}, {loss.md_engine})"
+    return f"{loss.title} {where} {unit}: {much} ({COSTS[loss.cost][1]}, {loss.md_engine})"
 
 
-def together(losses: Sequence[Loss], length: str) -> str:
+def together(losses: Sequence[Loss], unit: str) -> str:
     """All losses in one sentence: the worst by name, the others by number; '' without any."""
     if not losses:
         return ""
@@ -322,13 +322,13 @@ def together(losses: Sequence[Loss], length: str) -> str:
     errors = (min(loss.errors[0] for loss in losses), max(loss.errors[1] for loss in losses))
     others = len(losses) - 1
     more = "" if not others else f" and {others} other{'s' if others > 1 else ''}"
-    return sentence(replace(worst, title=worst.title + more, errors=errors), length)
+    return sentence(replace(worst, title=worst.title + more, errors=errors), unit)
 
 
 def summary(comparison: Comparison) -> list[dict[str, Any]]:
     """One row an MD engine: who is on the front of what decides, what kcons gains, and what it loses."""
     found = verdict(comparison)
-    length = comparison.scene["units"]["length"]
+    unit = comparison.error_unit
     rows = []
     for standing in found.standings:
         if standing.cost != found.decides_on(standing.md_engine):
@@ -346,10 +346,10 @@ def summary(comparison: Comparison) -> list[dict[str, Any]]:
                 "gain_error": standing.gain_error,
                 "ours": standing.ours,
                 "rival": standing.rival,
-                "lost": together(standing.losses, length),
-                "lost_beside": "" if beside is None else together(beside.losses, length),
-                "losses": [sentence(loss, length) for loss in standing.losses],
-                "beside": [] if beside is None else [sentence(loss, length) for loss in beside.losses],
+                "lost": together(standing.losses, unit),
+                "lost_beside": "" if beside is None else together(beside.losses, unit),
+                "losses": [sentence(loss, unit) for loss in standing.losses],
+                "beside": [] if beside is None else [sentence(loss, unit) for loss in beside.losses],
             }
         )
     return rows

@@ -127,14 +127,14 @@ def diagram(comparison: Comparison) -> str:
             continue
         entry = curves.setdefault(m.method, {"t": m.title, "c": style(m.method)[0], "on": m.title in first, "p": []})
         step = f"rtol {m.setting:.0e}" if m.adaptive else f"step {m.setting:.4g} {units['time']}"
-        error = f"{float(m.error):.2e} {units['length']}"
+        error = f"{float(m.error):.2e} {comparison.error_unit}"
         spent = "" if m.seconds_per_time is None else duration(m.seconds_per_time)
         entry["p"].append([m.evaluations_per_time, m.seconds_per_time, m.error, step, error, _number(m), spent])
     if not curves:
         return ""
     (_, evaluations), (_, wall) = COSTS["evaluations"], COSTS["wall"]
     long = units["long_time"]
-    axes = [f"{evaluations} a simulated {long}", f"{wall} a simulated {long} / s", f"error / {units['length']}"]
+    axes = [f"{evaluations} a simulated {long}", f"{wall} a simulated {long} / s", f"error / {comparison.error_unit}"]
     data = json.dumps({"axes": axes, "curves": list(curves.values())}, ensure_ascii=False).replace("<", "\\u003c")
     return f'<div class="diagram"><script type="application/json">{data}</script></div>'
 

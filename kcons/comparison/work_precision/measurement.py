@@ -90,6 +90,11 @@ class Comparison:
     timing: Mapping[str, Any] = field(default_factory=dict)
     recommendation: Mapping[str, Any] | None = None
 
+    @property
+    def error_unit(self) -> str:
+        """That of errors: of lengths, or of energies where the error is one."""
+        return str(self.scene["units"]["energy" if "error" in self.scene else "length"])
+
     def of(self, method: str, status: Status = "ok") -> list[Measurement]:
         """Measurements of one method, coarsest first."""
         return [m for m in self.measurements if m.method == method and m.status == status]

@@ -360,12 +360,12 @@ def default_method(test_system: TestSystem, md_engine: str) -> str | None:
 def _why_not(
     test_system: TestSystem, comparison: Comparison, target: float, resolution: float, everything: Sequence[Measurement]
 ) -> str:
-    length = comparison.scene["units"]["length"]
+    unit = comparison.error_unit
     good = float(comparison.reference["error"])
     if target < resolution:
         return (
-            f"the reference itself ({comparison.reference['how']}) is good to {good:.1g} {length}, so that errors "
-            f"below {resolution:.1g} {length} cannot be told from none; the forces are {comparison.scene['forces']}"
+            f"the reference itself ({comparison.reference['how']}) is good to {good:.1g} {unit}, so that errors "
+            f"below {resolution:.1g} {unit} cannot be told from none; the forces are {comparison.scene['forces']}"
         )
     late = [m for m in comparison.measurements if m.status in ("partial", "not run") and "budget" in m.note]
     more = f"; {len(late)} runs were stopped for the budget, which --budget raises" if late else ""
@@ -389,8 +389,8 @@ def sentences(comparison: Comparison) -> str:
     entry = comparison.recommendation
     if entry is None:
         return ""
-    units = comparison.scene["units"]
-    wanted = f"{entry['target']:.3g} {units['length']} at {comparison.scene['horizon']:g} {units['time']}"
+    units = {**comparison.scene["units"], "error": comparison.error_unit}
+    wanted = f"{entry['target']:.3g} {units['error']} at {comparison.scene['horizon']:g} {units['time']}"
     if not entry["reached"]:
         lines = [f"No method reaches an error of {wanted}: {entry['why']}."]
         if "best" in entry:
@@ -405,7 +405,7 @@ def sentences(comparison: Comparison) -> str:
 
 def _row(m: Mapping[str, Any], units: Mapping[str, str]) -> str:
     return (
-        f"{m['title']} {_at(m, units)}, error {m['error']:.2e} {units['length']}, "
+        f"{m['title']} {_at(m, units)}, error {m['error']:.2e} {units['error']}, "
         f"{m['evaluations_per_time']:,.0f} force evaluations and {duration(m['seconds_per_time'])} "
         f"a simulated {units['long_time']}"
     )
@@ -420,7 +420,7 @@ def _about_default(entry: Mapping[str, Any], default: Mapping[str, Any], units: 
     if default["error"] is None:
         why = ": ".join(word for word in (default["status"], default["note"]) if word)
         return f"{start}has no error to compare with ({why})."
-    start += f"makes {default['error']:.2e} {units['length']}"
+    start += f"makes {default['error']:.2e} {units['error']}"
     if "needs" not in default:
         return f"{start}; from its points it cannot be said what it needs for this error."
     needs, gain = default["needs"], default["gain"]

@@ -116,7 +116,7 @@ def table(comparison: Comparison, *, narrow: bool = False) -> Table:
     length, time, energy, long_time = (units[key] for key in ("length", "time", "energy", "long_time"))
     headers = {
         "step": time,
-        "error": length,
+        "error": comparison.error_unit,
         "max |σ|": f"{length}, rad",
         "max |Av|": "/v_rms",
         "slope": f"{energy}/{long_time}",
@@ -180,7 +180,7 @@ def explanation(comparison: Comparison) -> str:
         "horizon": comparison.scene["horizon"],
         "how": comparison.reference["how"],
         "error_is": comparison.scene.get("error", ERROR),
-        "good": f", good to {error:.0e} {units['length']}" if error else "",
+        "good": f", good to {error:.0e} {comparison.error_unit}" if error else "",
         **units,
     }
     lines = [*(line.format(**known) for line in EXPLANATION), *comparison.remarks]
@@ -208,11 +208,12 @@ def figure(comparison: Comparison, most: int = MOST) -> Figure:
     units, environment = comparison.scene["units"], comparison.environment
     standings = judge(comparison).standings
     shown = chosen(comparison, most)
+    what = comparison.scene.get("error", "rms error an atom")
     grid = {"which": "major", "linewidth": 0.5, "alpha": 0.5}
     left = Panel(
         _errors(comparison, shown, standings, "evaluations"),
         f"force evaluations per simulated {units['long_time']}",
-        f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}",
+        f"{what} at {comparison.scene['horizon']:g} {units['time']} / {comparison.error_unit}",
         plain="x",
         grid=grid,
     )
@@ -321,7 +322,7 @@ def page_table(comparison: Comparison) -> Table:
     units = comparison.scene["units"]
     rank = max(int(comparison.scene["rank"]), 1)
     headings = [
-        *("method", f"step / {units['time']}", f"error / {units['length']}", "on the front of"),
+        *("method", f"step / {units['time']}", f"error / {comparison.error_unit}", "on the front of"),
         *("max |σ|", "max |Av|", f"slope / {units['energy']}/{units['long_time']}"),
         *("time a step", "constraints a step", "a constraint", f"forces a {units['long_time']}"),
         *(f"wall a {units['long_time']}", "what happened"),

@@ -221,7 +221,6 @@ def winners(parts: Sequence[Part]) -> Table:
         found = part.comparison
         if found is None:
             continue
-        length = found.scene["units"]["length"]
         margin = found.timing.get("margin")
         for row in summary(found):
             if not row["rivals"]:
@@ -233,7 +232,7 @@ def winners(parts: Sequence[Part]) -> Table:
                     *(part.heading, row["md_engine"], row["cost"]),
                     f"{100 * margin:.0f} %" if by_time and margin is not None else "",
                     "" if gain is None else factor(gain),
-                    "" if gain is None else f"{row['gain_error']:.0e} {length}",
+                    "" if gain is None else f"{row['gain_error']:.0e} {found.error_unit}",
                     row["lost"] or "none",
                     *(row["ours"] or "", row["rival"] or ""),
                     row["lost_beside"] or ("" if row["md_engine"] == EVERY_MD_ENGINE else "none"),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, replace
 from io import StringIO
 
 import pytest
 from rich.console import Console
 
-from kcons.comparison.work_precision import measure, report
+from kcons.comparison.work_precision import answer, measure, recommendation, report
 from kcons.comparison.work_precision.measure import Comparison, Measurement
 
 UNITS = {"length": "Å", "energy": "eV", "time": "fs", "long_time": "ps"}
@@ -177,6 +178,19 @@ def test_plot_has_both_panels_with_units():
     assert any("stopped for the budget" in label for label in labels)
     # Methods differ in colour and marker.
     assert len({colour for colour, _ in report.STYLES.values()}) == len(report.STYLES)
+
+
+def test_an_error_that_is_an_energy_has_the_unit_of_one():
+    found = comparison(*ROWS)
+    found = replace(found, scene={**found.scene, "error": "energy above the optimum"})
+    heading = text_of(found).splitlines()[3].split()
+    assert heading[:4] == ["method", "fs", "eV", "Å,"]
+    assert "good to 1e-09 eV" in report.explanation(found)
+    assert report.figure(found).axes[0].get_ylabel() == "energy above the optimum at 24 fs / eV"
+    assert "for an error of at most 0.0013 eV (what" in answer.sentence(answer.answer(found))
+    entry = {**asdict(ROWS[0]), "target": 2e-3, "reached": True, "decides": "wall time", "code": ""}
+    said = recommendation.sentences(replace(found, recommendation=entry))
+    assert "at most 0.002 eV" in said and "error 1.25e-03 eV" in said
 
 
 def test_methods_differ_in_colour_and_marker(monkeypatch):
