@@ -91,8 +91,7 @@ class HamiltonianMonteCarlo:
         Temperature not positive, fewer than one step, `keep` out of range; a file of other particles.
     UnsupportedError
         Another integrator, one with an ensemble, or the leapfrog; parts that move; barostats, AndersenThermostat or
-        CMMotionRemover in the System. At the first step: momentum is to be conserved where rows or particles without
-        mass hold all directions.
+        CMMotionRemover in the System. At the first step: momentum that rows, or particles without mass, hold all of.
 
     Notes
     -----

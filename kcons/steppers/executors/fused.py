@@ -45,7 +45,7 @@ def fused_steps(
     # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
     force, number, stage = system.force, start.step, drifts[0]
     x, v, f = system.taken(start)
-    shape, shift = x.shape, None
+    shape, shift, cells = x.shape, None, start.barostat
     if (remainder := system.remainder_of(start)) is not None:
         shift = x[system.anchor]
         x = (x - shift) + remainder
@@ -117,8 +117,7 @@ def fused_steps(
         flights.motion.took(found)
     x, remainder = _relative(x, shift, work) if shift is not None or far else (x, None)
     forces = start.forces if force is None else f.copy()
-    more = None, start.barostat, (ref(system), x)
-    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, *more)
+    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, None, cells, (ref(system), x))
     return state, steps
 
 
