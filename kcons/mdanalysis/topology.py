@@ -108,7 +108,7 @@ def snapshot_of(universe: Any) -> Snapshot:
     Raises
     ------
     InputError
-        No Universe or AtomGroup; no coordinates; an atom that is twice in a group.
+        No Universe or AtomGroup; no coordinates; an atom that is twice in a group, or at alternate locations.
     """
     _require_atoms(universe)
     group = universe.atoms
@@ -133,11 +133,29 @@ def snapshot_of(universe: Any) -> Snapshot:
         ) from None
     # Of a part, only the atoms of the part; but whole residues keep their numbers.
     described = topology_of(universe)
+    _refuse_alternates(group, described)
     cell = None
     if step.dimensions is not None and np.all(step.dimensions[:3] > 2.0):
         cell = _cell(step)
     velocities = as_written(group.velocities) if step.has_velocities else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
+
+
+def _refuse_alternates(group: Any, topology: Topology) -> None:
+    """An atom at two places is two atoms in MDAnalysis, and no molecule."""
+    places = np.char.strip(_texts(group, "altLocs", len(group)))
+    if not (places != places[0]).any():
+        return
+    there: dict[tuple[int, str], int] = {}
+    for atom in np.flatnonzero(places != "").tolist():
+        other = there.setdefault((int(topology.residues[atom]), str(topology.names[atom])), atom)
+        if places[atom] != places[other]:
+            raise InputError(
+                f"{topology.atom_name(other)} is at alternate locations, {places[other]} and {places[atom]}: give one "
+                f"of them, such as universe.select_atoms('not altloc {places[atom]}'), or take one out of the file",
+                item="atoms",
+                atoms=[other, atom],
+            )
 
 
 def _require_atoms(universe: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from io import StringIO
+
 import ase
 import MDAnalysis as mda
 import numpy as np
@@ -101,6 +103,20 @@ def test_an_atom_that_is_twice_in_a_group_is_refused(taken):
     with pytest.raises(InputError, match=r"atom 1 of its Universe twice, .* in place 3; take group.unique"):
         taken(made.atoms[[0, 1, 2, 1, 3, 4, 5]])
     assert constraints_of(made.atoms[[5, 0, 1, 2, 4, 3]], "none").constraint_set.n_rows == 6
+
+
+def test_alternate_locations_of_one_atom_are_refused():
+    """A second hydrogen, 0.5 angstrom from the first, was another atom and took its row."""
+    atoms = [("O", " ", 0.0, 0.0), ("H1", "A", 0.957, 0.0), ("H1", "B", 0.8, 0.5), ("H2", " ", -0.24, 0.927)]
+    lines = [
+        f"ATOM  {k:5d}  {name:<3s}{place}HOH A   1    {x:8.3f}{y:8.3f}{0.0:8.3f}  1.00  0.00           {name[0]}  "
+        for k, (name, place, x, y) in enumerate(atoms, 1)
+    ]
+    universe = mda.Universe(StringIO("\n".join([*lines, "END"])), format="PDB")
+    with pytest.raises(InputError, match=r"H1 of HOH 1 .*A and B: give one .*select_atoms\('not altloc B'\)") as caught:
+        constraints_of(universe)
+    assert caught.value.atoms == (1, 2)
+    assert constraints_of(universe.select_atoms("not altloc B")).constraint_set.n_rows == 3
 
 
 def test_sites_without_mass_are_found_by_mass_and_name():
