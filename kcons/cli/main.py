@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,15 @@ from kcons.cli.parser import Parser
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 from kcons.errors import InputError, KconsError, did_you_mean, with_extra
 
+#: Options of `kcons compare` and `kcons plan` by what can be run.
+OF_FLUIDS = frozenset({"size", "seed", "dt", "methods", "out", "quick", "budget", "criterion"})
+OF_STEPS_OF_FLUIDS = OF_FLUIDS - {"criterion"} | {"slow", "fast"}
+OF_STEPS_OF_FILES = OF_STEPS_OF_FLUIDS - {"size"} | {"coordinates", "constrain", "select", "rigid_residues", "platform"}
+OF_THE_WHOLE = frozenset({"all", "only", "fresh", "out", "quick", "list"})
+
 if TYPE_CHECKING:
     from kcons.comparison.methods.method import Method
     from kcons.comparison.test_systems import TestSystem
-    from kcons.comparison.test_systems.fluid import Fluid
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -175,7 +180,7 @@ def _parser() -> Parser:
 
 
 def _compare(chosen: argparse.Namespace) -> int:
-    if chosen.all or chosen.redraw is not None or chosen.only or chosen.fresh:
+    if chosen.all or chosen.redraw is not None or chosen.only or chosen.fresh or chosen.into is not None:
         return _compare_all(chosen)
     if chosen.list:
         return _list()
@@ -190,7 +195,14 @@ def _compare(chosen: argparse.Namespace) -> int:
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
     if chosen.slow is not None or chosen.fast is not None:
-        return studies.compare_steps(chosen, budget, folder)
+        known = OF_STEPS_OF_FLUIDS if chosen.scene in test_systems.FLUIDS else OF_STEPS_OF_FILES
+        _take_only(chosen, known, "does not go with --slow and --fast; leave it out")
+        _check_name(chosen)
+
+        def with_forces(forces: str) -> TestSystem:
+            return _test_system(argparse.Namespace(**{**vars(chosen), "forces": forces}))
+
+        return studies.compare_steps(chosen, budget, folder, with_forces)
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
@@ -289,13 +301,20 @@ def _compare_all(chosen: argparse.Namespace) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison.work_precision import parts_of_the_whole, whole
 
+    every = "--all runs all test systems and methods; choose parts of it by --only"
+    if chosen.scene is not None:
+        raise InputError(every, item="all")
+    if chosen.redraw is not None:
+        _take_only(chosen, {"all", "redraw", "into"}, "does not go with --redraw, which runs nothing; leave it out")
+    elif chosen.into is not None:
+        raise InputError("--into goes with --redraw DIR", item="into")
+    else:
+        _take_only(chosen, OF_THE_WHOLE, f"does not go with --all: {every}")
     if chosen.list:
         print("parts of the whole comparison")
         for item in parts_of_the_whole.PLAN:
             print(f"  {item.key:<22} {item.heading}")
         return 0
-    if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
-        raise InputError("--all runs all test systems and methods; choose parts of it by --only", item="all")
     if chosen.redraw is not None:
         with Bars() as watcher:
             written = whole.redraw(chosen.redraw, chosen.into, watcher)
@@ -312,18 +331,15 @@ def _compare_all(chosen: argparse.Namespace) -> int:
 
 def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, asked: dict[str, Any]) -> int:
     from kcons.cli.progress import Bars
+    from kcons.comparison import test_systems
     from kcons.comparison.averages import report as sampling_report
     from kcons.comparison.averages import sampling
     from kcons.comparison.work_precision import answer
 
     sampling.chosen(chosen.methods)  # complain before any work
     _check_name(chosen)
-    if _molecules(chosen):
-        raise InputError(
-            f"--{next(iter(_molecules(chosen))).replace('_', '-')} is for molecules in OpenMM, not for fluids",
-            item=next(iter(_molecules(chosen))),
-        )
-    fluid = _fluid(chosen, quick=chosen.quick)
+    _take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
+    fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
     if chosen.dt is not None:
         fluid = fluid.with_time_steps(chosen.dt)
     folder.mkdir(parents=True, exist_ok=True)
@@ -340,6 +356,13 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     show(table, explained, terminal)
     say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
     return 0
+
+
+def _take_only(chosen: argparse.Namespace, known: Collection[str], why: str) -> None:
+    """Complain of an option that would say nothing."""
+    for name, option in commands()[chosen.command].given(chosen).items():
+        if name not in known:
+            raise InputError(f"{option} {why}", item=name)
 
 
 def _check_name(chosen: argparse.Namespace) -> None:
@@ -398,12 +421,6 @@ def _test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSyst
     return test_systems.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
 
 
-def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
-    from kcons.comparison import test_systems
-
-    return test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=quick)
-
-
 # -- plan and list ----------------------------------------------------------------------------------
 
 
@@ -417,7 +434,8 @@ def _plan(chosen: argparse.Namespace) -> int:
     if test_systems.is_other_file(chosen.scene) and test_systems.by_mdanalysis(chosen.scene, given):
         return _plan_file(chosen, given)
     if chosen.scene in test_systems.FLUIDS:
-        fluid = _fluid(chosen)
+        _take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
+        fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed)
         print(fluid.title)
         print(fluid.motion.report(fluid.positions))
         return 0

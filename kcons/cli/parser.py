@@ -17,6 +17,11 @@ class Parser(argparse.ArgumentParser):
         found = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
         return dict(found[0].choices) if found else {}
 
+    def given(self, chosen: argparse.Namespace) -> dict[str, str]:
+        """Options that are not what they are by default: where they are kept, and how they are written."""
+        options = [action for action in self._actions if action.option_strings and hasattr(chosen, action.dest)]
+        return {a.dest: a.option_strings[0] for a in options if getattr(chosen, a.dest) != a.default}
+
     def parse_fully(self, arguments: Sequence[str] | None = None) -> argparse.Namespace:
         """As `parse_args`."""
         chosen, rest = self.parse_known_args(arguments)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kcons.cli.terminal import console, names, rendered, say_written, show
 from kcons.errors import InputError
+
+if TYPE_CHECKING:
+    from kcons.comparison.averages.layers import Layers
+    from kcons.comparison.test_systems import TestSystem
 
 
 def add(commands: Any) -> None:
@@ -89,8 +94,10 @@ def _stability(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def compare_steps(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
-    """Bias against evaluations of the expensive forces."""
+def compare_steps(
+    chosen: argparse.Namespace, budget: float, folder: Path, with_forces: Callable[[str], TestSystem]
+) -> int:
+    """Bias against evaluations of the expensive forces; `with_forces` makes the test system of a file."""
     from kcons.cli.progress import Bars
     from kcons.comparison.averages import long_steps
     from kcons.comparison.averages import long_steps_report as report
@@ -98,13 +105,11 @@ def compare_steps(chosen: argparse.Namespace, budget: float, folder: Path) -> in
     long_steps.chosen(chosen.methods)  # complain before any work
     if chosen.fast is None:
         raise InputError("--slow needs --fast: give the cheap forces, too", item="fast")
-    if chosen.target_error is not None or chosen.forces is not None:
-        raise InputError("--slow and --fast take the place of --forces, and have no --target-error", item="slow")
     if chosen.slow == chosen.fast:
         raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
     with Bars() as watcher:
         with watcher.piece("building the system", 1):
-            layers = _layers(chosen)
+            layers = _layers(chosen, with_forces)
         unit = layers.units.time_unit
         steps = None if chosen.dt is None else [dt * unit for dt in chosen.dt]
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
@@ -124,7 +129,7 @@ def compare_steps(chosen: argparse.Namespace, budget: float, folder: Path) -> in
     return 0
 
 
-def _layers(chosen: argparse.Namespace) -> Any:
+def _layers(chosen: argparse.Namespace, with_forces: Callable[[str], TestSystem]) -> Layers:
     """The system with both forces."""
     from kcons.comparison import test_systems
     from kcons.comparison.averages import layers
@@ -144,11 +149,4 @@ def _layers(chosen: argparse.Namespace) -> Any:
         raise InputError(f"--slow and --fast are for {known} and for files, not {chosen.scene!r}", item="scene")
     if chosen.slow is None:
         raise InputError("a file needs --slow and --fast, the expensive and the cheap forces", item="slow")
-    given = {
-        name: getattr(chosen, name) for name in ("coordinates", "constrain", "select", "rigid_residues", "platform")
-    }
-    given = {name: value for name, value in given.items() if value is not None}
-    expensive = test_systems.from_file(chosen.scene, chosen.seed, forces=chosen.slow, **given)
-    return layers.of_test_systems(
-        expensive, test_systems.from_file(chosen.scene, chosen.seed, forces=chosen.fast, **given)
-    )
+    return layers.of_test_systems(with_forces(chosen.slow), with_forces(chosen.fast))

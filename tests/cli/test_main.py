@@ -147,6 +147,14 @@ def test_version(capsys):
         (["compare", "chain", "--seed", "-1"], "non-negative"),
         (["compare", "chain", "--size", "3", "--budget", "-1"], "positive number of seconds"),
         (["compare", "chain", "--size", "3", "--out", "/dev/null/x"], "/dev/null"),
+        (["compare", "--all", "--dt", "4"], "--dt does not go with --all"),
+        (["compare", "--all", "--seed", "2"], "--seed does not go with --all"),
+        (["compare", "--only", "rotor", "--fast", "3"], "--fast does not go with --all"),
+        (["compare", "--redraw", ".", "--only", "rotor"], "--only does not go with --redraw"),
+        (["compare", "--into", "page.md", "--methods", "rattle"], "--into goes with --redraw DIR"),
+        (["compare", "thermostat", "--forces", "lj"], "--forces is not for fluids"),
+        (["plan", "thermostat", "--constrain", "hbonds"], "--constrain is not for fluids"),
+        (["plan", "thermostat", "--select", "all", "--add-hydrogens"], "is not for fluids"),
     ],
 )
 def test_mistakes_give_one_line_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):

@@ -46,9 +46,16 @@ def test_how_long_the_step_may_be(tmp_path, monkeypatch, capsys):
         ("compare thermostat-water --fast 3 --methods rattle", "there is no method 'rattle'"),
         ("compare thermostat-water --fast 9", "molecules reach 9"),
         ("compare run.pdb --slow gfn2 --fast gfn2", "are both gfn2: give cheaper forces to --fast"),
+        ("compare thermostat --fast 1 --seed -1", "give a non-negative number"),
+        ("compare thermostat --fast 1 --criterion temperature", "--criterion does not go with --slow and --fast"),
+        ("compare thermostat --fast 1 --constrain hbonds", "--constrain does not go with"),
+        ("compare run.pdb --slow gfn2 --fast lj --add-hydrogens", "--add-hydrogens does not go with"),
+        ("compare run.pdb --slow gfn2 --fast lj --size 3", "--size does not go with"),
+        ("compare run.pdb --slow gfn2 --fast lj --forces emt", "--forces does not go with"),
     ],
 )
 def test_expensive_and_cheap_forces_that_cannot_be(command, text, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.pdb").touch()
     assert main.main(command.split()) == 2
     assert text in capsys.readouterr().err
