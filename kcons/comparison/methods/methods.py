@@ -221,6 +221,9 @@ class AseMethod(Method):
 class AseKcons(AseMethod):
     """ASE's VelocityVerlet with `kcons.ase.Constraints`."""
 
+    def warm_up(self, test_system: TestSystem) -> None:
+        self.start(test_system, min(test_system.time_steps)).advance()
+
     def start(self, test_system: TestSystem, setting: float) -> Run:
         held = Constraints(test_system.constraint_set.constraints)
         return _AseRun(test_system, setting, held)

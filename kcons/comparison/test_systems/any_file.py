@@ -285,7 +285,7 @@ def _of_ase(snapshot: Any, name: str) -> Potential:
     try:
         finite = bool(np.all(np.isfinite(potential.forces(atoms.positions))))
     except Exception as error:  # calculators raise whatever they like
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(str(error.__cause__ or error).split()) or type(error).__name__
         raise InputError(
             f"the calculator {name} fails on these atoms: {text}; choose other --forces", item="forces"
         ) from error

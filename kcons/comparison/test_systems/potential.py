@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms
+from ase.calculators import calculator as of_ase
 
 from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray
+from kcons.errors import CalculatorError
 
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray]]
 
@@ -125,12 +127,19 @@ class PotentialCalculator:
 
 
 def of_calculator(atoms: Atoms, calculator: Any, name: str) -> Potential:
-    """The potential that an ASE calculator gives for these atoms (without their constraints)."""
+    """The potential that an ASE calculator gives for these atoms (without their constraints).
+
+    Where the calculator says that it failed, the potential raises `CalculatorError`.
+    """
     copy = Atoms(atoms.symbols, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc, masses=atoms.get_masses())
     copy.calc = calculator
 
     def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
         copy.positions[:] = x
-        return float(copy.get_potential_energy()), np.asarray(copy.get_forces())
+        try:
+            return float(copy.get_potential_energy()), np.asarray(copy.get_forces())
+        except of_ase.CalculatorError as error:
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise CalculatorError(f"{name} failed: {text}; mend the start, or choose other forces") from error
 
     return Potential(evaluate, name)

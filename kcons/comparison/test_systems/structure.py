@@ -151,9 +151,18 @@ def from_file(
         molecule = kind(StringIO(path.read_text(encoding="utf-8", errors="replace")))
         topology, x = molecule.topology, _nanometers(molecule)
     except Exception as error:  # OpenMM's readers raise whatever went wrong inside of them
-        raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}", item="file") from error
+        raise InputError(
+            f"{path} cannot be read; does it hold molecules, in the format of its ending? "
+            f"({type(error).__name__}: {error})",
+            item="file",
+        ) from error
     if not len(x):
         raise InputError(f"{path} has no atoms", item="file")
+    bad = ~np.isfinite(x).all(axis=1)
+    if bad.any():
+        atom = list(topology.atoms())[int(np.argmax(bad))]
+        where = f"{atom.name} of {atom.residue.name} {atom.residue.id}"
+        raise InputError(f"{path}: the position of {where} is not finite; mend the file", item="file")
     field = force_field_of(force_field)
     if add_hydrogens:
         topology, x = _with_hydrogens(topology, molecule.positions, field)

@@ -188,8 +188,13 @@ def test_bad_files(tmp_path):
     for text, message in (("nonsense\n", "cannot be read|no atoms"), ("END\n", "cannot be read|no atoms")):
         path = tmp_path / "bad.pdb"
         path.write_text(text)
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match=message) as caught:
             test_systems.from_file(path)
+        assert "does it hold molecules" in str(caught.value) or "no atoms" in str(caught.value)
+    text = ALANINE.read_text(encoding="utf-8").replace("2.000   2.090", "  nan   2.090")
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"the position of CH3 of ACE 1 is not finite; mend the file"):
+        test_systems.from_file(path)
 
 
 def test_molecule_that_is_cut(tmp_path):
