@@ -245,21 +245,18 @@ def kinetic(full: bool) -> dict[str, Any]:
 
 
 def show(result: dict[str, Any], console: Console) -> None:
-    fast, called, sampled = (result["measurements"].get(name) for name in ("speed", "simulation", "sampling"))
-    if fast:
-        headings = ("integrator", "ms a step", "steps a second, relative")
-        table = scripts.table(fast["title"], headings, {"integrator"})
-        for name, row in fast["rows"].items():
-            table.add_row(name, f"{row['ms']:.2f}", f"{row['ratio']:.2f}")
-        console.print(table)
-        console.print(_made_on(fast["machine"]))
-    if called:
-        columns = ("integrator", "ms a step", "Simulation.step, relative")
-        table = scripts.table(called["title"], columns, {"integrator"})
-        for name, row in called["rows"].items():
-            table.add_row(name, f"{row['ms']:.2f}", f"{row['quotient']:.3f} ± {row['error']:.3f}")
-        console.print(table)
-        console.print(_made_on(called["machine"]))
+    last: dict[str, tuple[str, Callable[[dict[str, float]], str]]] = {
+        "speed": ("steps a second, relative", lambda row: f"{row['ratio']:.2f}"),
+        "simulation": ("Simulation.step, relative", lambda row: f"{row['quotient']:.3f} ± {row['error']:.3f}"),
+    }
+    for name, (heading, relative) in last.items():
+        if timed := result["measurements"].get(name):
+            table = scripts.table(timed["title"], ("integrator", "ms a step", heading), {"integrator"})
+            for integrator, row in timed["rows"].items():
+                table.add_row(integrator, f"{row['ms']:.2f}", relative(row))
+            console.print(table)
+            console.print(_made_on(timed["machine"]))
+    sampled = result["measurements"].get("sampling")
     if sampled and "reference" in sampled:
         headings = ("integrator", "step/fs", "mean U, kJ/mol", "less that at 1 fs")
         table = scripts.table(sampled["title"], headings, {"integrator"})
