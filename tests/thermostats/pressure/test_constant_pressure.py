@@ -12,6 +12,7 @@ from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import ProjectedVerlet, Rattle, State, Suzuki4, run
+from kcons.steppers.stages.fused_stages import UNENDED
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
@@ -162,3 +163,18 @@ def test_other_steppers_go_on_in_the_cell_of_the_state(stepper):
     second = run(system, there, 0.05, 2, stepper=stepper)
     assert np.array_equal(first.positions, second.positions)
     assert np.array_equal(first.cell, there.cell) and np.array_equal(system.cell, there.cell)
+
+
+def test_a_step_that_the_joined_kernel_leaves_to_the_engine_keeps_the_cell(monkeypatch):
+    system, state = begun()
+    whole = run(system, state, 0.05, 5, stepper=Rattle())
+    kernel, calls = system.flights.one, []
+
+    def unwilling(*arguments):
+        calls.append(arguments)
+        return UNENDED if len(calls) == 3 else kernel(*arguments)
+
+    monkeypatch.setattr(type(system.flights), "one", property(lambda flights: unwilling))
+    after = run(system, state, 0.05, 5, stepper=Rattle())
+    assert len(calls) > 3 and np.array_equal(after.positions, whole.positions)
+    assert np.array_equal(after.cell, state.cell)
