@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
 from kcons.comparison.hard_cases.problem import Array, Numbers, Problem
+from kcons.comparison.test_systems.rotor import flight
 from kcons.constraints import projection
 
 _KNOWN: dict[tuple[Any, ...], Array] = {}
@@ -56,17 +57,7 @@ def spinning(x: Array, masses: Array, omega: Numbers, drift: ArrayLike = (0, 0, 
 @_remembered
 def rigid_flight(x: Array, masses: Array, omega: Array, time: float) -> Array:
     """Positions of a free rigid body after `time`, by Euler's equations; its centre rests."""
-    centre = masses @ x / masses.sum()
-    d = x - centre
-    inertia = _inertia(d, masses)
-
-    def rate(t: float, y: Array) -> Array:
-        turn, w = y[:9].reshape(3, 3), y[9:]
-        return np.concatenate([(turn @ cross_matrix(w)).ravel(), np.linalg.solve(inertia, -np.cross(w, inertia @ w))])
-
-    start = np.concatenate([np.eye(3).ravel(), omega])
-    end = solve_ivp(rate, (0, time), start, method="DOP853", rtol=1e-13, atol=1e-14)
-    return np.asarray(centre + d @ end.y[:9, -1].reshape(3, 3).T)
+    return flight(x, spinning(x, masses, omega), masses, time).positions
 
 
 @_remembered
@@ -103,11 +94,6 @@ def _turn(w: Array) -> Array:
     size = float(np.linalg.norm(w))
     W = cross_matrix(w)
     return np.asarray(np.eye(3) + np.sinc(size / np.pi) * W + 0.5 * np.sinc(size / 2 / np.pi) ** 2 * W @ W)
-
-
-def _inertia(d: Array, masses: Array) -> Array:
-    spread = np.einsum("i,ij,ik->jk", masses, d, d)
-    return np.trace(spread) * np.eye(3) - spread
 
 
 def linear_flight(x: Array, v: Array, masses: Array, time: float) -> Array:

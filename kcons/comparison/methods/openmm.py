@@ -45,7 +45,6 @@ HALF_STEP = (
     "OpenMM gives."
 )
 NO_TRAJECTORY = "thermostat: a trajectory of its own, so that no error can be stated."
-SETTLE = "SETTLE stores its distances in single precision: water is off by up to 6e-8 of them at any tolerance."
 
 
 class _EngineRun(InOpenMM):

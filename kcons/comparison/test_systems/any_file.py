@@ -10,10 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ase import units
 
-from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, place
+from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.structure import (
+    FORCE_FIELD,
+    TEMPERATURE,
+    force_field_of,
+    platform_of,
+    steps_of,
+    system_of,
+)
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
@@ -26,12 +33,8 @@ from kcons.topology.whole_molecules import whole_molecules
 if TYPE_CHECKING:
     from kcons.topology.rows_by_name import HeldRows
 
-TEMPERATURE = 300.0
 #: Forces by name, beside those of OpenMM and what ASE knows.
 CALCULATORS = ("emt", "lj", "tip3p", "gfn1", "gfn2")
-FORCE_FIELD = ("amber14-all.xml", "amber14/tip3pfb.xml")
-#: Up to this size OpenMM's Reference platform, which computes in double precision, is fast enough.
-FEW_ATOMS, MANY_ATOMS = 200, 3000
 
 
 @dataclass(frozen=True)
@@ -208,8 +211,6 @@ def from_file(
     held = ConstraintSet(list(found.rows), x, masses, cell=cell, pbc=snapshot.pbc.tolist())
     motion = Motion(held, x)
     x = motion.restore_positions(x)
-    many, few = len(x) > MANY_ATOMS, len(x) <= FEW_ATOMS
-    steps = (4.0, 2.0, 1.0) if many else (4.0, 2.0, 1.0, 0.5)
     return TestSystem(
         name=Path(path).stem,
         title=f"{found.title}, {TEMPERATURE:g} K; {potential.name}",
@@ -218,13 +219,10 @@ def from_file(
         velocities=thermal_velocities(motion, x, TEMPERATURE, seed),
         potential=potential,
         symbols=[e or "X" for e in snapshot.topology.elements.tolist()],
-        horizon=(48 if few else 24) * units.fs,
-        time_steps=tuple(dt * units.fs for dt in steps),
-        tolerances=(1e-3, 1e-4, 1e-5),
         bonds=_distances(found.rows),
         cell=cell,
         openmm=md_engine,
-        reference_pace=1.0 if few else 2.0,
+        **steps_of(len(x)),
     )
 
 
@@ -256,7 +254,6 @@ def _has_force_field(file: str) -> bool:
 def _openmm_engine(snapshot: Any, rows: HeldRows, force_field: Sequence[str], platform: str) -> OpenMMEngine:
     if find_spec("openmm") is None:
         raise UnsupportedError("these forces need OpenMM; python -m pip install openmm, or --forces emt, gfn2, ...")
-    from kcons.comparison.test_systems.structure import force_field_of, system_of
     from kcons.openmm.topology import openmm_topology
 
     if not all(isinstance(item, Distance) for item in rows):
@@ -265,8 +262,7 @@ def _openmm_engine(snapshot: Any, rows: HeldRows, force_field: Sequence[str], pl
             "of an ASE calculator"
         )
     topology, _ = openmm_topology(snapshot)
-    platform = platform or ("Reference" if snapshot.topology.n_atoms <= FEW_ATOMS else "CPU")
-    place(platform)  # complain before the long part
+    platform = platform_of(snapshot.topology.n_atoms, platform)
     system = system_of(topology, force_field_of(force_field), None, False)
     for item in rows:
         lengths = (np.asarray(item.target) * ASE_LENGTH).tolist()

@@ -297,9 +297,7 @@ def _test_system(
     box = _box(topology)
     if box is None:
         topology.setPeriodicBoxVectors(None)
-    few = len(x) <= FEW_ATOMS
-    platform = platform or ("Reference" if few else "CPU")
-    place(platform)  # complain before the long part
+    platform = platform_of(len(x), platform)
     system = system_of(topology, field, getattr(app, CONSTRAIN[constrain]), True)
     _refuse_sites(system, topology)
     rows = SystemRows.of(system)
@@ -314,8 +312,6 @@ def _test_system(
     on = motion.restore_positions(x / ASE_LENGTH)
     md_engine = OpenMMEngine(lambda: system, platform=platform, home=True)
     potential = md_engine.potential()
-    many = len(x) > MANY_ATOMS
-    steps = (4.0, 2.0, 1.0) if many else (4.0, 2.0, 1.0, 0.5)
     what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances, {TEMPERATURE:g} K"
     return TestSystem(
         name=name,
@@ -325,14 +321,36 @@ def _test_system(
         velocities=thermal_velocities(motion, on, TEMPERATURE, seed),
         potential=potential,
         symbols=[atom.element.symbol if atom.element is not None else "X" for atom in topology.atoms()],
-        horizon=(48 if few else 24) * units.fs,
-        time_steps=tuple(dt * units.fs for dt in steps),
-        tolerances=(1e-3, 1e-4, 1e-5),
         bonds=rows.pairs,
         cell=None if box is None else box / ASE_LENGTH,
         openmm=md_engine,
-        reference_pace=1.0 if few else 2.0,
+        **steps_of(len(x)),
     )
+
+
+def platform_of(n_atoms: int, platform: str) -> str:
+    """The platform of OpenMM that was asked for, or by default one that is fast enough.
+
+    Raises
+    ------
+    InputError
+        There is none of this name.
+    """
+    platform = platform or ("Reference" if n_atoms <= FEW_ATOMS else "CPU")
+    place(platform)  # complain before the long part
+    return platform
+
+
+def steps_of(n_atoms: int) -> dict[str, Any]:
+    """Horizon, time steps, tolerances and reference pace of molecules, such as a system of this size can pay for."""
+    few = n_atoms <= FEW_ATOMS
+    steps = (4.0, 2.0, 1.0) if n_atoms > MANY_ATOMS else (4.0, 2.0, 1.0, 0.5)
+    return {
+        "horizon": (48 if few else 24) * units.fs,
+        "time_steps": tuple(dt * units.fs for dt in steps),
+        "tolerances": (1e-3, 1e-4, 1e-5),
+        "reference_pace": 1.0 if few else 2.0,
+    }
 
 
 def _refuse_sites(system: Any, topology: Any) -> None:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from kcons.comparison.averages.sampling import SamplingComparison
 
 Criterion = Literal["error", "drift", "temperature"]
-CRITERIA: tuple[Criterion, ...] = ("error", "drift", "temperature")
 
 #: Methods whose error is what is usually accepted, and the step of it where time is in fs.
 USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-rattle", "openmm-verlet")
