@@ -230,19 +230,30 @@ def added(known: dict[str, Any], place: str) -> dict[str, Any]:
 
 
 def measured(chosen: argparse.Namespace) -> dict[str, Any]:
+    """All runs, of which those that are done are in the file; with --full runs on other platforms stay in it."""
     names = chosen.structure or (list(STRUCTURES) if chosen.full else ["alanine dipeptide"])
     place = chosen.platform or ("OpenCL mixed" if chosen.full else "CPU")
     picoseconds = chosen.picoseconds or (100.0 if chosen.full else 4.0)
-    return {
-        "machine": measure.environment(),
-        "full": chosen.full,
-        "runs": {name: run(name, place, picoseconds, 5.0 if chosen.full else 0.2) for name in names},
-        "again": [
-            run("villin", where, picoseconds / 2, 5.0, step, seed)
-            for where, step, count in AGAIN * chosen.full
-            for seed in range(2, 2 + count)
-        ],
-    }
+    known = json_files.read(chosen.out)["again"] if chosen.full and chosen.out and chosen.out.exists() else []
+    others = [each for each in known if each["place"] not in {where for where, _, _ in AGAIN}]
+    machine = measure.environment()
+    result: dict[str, Any] = {"machine": machine, "full": chosen.full, "runs": {}, "again": others}
+
+    def keep() -> None:
+        if chosen.out:
+            json_files.write(chosen.out, result)
+
+    for name in names:
+        result["runs"][name] = run(name, place, picoseconds, 5.0 if chosen.full else 0.2)
+        keep()
+    about = {key: machine[key] for key in ("cpu", "commit", "date")}
+    own: list[dict[str, Any]] = []
+    for where, step, count in AGAIN * chosen.full:
+        for seed in range(2, 2 + count):
+            own.append(run("villin", where, picoseconds / 2, 5.0, step, seed) | about)
+            result["again"] = [*own, *others]
+            keep()
+    return result
 
 
 def main() -> None:

@@ -423,7 +423,7 @@ def main(arguments: list[str]) -> None:
     if "--alanine" in arguments:
         folder = Path(arguments[arguments.index("--alanine") + 1])
         folder.mkdir(parents=True, exist_ok=True)
-        found = {"alanine dipeptide": alanine(folder, 24, 36, 240_000, 1)}
+        found = {"alanine dipeptide": alanine(folder, 24, 36, 480_000, 1)}
         if "--again" in arguments:
             first = json_files.read(RESULT)["alanine dipeptide"]
             found = {"alanine dipeptide": first | {"again": again(first, found["alanine dipeptide"])}}
