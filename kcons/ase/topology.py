@@ -51,7 +51,8 @@ GUESSED = "bonds_guessed_for"
 _STALE = 1.6
 #: ASE's unit of time in ps, to the power that velocities need.
 PS = 1000 * units.fs
-_REMEDY = "put pairs of atoms into atoms.info['bonds']"
+_ITEM = f"atoms.info[{BONDS!r}]"
+_REMEDY = f"put pairs of atoms into {_ITEM}"
 
 
 @with_options
@@ -191,12 +192,12 @@ def _given_bonds(atoms: Atoms) -> tuple[IntArray, bool]:
     given = atoms.info.get(BONDS)
     if given is None:
         return np.zeros((0, 2), np.int64), False
-    bonds = check_pairs(given)
+    bonds = check_pairs(given, item=_ITEM)
     said, stamp = str(atoms.info.get(GUESSED, "")), _stamp(atoms, bonds)
     guessed = said[:8] == stamp[:8]  # otherwise the bonds are somebody's since
     if guessed and said != stamp:
         return np.zeros((0, 2), np.int64), True
-    return check_pairs(bonds, len(atoms)), guessed
+    return check_pairs(bonds, len(atoms), _ITEM), guessed
 
 
 def mend_elements(atoms: Atoms) -> int:

@@ -113,7 +113,7 @@ def check_multipliers(multipliers: FloatArray, n_rows: int) -> None:
         raise InputError(f"multipliers must be a writable float64 array of shape ({n_rows},)", item="multipliers")
 
 
-def check_pairs(pairs: ArrayLike, n_atoms: int | None = None) -> IntArray:
+def check_pairs(pairs: ArrayLike, n_atoms: int | None = None, item: str = "bonds") -> IntArray:
     """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet.
 
     Raises
@@ -124,20 +124,20 @@ def check_pairs(pairs: ArrayLike, n_atoms: int | None = None) -> IntArray:
     try:
         table = np.asarray(pairs)
     except ValueError as error:
-        raise InputError(f"bonds must be pairs of atoms, shape (n, 2): {error}", item="bonds") from None
+        raise InputError(f"{item} must be pairs of atoms, shape (n, 2): {error}", item=item) from None
     if table.size == 0:
         return np.zeros((0, 2), np.int64)
     if table.ndim != 2 or table.shape[1] != 2 or not np.issubdtype(table.dtype, np.integer):
-        raise InputError(f"bonds must be pairs of atoms, shape (n, 2), not {table.dtype} {table.shape}", item="bonds")
+        raise InputError(f"{item} must be pairs of atoms, shape (n, 2), not {table.dtype} {table.shape}", item=item)
     bad = (table < 0).any(axis=1) | (table[:, 0] == table[:, 1])
     if n_atoms is not None:
         bad |= (table >= n_atoms).any(axis=1)
     if bad.any():
         i, j = table[int(np.argmax(bad))].tolist()
         raise InputError(
-            f"bonds has the pair ({i}, {j}); give two different atoms of 0 to "
+            f"{item} has the pair ({i}, {j}); give two different atoms of 0 to "
             + ("the last" if n_atoms is None else f"{n_atoms - 1}"),
-            item="bonds",
+            item=item,
             atoms=[i, j],
         )
     return table.astype(np.int64)

@@ -68,7 +68,7 @@ def test_bonds_that_name_no_atoms_are_refused(pair):
     atoms = molecule("H2O")
     atoms.info["bonds"] = [pair]
     for asked in (bonds_of, snapshot_of, constraints_of):
-        with pytest.raises(InputError, match=r"bonds has the pair"):
+        with pytest.raises(InputError, match=r"atoms\.info\['bonds'\] has the pair"):
             asked(atoms)
 
 
@@ -209,5 +209,5 @@ def test_bonds_that_are_no_pairs_are_refused(bonds):
     atoms = molecule("CH3OH")
     atoms.info["bonds"] = bonds
     for asked in (bonds_of, snapshot_of, constraints_of):
-        with pytest.raises(InputError, match="bonds must be pairs"):
+        with pytest.raises(InputError, match=r"atoms\.info\['bonds'\] must be pairs"):
             asked(atoms)

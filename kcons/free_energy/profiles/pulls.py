@@ -27,6 +27,8 @@ from kcons.thermostats import Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
 FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03
+#: Works over kT that differ by less are the same, but for rounding.
+_NO_SPREAD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,8 @@ def pull_free_energy(
     back = _works(backward, "backward", kT)
     drawn_back = back[rng.integers(len(back), size=(_SAMPLES, len(back)))]
     jarzynski_back, cumulant_back = _both(back, drawn_back)
-    found = pymbar().bar(ahead, back)
-    overlap = _overlap(ahead, back, float(found["Delta_f"]))
+    difference, error = _bar(ahead, back)
+    overlap = _overlap(ahead, back, difference)
     if overlap < _OVERLAP:
         warnings.warn(
             f"forward and backward pulls have an overlap of {overlap:.1%}; below {_OVERLAP:.0%} errors are not to be "
@@ -148,12 +150,12 @@ def pull_free_energy(
         _times(cumulant, kT),
         kT * bias,
         effective,
-        kT * float(ahead.mean() - found["Delta_f"]),
+        kT * float(ahead.mean() - difference),
         _times(jarzynski_back, -kT),
         _times(cumulant_back, -kT),
         -kT * _bias(back),
         _effective(back),
-        _times(Estimate(float(found["Delta_f"]), float(found["dDelta_f"])), kT),
+        _times(Estimate(difference, error), kT),
         crossing,
         overlap,
     )
@@ -221,6 +223,21 @@ def work_profile(
     rng, n = generator_of(seed, "seed"), len(reduced)
     sampled = np.array([along(rng.integers(n, size=n)) for _ in range(_SAMPLES)])
     return thermal_energy * along(slice(None)), thermal_energy * sampled.std(axis=0, ddof=1)
+
+
+def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
+    """Difference and its error, over kT. Works without a spread, where pymbar finds no bounds, are the difference."""
+    if max(np.ptp(ahead), np.ptp(back)) > _NO_SPREAD:
+        found = pymbar().bar(ahead, back)
+        return float(found["Delta_f"]), float(found["dDelta_f"])
+    lost = float(ahead.mean() + back.mean())
+    if abs(lost) > _NO_SPREAD:
+        raise InputError(
+            f"all works are the same each way, and {lost:g} kT are lost; start each pull from another state of "
+            "equilibrium",
+            item="forward",
+        )
+    return float(ahead.mean() - back.mean()) / 2, 0.0
 
 
 def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:

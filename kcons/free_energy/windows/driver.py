@@ -76,6 +76,7 @@ class Windows:
         self.both_sides, self.seed = both_sides, seed_number(seed)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
+        self._failed: dict[str, str] = {}
         self.approach = approach_of(approach, sampler.names)
         mine: dict[str, Any] = {"coordinates": list(sampler.names), "system": sampler.digest}
         mine |= {"settings": asdict(self.settings), "seed": self.seed, "both sides": both_sides}
@@ -137,7 +138,10 @@ class Windows:
         jobs = [job for number in numbers for job in self._jobs(number)]
         missing = [job for job in jobs if not self._finished(job)]
         failed = self._sample(missing, executor, workers, progress, len(jobs))
-        return self.result(failed)
+        for job in jobs:
+            self._failed.pop(job.name, None)
+        self._failed |= failed
+        return self.result()
 
     def improve(
         self,
@@ -163,14 +167,15 @@ class Windows:
         at_once : int
             How many are added before the profile is looked at again: as many as there are workers.
         """
-        result = self.result({})
+        result = self.result()
         while len(self._targets) < most:
             profile = result.profile
             if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
                 break
             places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
+            known = len(self._failed)
             result = self._run(self._added([place] for place in places), executor, workers, progress)
-            if result.failed:
+            if len(self._failed) > known:
                 break
         return result
 
@@ -307,11 +312,11 @@ class Windows:
 
     # -- what came of it ------------------------------------------------------------------------
 
-    def result(self, failed: Mapping[str, str]) -> FreeEnergy:
+    def result(self) -> FreeEnergy:
         """Mean forces of the windows that are finished."""
         kT = BOLTZMANN * self.settings.temperature / self.sampler.kJ
         found = []
-        problems = dict(failed)
+        problems = dict(self._failed)
         for number, target in enumerate(self._targets):
             sides, seconds = dict[str, MeanForce](), 0.0
             for job in self._jobs(number):

@@ -134,6 +134,15 @@ def test_weights_at_both_ends():
     assert found == pytest.approx(-KT * np.log(np.exp(logs).mean(axis=0) / np.exp(logs[:, 0]).mean()), abs=1e-12)
 
 
+def test_works_of_no_spread():
+    """Pulls of what nothing resists: the difference is the work. Works that contradict each other have none."""
+    same = pull_free_energy(np.full(6, 2.0), np.full(7, -2.0), thermal_energy=0.5)
+    assert same.bar.value == pytest.approx(2.0) and same.bar.error == 0
+    assert same.overlap == pytest.approx(1.0) and same.dissipated == pytest.approx(0.0, abs=1e-12)
+    with pytest.raises(InputError, match="the same each way, and 1 kT are lost"):
+        pull_free_energy(np.full(6, 2.0), np.full(6, -1.0), thermal_energy=1.0)
+
+
 def test_pulls_that_do_not_overlap_are_warned_of():
     one, other = normal(np.random.default_rng(8), 50, 12 * KT)
     with pytest.warns(UserWarning, match=r"overlap of 0\.\d%"):

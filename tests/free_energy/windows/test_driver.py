@@ -121,6 +121,16 @@ def test_windows_are_added_where_they_help(tmp_path):
     assert errors.max() <= 0.5 < found.profile.error.max() and len(found.windows) == 5
 
 
+def test_windows_that_failed_before_others_are_added_are_still_told_of(tmp_path):
+    windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1], fails=("window-0001-up",))
+    with ThreadPoolExecutor(1) as executor:
+        better = windows.improve(0.5, 20, executor=executor)
+        assert len(first.failed) == 1 and better.failed == first.failed and better.profile.error.max() <= 0.5
+        windows.sampler.fails = ()
+        assert windows.run([PLACES[0]], executor=executor).failed == first.failed  # not what was tried again
+        assert windows.run(np.linspace(-np.pi, np.pi, 6)[:-1], executor=executor).failed == {}
+
+
 def test_a_killed_worker_changes_nothing(tmp_path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
