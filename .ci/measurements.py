@@ -129,7 +129,7 @@ TABLE = {
     ),
     "openmm_compare.json": Measurement(OPENMM, script("11_openmm_compare"), 7),
     "openmm_constraints.json": Measurement(OPENMM, script("08_openmm_constraints"), 5),
-    "openmm_four_femtoseconds.json": Measurement(OPENMM, script("24_openmm_four_femtoseconds"), None),
+    "openmm_four_femtoseconds.json": Measurement(OPENMM, script("24_openmm_four_femtoseconds"), 50),
     "openmm_heavy_hydrogens.json": Measurement(OPENMM, script("25_openmm_heavy_hydrogens"), 4),
     "openmm_platforms.json": Measurement(
         OPENMM,
