@@ -226,10 +226,10 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
     from multiprocessing import get_context
 
     from openmm import app
-    from pymbar import FES, timeseries
+    from pymbar import FES
     from scipy.interpolate import CubicSpline
 
-    from kcons.free_energy import OpenMMWindows, Windows
+    from kcons.free_energy import OpenMMWindows, Windows, weighted_mean
 
     pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
     system = _system(pdb)
@@ -251,11 +251,12 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         series = list(pool.map(umbrella, places, range(first), [each] * first, [str(folder)] * first))
     kT = 0.00831446261815324 * TEMPERATURE
-    # MBAR's errors are those of independent samples.
-    series = [
-        each[:: int(np.ceil(timeseries.statistical_inefficiency((each - place + np.pi) % (2 * np.pi))))]
+    # MBAR's errors are those of independent samples; the same rule as for the windows says how far apart these are.
+    apart = [
+        weighted_mean((each - place + np.pi) % (2 * np.pi)).inefficiency[0]
         for each, place in zip(series, places, strict=True)
     ]
+    series = [each[:: int(np.ceil(every))] for each, every in zip(series, apart, strict=True)]
     phi = np.concatenate(series)
     away = (phi[None] - places[:, None] + np.pi) % (2 * np.pi) - np.pi
     fes = FES(STIFFNESS / 2 * away**2 / kT, [len(s) for s in series])

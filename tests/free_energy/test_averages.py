@@ -39,6 +39,16 @@ def test_intervals_cover_as_often_as_they_say(memory):
     assert np.mean([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
 
 
+def test_a_small_slow_part_counts():
+    """A hundredth of the variance with a memory of 300 samples: noise hides it in the autocorrelation (g of 1.3)."""
+    rng, memory = np.random.default_rng(1), np.exp(-1 / 300)
+    exact = 1 + 2 * 0.01 / 1.01 * memory / (1 - memory)
+    series = (rng.standard_normal(30_000) + 0.1 * ar1(rng, 30_000, memory)[:, 0] for _ in range(60))
+    found = [weighted_mean(values) for values in series]
+    assert within(found, 0.0, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.15)
+    assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.3)
+
+
 def test_weights_that_belong_to_the_values():
     """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
     rng, b = np.random.default_rng(2), 1.0
