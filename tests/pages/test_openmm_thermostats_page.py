@@ -26,6 +26,8 @@ def test_results_are_those_of_a_full_run():
     assert speed["kcons Isokinetic"] >= 0.85 and speed["kcons rattle"] >= 0.9
     assert speed["kcons RattleIntegrator"] >= 0.97
     assert speed["kcons Langevin"] >= 0.9 * speed["LangevinMiddleIntegrator"]
+    simulation = results["measurements"]["simulation"]["rows"]
+    assert len(simulation) == 8 and all(row["quotient"] <= 1.02 for row in simulation.values())
 
 
 def test_a_long_step_of_langevin_is_no_worse_than_a_short_one_of_openmm():
