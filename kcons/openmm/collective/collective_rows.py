@@ -11,6 +11,7 @@ from openmm import unit
 
 from kcons.constraints import Formula
 from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.internal import MOST_TURNED
 from kcons.errors import (
     CertificateError,
     InputError,
@@ -123,6 +124,11 @@ class CollectiveRows(ReportedRows):
                 raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
             if isinstance(rate, str) and not isinstance(target, str):
                 raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
+            if isinstance(target, float) and self._units[k] == unit.radian and abs(target) > MOST_TURNED:
+                raise InputError(
+                    f"target of row {k} is {target:g}, more than three turns, and in radian; give {target:g} * unit.degrees",
+                    item="target",
+                )
             if scale is not None and not scale > 0:
                 raise InputError(f"scale of row {k} is {scale}; give a positive number", item="scale")
         known = _context_parameters(system, [row.force for row in given])
