@@ -245,7 +245,7 @@ class Dihedral(Constraint):
             self.refuse_input(
                 np.abs(target) > MOST_TURNED,
                 first_row,
-                lambda k: f"target {target[k]:g} is more than three turns, and in radian; give np.radians({target[k]:g})",
+                lambda k: f"target {target[k]:g} is over three turns, and in radian; give np.radians({target[k]:g})",
                 "target",
             )
         F, G, H = _legs(r)

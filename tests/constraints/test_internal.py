@@ -136,7 +136,7 @@ def test_angle_in_degrees_is_refused():
 @pytest.mark.parametrize("target", [60.0, -60.0])
 def test_dihedral_in_degrees_is_refused(target):
     item = Dihedral([[0, 1, 2, 3]], target)
-    with pytest.raises(InputError, match=rf"{target:g} is more than three turns, and in radian; give np\.radians"):
+    with pytest.raises(InputError, match=rf"{target:g} is over three turns, and in radian; give np\.radians"):
         ConstraintSet([item], twisted(30.0)[0], np.ones(4))
     ConstraintSet([Dihedral([[0, 1, 2, 3]], lambda t: target + t)], twisted(30.0)[0], np.ones(4))
 

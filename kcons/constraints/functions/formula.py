@@ -76,7 +76,8 @@ class Formula(Constraint):
     ) -> None:
         if not isinstance(parameters, Mapping | None):
             raise InputError(
-                f"Formula: parameters is {parameters!r:.60}; give numbers by name, such as {{'k': 2.0}}", item="parameters"
+                f"Formula: parameters is {parameters!r:.60}; give numbers by name, such as {{'k': 2.0}}",
+                item="parameters",
             )
         given = dict(parameters or {})
         self.formula, self.period, self.names = formula, period, list(given)

@@ -126,7 +126,7 @@ class CollectiveRows(ReportedRows):
                 raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
             if isinstance(target, float) and self._units[k] == unit.radian and abs(target) > MOST_TURNED:
                 raise InputError(
-                    f"target of row {k} is {target:g}, more than three turns, and in radian; give {target:g} * unit.degrees",
+                    f"target of row {k} is {target:g}, over three turns, and in radian; give {target:g} * unit.degrees",
                     item="target",
                 )
             if scale is not None and not scale > 0:

@@ -461,6 +461,6 @@ def test_constraints_of_kcons_are_sent_to_hold():
 
 def test_a_torsion_in_degrees_is_refused():
     for target in (60.0, -60):
-        with pytest.raises(InputError, match=rf"more than three turns, and in radian; give {target:g} \* unit\.degrees"):
+        with pytest.raises(InputError, match=rf"over three turns, and in radian; give {target:g} \* unit\.degrees"):
             CollectiveRows(chain_system(), Row(dihedral(0, 1, 2, 3), target))
     assert CollectiveRows(chain_system(), Row(dihedral(0, 1, 2, 3), 60 * openmm.unit.degrees)).n_rows == 1
