@@ -391,8 +391,8 @@ def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[
     InputError
         Something else.
     """
-    single = isinstance(given, Constraint | str) or not isinstance(given, Iterable)
-    found: list[Any] = [given] if single else [*given]
+    found: list[Any]
+    found = [given] if isinstance(given, Constraint | str) or not isinstance(given, Iterable) else list(given)
     for entry in found:
         if not isinstance(entry, Constraint):
             raise InputError(f"{item} has {entry!r}, which is no kcons constraint; see kcons.constraints", item=item)
