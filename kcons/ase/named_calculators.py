@@ -15,10 +15,13 @@ import numpy as np
 from ase import Atoms
 
 from kcons.ase.binding import FORCES_ONLY
-from kcons.errors import InputError, UnsupportedError, did_you_mean
+from kcons.errors import InputError, KconsError, UnsupportedError, did_you_mean
 
 #: Endings of files that say what a calculator computes, not what it writes.
 WEIGHTS = (".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz", ".xml", ".eam", ".alloy", ".yace")
+
+#: Calculators of ASE that take any setting, and know those alone that they list.
+_FULLY_LISTED = ("emt", "lj", "morse")
 
 
 def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> Any:
@@ -45,14 +48,18 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
                 raise UnsupportedError(f"{name} needs tblite: python -m pip install tblite")
             from tblite.ase import TBLite
 
+            _refuse_unknown(name, TBLite, given)
             return TBLite(**{"method": f"GFN{name[-1]}-xTB", "verbosity": 0, **given})
         if ":" in name:
             module, _, attribute = name.partition(":")
             return getattr(import_module(module), attribute)(**given)
         from ase.calculators.calculator import get_calculator_class
 
-        return get_calculator_class(name)(**given)
-    except UnsupportedError:
+        kind = get_calculator_class(name)
+        if name in _FULLY_LISTED:
+            _refuse_unknown(name, kind, given)
+        return kind(**given)
+    except KconsError:
         raise
     except Exception as error:
         from ase.calculators.names import names
@@ -64,6 +71,15 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
             "name (emt, lj, ...), and MODULE:NAME for what makes any other",
             item="calculator",
         ) from error
+
+
+def _refuse_unknown(name: str, kind: Any, given: Mapping[str, Any]) -> None:
+    known = list(kind.default_parameters)
+    for key in given:
+        if key not in known:
+            raise InputError(
+                f"{name} has no setting {key!r}{did_you_mean(key, known)}; there are {', '.join(known)}", item=key
+            )
 
 
 def described(calculator: Any, atoms: Atoms) -> list[Any]:

@@ -150,10 +150,8 @@ def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) ->
         row, miss = worst
         finite_array(x, held.n_atoms, "position")
         target = held.target(time)[row]
-        turns = held.row_name(row).partition("(")[0].endswith(("Angle", "Dihedral"))
-        degrees = f", in radian: is it {target:.6g} degrees?" if turns and abs(target) > 2 * np.pi else ""
         raise InputError(
-            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {target:.6g}{degrees}); moving "
+            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {target:.6g}); moving "
             "them from there would turn the correction into velocity. Use constrain(..., project=True) or "
             "Constraints.restore(atoms) first",
             item="positions",

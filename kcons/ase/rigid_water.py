@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from ase import Atoms
 from ase.geometry import find_mic
+from ase.neighborlist import neighbor_list
 from numpy.typing import NDArray
 
 from kcons.ase.topology import require_atoms
@@ -41,7 +42,7 @@ def rigid_water(
     Raises
     ------
     InputError
-        No `Atoms`, or no water in it; a geometry or a reach that is none.
+        No `Atoms`, no water in it, or one whose hydrogens do not follow; a geometry or a reach that is none.
     """
     require_atoms(atoms)
     reach = positive(reach, "reach")
@@ -62,6 +63,17 @@ def rigid_water(
             "no water found: an oxygen must be followed by its two hydrogens in the list of atoms "
             f"(within {reach:g} Angstrom); reorder the atoms, or hold them with Distance",
             item="atoms",
+        )
+    rest = np.setdiff1d(np.flatnonzero(np.isin(z, (1, 8))), oxygen[:, None] + np.arange(3))
+    others = Atoms(z[rest], atoms.positions[rest], cell=atoms.cell, pbc=atoms.pbc)
+    hydrogens = np.bincount(neighbor_list("i", others, {("O", "H"): reach}), minlength=len(rest))
+    missed = rest[(z[rest] == 8) & (hydrogens == 2)]
+    if len(missed):
+        raise InputError(
+            f"the water of oxygen {missed[0]} is not followed by its two hydrogens in the list of atoms ({len(missed)} "
+            "such in all), and would stay flexible; reorder the atoms, or hold all by constraints_of(atoms, 'none')",
+            item="atoms",
+            atoms=missed,
         )
     if isinstance(geometry, str):
         if geometry.lower() != "tip3p":

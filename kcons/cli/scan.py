@@ -124,23 +124,17 @@ def _scan(chosen: argparse.Namespace) -> int:
 
 def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Constraint:
     from kcons import constraints
+    from kcons.free_energy.windows.plan_file import counted
 
     kind: Any = getattr(constraints, family.capitalize())
-    return kind([_counted(atoms, chosen)])
-
-
-def _counted(atoms: Sequence[int], chosen: argparse.Namespace) -> list[int]:
-    """Numbers from 0."""
-    numbers = [a - chosen.count_from for a in atoms]
-    if numbers and min(numbers) < 0:
-        raise InputError(f"there is no atom {min(atoms)}; atoms are counted from {chosen.count_from}", item="atoms")
-    return numbers
+    return kind([counted(atoms, chosen.count_from)])
 
 
 def _held(chosen: argparse.Namespace) -> list[Constraint]:
     from kcons.constraints import FixedAtoms
+    from kcons.free_energy.windows.plan_file import counted
 
-    held: list[Constraint] = [FixedAtoms(_counted(chosen.fix, chosen))] if chosen.fix else []
+    held: list[Constraint] = [FixedAtoms(counted(chosen.fix, chosen.count_from))] if chosen.fix else []
     return held + [_made(f, atoms, chosen) for f in FAMILIES for atoms in getattr(chosen, f"hold_{f}")]
 
 

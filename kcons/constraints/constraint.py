@@ -391,7 +391,8 @@ def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[
     InputError
         Something else.
     """
-    found = [given] if isinstance(given, Constraint) else list(given) if isinstance(given, Iterable) else [given]
+    found: list[Any]
+    found = [given] if isinstance(given, Constraint | str) or not isinstance(given, Iterable) else list(given)
     for entry in found:
         if not isinstance(entry, Constraint):
             raise InputError(f"{item} has {entry!r}, which is no kcons constraint; see kcons.constraints", item=item)

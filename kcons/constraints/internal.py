@@ -18,6 +18,8 @@ from kcons.errors import SingularGeometryError
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
 COLLINEAR = 1e-7
+#: Fixed dihedrals beyond are degrees that were taken for radian.
+MOST_TURNED = 6 * np.pi
 
 
 class Distance(Constraint):
@@ -174,7 +176,7 @@ class Dihedral(Constraint):
     quads : array_like of int, shape (n_rows, 4)
         Atoms i, j, k, l of each row; j-k is the axis.
     target : float, array_like, callable of time, MovingTarget or None
-        Angle held, in radian; any value, the nearest image modulo 2 pi counts.
+        Angle held, in radian; the nearest image modulo 2 pi counts. A number beyond three turns is refused.
 
     Notes
     -----
@@ -238,6 +240,14 @@ class Dihedral(Constraint):
         if self.n_rows == 0:
             return
         _refuse_coincident(self, r, first_row)
+        if self.target is not None and not self.moving:
+            target = self.target_at(time)
+            self.refuse_input(
+                np.abs(target) > MOST_TURNED,
+                first_row,
+                lambda k: f"target {target[k]:g} is over three turns, and in radian; give np.radians({target[k]:g})",
+                "target",
+            )
         F, G, H = _legs(r)
         for first, second, three in ((F, G, slice(0, 3)), (H, G, slice(1, 4))):
             straight = norm(cross(first, second)) < COLLINEAR * norm(first) * norm(second)

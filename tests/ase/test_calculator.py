@@ -194,3 +194,17 @@ def test_too_far_off():
     atoms.positions[1] += [3.0, 0, 0]
     with pytest.raises(ConvergenceError):
         atoms.get_forces()
+
+
+class Unnamed(EMT):
+    """Has a free energy in its results that it does not list, as tblite does."""
+
+    implemented_properties = ["energy", "forces"]
+
+
+def test_a_result_that_the_inner_calculator_does_not_list():
+    atoms, calculator = ethanol(Unnamed())
+    BFGS(atoms, logfile=None).run(fmax=0.05, steps=3)
+    calculator.restore(atoms)
+    assert "free_energy" in calculator.inner.results
+    assert calculator.results["energy"] == calculator.inner.results["energy"]

@@ -299,8 +299,8 @@ def test_targets_are_taken_at_first_use_and_kept():
 
 def test_explicit_target_off_is_refused_with_its_size():
     atoms = molecule("H2O")
-    with pytest.raises(InputError, match=r"held at 109\.5, in radian: is it 109\.5 degrees"):
-        constrain(molecule("H2O2"), Dihedral([[2, 0, 1, 3]], 109.5))
+    with pytest.raises(InputError, match=r"109\.5 is over three turns, and in radian; give np\.radians\(109\.5\)"):
+        constrain(molecule("H2O2"), Dihedral([[2, 0, 1, 3]], 109.5), project=True)
     with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.031.*project=True"):
         constrain(atoms, Distance([0, 1], 1.0))
     assert atoms.constraints == []

@@ -34,6 +34,15 @@ def test_what_there_is_not_is_said(name, settings):
         named_calculator(name, settings)
 
 
+@pytest.mark.parametrize(("name", "typo", "known"), [("lj", "sgima", "sigma"), ("gfn2", "chrge", "charge")])
+def test_settings_that_nothing_reads_are_refused(name, typo, known):
+    if name == "gfn2":
+        pytest.importorskip("tblite")
+    with pytest.raises(InputError, match=rf"{name} has no setting '{typo}' .did you mean '{known}'"):
+        named_calculator(name, {typo: 1})
+    assert named_calculator(name, {known: 1}).parameters[known] == 1
+
+
 def test_what_tells_calculators_from_each_other():
     made = [
         LennardJones(epsilon=0.1),

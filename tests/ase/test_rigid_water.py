@@ -26,6 +26,15 @@ def test_rigid_water_spares_hydronium():
         rigid_water(atoms)
 
 
+def test_water_in_another_order_is_not_left_flexible():
+    atoms = molecule("H2O") + molecule("H2O")[[1, 0, 2]] + molecule("CH3OH")
+    atoms.positions[3:] += 10
+    atoms.positions[6:] += 10
+    with pytest.raises(InputError, match=r"water of oxygen 4 is not followed by its two hydrogens.*1 such in all"):
+        rigid_water(atoms)
+    assert constraints_of(atoms, "none", guess_bonds=True).constraint_set.n_rows == 6
+
+
 def test_rigid_water_across_a_boundary():
     atoms = molecule("H2O")
     atoms.set_cell([8, 8, 8])

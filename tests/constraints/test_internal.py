@@ -133,6 +133,14 @@ def test_angle_in_degrees_is_refused():
         ConstraintSet([Angle([[0, 1, 2]], 109.5)], bent(100.0)[0], np.ones(3))
 
 
+@pytest.mark.parametrize("target", [60.0, -60.0])
+def test_dihedral_in_degrees_is_refused(target):
+    item = Dihedral([[0, 1, 2, 3]], target)
+    with pytest.raises(InputError, match=rf"{target:g} is over three turns, and in radian; give np\.radians"):
+        ConstraintSet([item], twisted(30.0)[0], np.ones(4))
+    ConstraintSet([Dihedral([[0, 1, 2, 3]], lambda t: target + t)], twisted(30.0)[0], np.ones(4))
+
+
 @pytest.mark.parametrize("degrees", [-179.99, -90.0, -1e-3, 0.0, 30.0, 180.0])
 def test_dihedral_has_the_sign_of_iupac(degrees):
     found = np.degrees(Dihedral([[0, 1, 2, 3]]).measure(twisted(degrees), 0.0)[0])

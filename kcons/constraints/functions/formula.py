@@ -74,6 +74,11 @@ class Formula(Constraint):
         *,
         period: float | None = None,
     ) -> None:
+        if not isinstance(parameters, Mapping | None):
+            raise InputError(
+                f"Formula: parameters is {parameters!r:.60}; give numbers by name, such as {{'k': 2.0}}",
+                item="parameters",
+            )
         given = dict(parameters or {})
         self.formula, self.period, self.names = formula, period, list(given)
         for name in self.names:
@@ -81,7 +86,7 @@ class Formula(Constraint):
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
         alone = width_of(formula, self.names, self.of_speeds) == 1
-        super().__init__(np.asarray(atoms).reshape(-1, 1) if alone else atoms, target)
+        super().__init__(np.reshape(atoms, (-1, 1)) if alone and np.ndim(atoms) < 2 else atoms, target)
         columns = []
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
@@ -224,7 +224,7 @@ def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, 
             item="coordinate",
         )
     (family,) = families
-    item = FAMILIES[family]([[atom - first for atom in entry[family]]])
+    item = FAMILIES[family]([counted(entry[family], first)])
     both = [key for key in ("from", "to", "windows") if key in entry and "values" in entry]
     if both:
         raise InputError(f"coordinate {name} has values and {both[0]}; give one of them", item="coordinate")
@@ -255,6 +255,19 @@ def _pulls(entry: Mapping[str, Any], coordinates: Mapping[str, Constraint], targ
     if np.array_equal(found["start"], found["end"]):
         raise InputError("[pulls] begin where they end; give from and to", item="pulls")
     return found
+
+
+def counted(atoms: Sequence[int], first: int) -> list[int]:
+    """Numbers from 0 of atoms that are counted from `first`.
+
+    Raises
+    ------
+    InputError
+        One below the first.
+    """
+    if len(atoms) and min(atoms) < first:
+        raise InputError(f"there is no atom {min(atoms)}; atoms are counted from {first}", item="atoms")
+    return [atom - first for atom in atoms]
 
 
 def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]) -> FloatArray:
@@ -299,11 +312,11 @@ def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Co
     first = structure.get("count_from", 0)
     rows: list[Constraint] = []
     if "fixed" in held:
-        rows.append(FixedAtoms([atom - first for atom in held["fixed"]]))
+        rows.append(FixedAtoms(counted(held["fixed"], first)))
     if "distances" in held:
-        rows.append(Distance(np.array(held["distances"], dtype=np.int64) - first))
+        rows.append(Distance([counted(pair, first) for pair in held["distances"]]))
     if "constrain" in held:
-        rows += constraints_of(atoms, held["constrain"])
+        rows += constraints_of(atoms, held["constrain"], guess_bonds=True)
     make = partial(named_calculator, forces["calculator"], forces.get("settings", {}))
     make()  # complain before windows are begun
     return AseWindows(atoms, make, coordinates, rows)

@@ -14,6 +14,7 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
+from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnreadableError
@@ -121,7 +122,7 @@ class ConstraintCheck(AnalysisBase):
         if isinstance(constraints, ConstraintSet):
             given: tuple[Constraint, ...] = constraints.constraints
         else:
-            given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+            given = tuple(constraints_in(constraints, "constraints"))
         if not sum(item.n_rows for item in given):
             raise InputError(
                 "there are no constraints to check; select others, or look at the bonds of the topology",
@@ -189,7 +190,7 @@ class ConstraintCheck(AnalysisBase):
         Raises
         ------
         InputError
-            There are no frames; threads where the file cannot be read by them.
+            There are no such frames; threads where the file cannot be read by them.
         UnreadableError
             The first frame cannot be read.
         KconsError
@@ -222,11 +223,16 @@ class ConstraintCheck(AnalysisBase):
 
     def _first(self, chosen: dict[str, Any]) -> int:
         if chosen["frames"] is None:
+            if chosen["step"] == 0:
+                raise InputError("step is 0; give another whole number", item="step")
             numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
             first = numbers[0] if len(numbers) else None
         else:
             asked = np.asarray(chosen["frames"])
             asked = np.flatnonzero(asked) if asked.dtype == bool else asked
+            count = self._trajectory.n_frames
+            for frame in asked[(asked < -count) | (asked >= count)]:
+                raise InputError(f"{self.asked.names[0]}: there is no frame {frame}; it has {count}", item="frames")
             first = int(asked[0]) if len(asked) else None
         if first is None:
             raise InputError(
@@ -331,7 +337,15 @@ class ConstraintCheck(AnalysisBase):
 
     @property
     def check(self) -> CheckResult:
-        """What was found."""
+        """What was found.
+
+        Raises
+        ------
+        InputError
+            Nothing was looked at yet.
+        """
+        if "check" not in self.results:
+            raise InputError("nothing was looked at yet; call run() first", item="check")
         result: CheckResult = self.results.check
         return result
 

@@ -42,7 +42,7 @@ from kcons.openmm.carried.requirements import (
 from kcons.openmm.integrator.part import NEAR, Miss
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import virtual_sites
+from kcons.openmm.integrator.system_checks import require_context, virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
@@ -200,6 +200,7 @@ class CarriedConstraints(CarriedProgram):
         UnsupportedError
             Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
         """
+        require_context(context)
         system, precision = context.getSystem(), Precision.of(context)
         refuse_single_precision(precision)
         _check_system(system, self._engine, precision, alone=self.alone)
@@ -297,6 +298,7 @@ class CarriedConstraints(CarriedProgram):
         context.setVelocities(self.motion.project_velocities(x, v, time=time))
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+        require_context(context)
         state = context.getState(positions=True, velocities=True)
         if self._engine.cell is not None:
             self._engine.follow_cell(state)

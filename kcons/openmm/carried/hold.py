@@ -129,8 +129,8 @@ def hold(
         As `CarriedConstraints`; a barostat that would break a row. The System was not changed.
     """
     given = constraints_in(constraints, "constraints")
-    n = system.getNumParticles()
     table = _table(system)
+    n = system.getNumParticles()
     chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
@@ -177,6 +177,10 @@ class _Table:
 
 
 def _table(system: openmm.System) -> _Table:
+    if not isinstance(system, openmm.System):
+        raise InputError(
+            f"system is a {type(system).__name__}; give the openmm.System, as createSystem makes it", item="system"
+        )
     n = system.getNumParticles()
     first, second, long = [], [], []
     for k in range(system.getNumConstraints()):

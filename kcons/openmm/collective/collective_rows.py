@@ -11,6 +11,7 @@ from openmm import unit
 
 from kcons.constraints import Formula
 from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.internal import MOST_TURNED
 from kcons.errors import (
     CertificateError,
     InputError,
@@ -56,7 +57,7 @@ class CollectiveRows(ReportedRows):
     ----------
     system : openmm.System
         The Forces that are not part of it are added, each in a free group. Make the Simulation or Context afterwards.
-    rows : sequence of Row, openmm.Force or Formula
+    rows : Row, openmm.Force or Formula, or a sequence of them
         What to hold. A Force alone is held at the value found at `positions`; `each_term` makes one Force of each
         term or variable of a larger one; a `kcons.constraints.Formula` is one of each of its rows.
     positions : array_like or Quantity, shape (n_particles, 3), optional
@@ -89,7 +90,7 @@ class CollectiveRows(ReportedRows):
     def __init__(
         self,
         system: openmm.System,
-        rows: Sequence[Row | openmm.Force | int | Formula],
+        rows: Row | openmm.Force | int | Formula | Sequence[Row | openmm.Force | int | Formula],
         *,
         positions: object | None = None,
         box: Sequence | None = None,
@@ -123,6 +124,11 @@ class CollectiveRows(ReportedRows):
                 raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
             if isinstance(rate, str) and not isinstance(target, str):
                 raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
+            if isinstance(target, float) and self._units[k] == unit.radian and abs(target) > MOST_TURNED:
+                raise InputError(
+                    f"target of row {k} is {target:g}, over three turns, and in radian; give {target:g} * unit.degrees",
+                    item="target",
+                )
             if scale is not None and not scale > 0:
                 raise InputError(f"scale of row {k} is {scale}; give a positive number", item="scale")
         known = _context_parameters(system, [row.force for row in given])
@@ -215,8 +221,10 @@ class CollectiveRows(ReportedRows):
         Raises
         ------
         InputError
-            No number; a target that is a context parameter (set that); a rate for a row made without.
+            No number, no such row; a target that is a context parameter (set that); a rate for a row made without.
         """
+        if row not in range(self.n_rows):
+            raise InputError(f"there is no row {row}; rows are numbered from 0 to {self.n_rows - 1}", item="row")
         if isinstance(self._targets[row], str):
             raise InputError(f"the target of row {row} is the context parameter {self._targets[row]}", item="target")
         of = self._units[row]
@@ -316,7 +324,11 @@ def _parts_of(system: openmm.System, force: openmm.Force | int, row: int) -> lis
     if isinstance(force, int):
         return forces_in(system, force)
     if not isinstance(force, openmm.Force):
-        raise InputError(f"row {row}: {force!r} is neither a Force nor the number of a force group", item="force")
+        raise InputError(
+            f"row {row}: {force!r} is neither a Force nor the number of a force group; kcons.openmm.hold holds "
+            "constraints of kcons",
+            item="force",
+        )
     return [force]
 
 

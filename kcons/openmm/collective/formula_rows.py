@@ -15,8 +15,8 @@ from kcons.openmm.collective.row_forces import Row
 _POWERS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "^"}
 
 
-def as_rows(given: Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
-    """Whatever stands for rows as rows; a formula is one for each of its rows.
+def as_rows(given: Row | openmm.Force | int | Formula | Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
+    """Whatever stands for rows, or for one, as rows; a formula is one for each of its rows.
 
     Raises
     ------
@@ -24,7 +24,7 @@ def as_rows(given: Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
         A formula, or its target, that moves with the time; one of velocities.
     """
     rows: list[Row] = []
-    for each in given:
+    for each in [given] if isinstance(given, Row | openmm.Force | int | Formula) else given:
         if isinstance(each, Formula):
             rows += formula_rows(each)
         else:

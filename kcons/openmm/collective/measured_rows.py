@@ -11,11 +11,12 @@ import numpy as np
 import openmm
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import SingularGeometryError
+from kcons.errors import InputError, SingularGeometryError
 from kcons.openmm.collective.row_forces import energy
 from kcons.openmm.integrator.guard import positions_of, velocities_of, width
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.states.hearing import listeners
+from kcons.openmm.integrator.system_checks import require_context
 from kcons.openmm.quantities import masses_of
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class MeasuredRows:
     """
 
     def __init__(self, rows: GroupRows, context: openmm.Context) -> None:
+        require_context(context)
         self.rows = rows
         self.context = context
         self._numbers = range(rows.n_rows)
@@ -250,8 +252,17 @@ def _names(integrator: openmm.CustomIntegrator) -> list[str]:
     return [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
 
 
+def require_holder(integrator: openmm.CustomIntegrator) -> None:
+    """Refuse a Context, a Simulation or whatever else is given for the integrator that holds the rows."""
+    if not isinstance(integrator, openmm.CustomIntegrator):
+        raise InputError(
+            f"integrator is a {type(integrator).__name__}; give the integrator that holds the rows", item="integrator"
+        )
+
+
 def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
     """All global variables of the integrator by name."""
+    require_holder(integrator)
     return {name: integrator.getGlobalVariable(k) for k, name in enumerate(_names(integrator))}
 
 

@@ -10,6 +10,7 @@ import openmm
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.openmm.collective.context_rows import ContextRows
+from kcons.openmm.collective.measured_rows import require_holder
 from kcons.openmm.collective.row_program import GroupRows
 from kcons.openmm.integrator.part import Miss
 from kcons.steppers.compositions import Composition
@@ -93,6 +94,7 @@ class ReportedRows(GroupRows):
         return self._read(integrator, "work")
 
     def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
+        require_holder(integrator)
         return np.array([integrator.getGlobalVariableByName(self._of(name, k)) for k in range(self.n_rows)])
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:

@@ -182,7 +182,13 @@ def worst_length(context: openmm.Context) -> tuple[str, float]:
         The constraint, its particles and its length; of a System without constraints, words that say so.
     off : float
         The part of its length by which it is off; 0 without constraints.
+
+    Raises
+    ------
+    InputError
+        No Context.
     """
+    require_context(context)
     rows = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
     if not rows.n_rows:
         return "no constraint of the System", 0.0
@@ -207,6 +213,19 @@ def _settled(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:
                 sides = {around[j], around[k], neighbours[j][k]}
                 held[[i, j, k]] = len(sides) < 3
     return held[pairs[:, 0]] & held[pairs[:, 1]] if len(pairs) else np.zeros(0, bool)
+
+
+def require_context(context: openmm.Context) -> None:
+    """Refuse a Simulation, an integrator or whatever else is given for a Context.
+
+    Raises
+    ------
+    InputError
+    """
+    if not isinstance(context, openmm.Context):
+        raise InputError(
+            f"context is a {type(context).__name__}; give the Context, such as simulation.context", item="context"
+        )
 
 
 def groups_of(force: openmm.Force) -> set[int]:

@@ -13,8 +13,6 @@ from openmm_systems import DATA
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.free_energy import AseWindows, OpenMMWindows, read_plan
 
-#: Files of coordinates have no bonds.
-pytestmark = pytest.mark.filterwarnings("ignore:.*bonds.*guessed")
 PLAN = """
 [structure]
 file = "methanol.xyz"
@@ -176,6 +174,12 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
             'file = "methanol.xyz"\ncount_from = -1',
             "count_from of .structure. is -1; give 0 or 1",
         ),
+        (
+            'file = "methanol.xyz"',
+            'file = "methanol.xyz"\ncount_from = 1',
+            "there is no atom 0; atoms are counted from 1",
+        ),
+        ("sigma = 1.0", "sgima = 1.0", r"lj has no setting 'sgima' .did you mean 'sigma'"),
         ("seed = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
         ("processes = 3", "processes = 0", r"processes of \[workers\] is 0"),
         ("[workers]", "[pull]\ncount = 5\n[workers]", r"unknown key 'pull' .did you mean 'pulls'"),

@@ -276,6 +276,22 @@ def test_bad_options(water):
         checked(water["dcd"], Distance([[0, 120]], 1.0))
 
 
+def test_wrong_frames_names_and_order(water):
+    universe = loaded(water["dcd"])
+    with pytest.raises(InputError, match=r"constraints has 'hbonds', which is no kcons constraint"):
+        ConstraintCheck(universe, "hbonds")
+    check = ConstraintCheck(universe, Distance([[0, 1]]))
+    with pytest.raises(InputError, match=r"nothing was looked at yet; call run\(\) first"):
+        _ = check.check
+    count = universe.trajectory.n_frames
+    for frame in (count, -count - 1):
+        with pytest.raises(InputError, match=f"there is no frame {frame}; it has {count}"):
+            check.run(frames=[0, frame])
+    with pytest.raises(InputError, match="step is 0"):
+        check.run(step=0)
+    assert check.run(frames=[0, count - 1]).check.status
+
+
 @pytest.mark.parametrize("targets", ["given", "first"])
 def test_bodies_longer_than_half_the_cell_are_seen_whole(tmp_path, targets):
     """Corners of a hexagon, 2.8 Å across, in a cell of 5 Å: nearest images of opposite corners are 2.2 Å apart."""

@@ -351,3 +351,13 @@ def test_alanine_dipeptide(constraints: object) -> None:
     others = np.array([tuple(sorted(b)) not in held for b in bonds.tolist()])
     assert np.abs(length[1] - length[0])[others].max(initial=0.0) < 0.002
     assert np.abs(length[1] - length[0]).max() < 0.004  # to the lengths of the force field
+
+
+def test_what_is_no_system_and_no_context() -> None:
+    for call in (take_constraints, lambda given: hold(given, Distance([[0, 3]]), PEPTIDE.positions)):
+        with pytest.raises(InputError, match=r"system is a Topology; give the openmm\.System"):
+            call(PEPTIDE.topology)
+    rows = hold(peptide(None), Distance([[0, 3]]), PEPTIDE.positions)
+    for call in (rows.check, rows.multipliers, rows.report, rows.apply_positions, rows.apply_velocities):
+        with pytest.raises(InputError, match=r"context is a VerletIntegrator; give the Context"):
+            call(openmm.VerletIntegrator(0.001))

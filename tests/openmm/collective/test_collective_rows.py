@@ -432,3 +432,35 @@ def test_a_context_of_another_system_is_refused():
 def test_numbers_that_are_none(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         CollectiveRows(chain_system(), [Row(bond(0, 3), 0.3)], **wrong)
+
+
+# -- something else in place of a Context, an integrator, a row -------------------------------------------------
+
+
+def test_what_is_no_context_and_no_integrator():
+    system = chain_system()
+    rows = CollectiveRows(system, bond(0, 3), positions=CHAIN)  # one row alone
+    assert rows.n_rows == 1
+    integrator = ProjectedIntegrator(0.001, parts=[rows])
+    context = context_of(system, integrator, CHAIN)
+    for call in (rows.values, rows.targets, rows.rank, rows.multipliers_at, rows.check, rows.restore):
+        with pytest.raises(InputError, match=r"context is a ProjectedIntegrator; give the Context"):
+            call(integrator)
+    for call in (rows.multipliers, rows.mean_multipliers, rows.work, lambda given: rows.set_target(given, 0, 0.3)):
+        with pytest.raises(InputError, match="integrator is a Context; give the integrator that holds the rows"):
+            call(context)
+    for row in (1, -1):
+        with pytest.raises(InputError, match=f"there is no row {row}; rows are numbered from 0 to 0"):
+            rows.set_target(integrator, row, 0.3)
+
+
+def test_constraints_of_kcons_are_sent_to_hold():
+    with pytest.raises(InputError, match=r"kcons\.openmm\.hold holds constraints of kcons"):
+        CollectiveRows(chain_system(), [Distance([[0, 3]])], positions=CHAIN)
+
+
+def test_a_torsion_in_degrees_is_refused():
+    for target in (60.0, -60):
+        with pytest.raises(InputError, match=rf"over three turns, and in radian; give {target:g} \* unit\.degrees"):
+            CollectiveRows(chain_system(), Row(dihedral(0, 1, 2, 3), target))
+    assert CollectiveRows(chain_system(), Row(dihedral(0, 1, 2, 3), 60 * openmm.unit.degrees)).n_rows == 1

@@ -15,7 +15,7 @@ from openmm_systems import (
     total_energy,
 )
 
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator, worst_length
 from kcons.openmm.integrator.system_checks import SystemRows, refuse_motion_remover
 
@@ -138,6 +138,8 @@ def test_the_length_that_is_off_most(kind):
     assert "constraint 1 of the System (particles 1 and 2, 0.2 nm)" in name and off == pytest.approx(0.05)
     context.applyConstraints(1e-8)
     assert worst_length(context)[1] < 1e-7
+    with pytest.raises(InputError, match=r"context is a System; give the Context, such as simulation\.context"):
+        worst_length(system)
 
 
 def test_without_constraints_no_length_is_off():

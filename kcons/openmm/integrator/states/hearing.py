@@ -12,7 +12,8 @@ kcons, alone or within a CompoundIntegrator; for all others they do what they di
 * `LocalEnergyMinimizer.minimize`: knows no parts, so that `minimizeEnergy` of the integrator takes its place.
 * `updateParametersInContext` of all Forces: forces that were kept are old.
 * `Simulation.step`, `runForClockTime`: nobody sees the end of a call of `step` within them (see `calls`), and what an
-  integrator has put off there is made before the Context answers.
+  integrator has put off there is made before the Context answers. Integrators of OpenMM are refused where the System
+  carries rows that are held.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from openmm import app
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.states.calls import settle
+from kcons.openmm.integrator.system_checks import refuse_forgotten_parts
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -221,6 +223,8 @@ def _update_parameters(original: Callable[..., None], force: openmm.Force, conte
 def _in_simulation(original: Callable[..., None], simulation: app.Simulation, *args: Any, **kwargs: Any) -> None:
     context = simulation.context
     heard = listeners(context)
+    if not heard:
+        refuse_forgotten_parts(context.getSystem(), ())
     for one in heard:
         one.unseen = True
     try:

@@ -36,6 +36,7 @@ from tests.openmm.integrator.states.test_settings import (
     thermostatted,
 )
 
+REFERENCE = openmm.Platform.getPlatformByName("Reference")
 PARTS = {"collective": row_at, "carried": carried_at, "surface": on_a_sphere}
 parts = pytest.mark.parametrize("make", PARTS.values(), ids=PARTS)
 
@@ -275,6 +276,18 @@ def test_forgotten_parts_are_refused(how, kind, copied):
         context = started(system, again, X)
         again.step(1)
     del context
+
+
+@pytest.mark.parametrize("how", ["hold", "collective", "formula"])
+def test_a_simulation_by_an_integrator_of_openmm_is_refused(how):
+    made = app.Simulation(app.Topology(), _held(how), openmm.VerletIntegrator(1e-3), REFERENCE)
+    made.context.setPositions(X)
+    with pytest.raises(InputError, match=r"parts=\[rows\]"):
+        made.step(1)
+    assert made.currentStep == 0
+    free = app.Simulation(app.Topology(), cluster(), openmm.VerletIntegrator(1e-3), REFERENCE)
+    free.context.setPositions(X)
+    free.step(1)
 
 
 # -- energies -------------------------------------------------------------------------------------------------
