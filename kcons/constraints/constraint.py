@@ -270,7 +270,7 @@ class Constraint(ABC):
         if isinstance(self.target, np.ndarray):
             copy.target = self.target[rows]
         elif self.target is not None:
-            copy.target = _selected(self.target, rows, self.n_rows)
+            copy.target = _selected(self.target, rows, self.n_rows, self.period)
         return copy
 
     def renumbered(self, new_index: IntArray) -> Self:
@@ -337,11 +337,11 @@ class Constraint(ABC):
         return f"<{what}>"
 
 
-def _selected(target: MovingTarget, rows: IntArray, n_rows: int) -> MovingTarget:
+def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
     return MovingTarget(
         value=lambda t: target.at(t, n_rows)[rows],
-        rate=lambda t: target.rate_at(t, n_rows)[rows],
-        acceleration=lambda t: target.acceleration_at(t, n_rows)[rows],
+        rate=lambda t: target.rate_at(t, n_rows, period)[rows],
+        acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
     )
 
 

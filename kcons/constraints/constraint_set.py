@@ -234,7 +234,7 @@ class ConstraintSet(InCell):
             u = velocities[c.atoms]
             if not c.holonomic:
                 return _rate_at(c, time) - c.curvature(r, u, time)
-            second = c.target.acceleration_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else 0.0
+            second = c.target.acceleration_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else 0.0
             return second - c.acceleration_terms(r, u, time)
 
         return self._of_rows(x, b_of)
@@ -341,7 +341,7 @@ class ConstraintSet(InCell):
 
 def _check_derivatives(item: Constraint, time: float) -> None:
     """Refuse derivatives of a moving target that contradict it: atoms would leave it without another sign."""
-    said = item.target.contradiction(time, item.n_rows) if isinstance(item.target, MovingTarget) else ""
+    said = item.target.contradiction(time, item.n_rows, item.period) if isinstance(item.target, MovingTarget) else ""
     if said:
         raise InputError(
             f"{item!r}: the target contradicts itself: {said}; correct it, or leave the derivatives out", item="target"
@@ -384,7 +384,7 @@ def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> N
 
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:
-    return c.target.rate_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
+    return c.target.rate_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
 
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:

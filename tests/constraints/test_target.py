@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons import ConstraintSet
-from kcons.constraints import Distance
+from kcons.constraints import Dihedral, Distance
 from kcons.constraints.target import MovingTarget, as_target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
 
@@ -101,3 +101,16 @@ def test_a_distance_that_moves_below_zero_is_refused_there():
     assert held.target(0.9) == pytest.approx(0.1)
     with pytest.raises(InputError, match=r"Distance\(0, 1\): target -0.5 is not positive at t = 1.5"):
         held.target(1.5)
+
+
+def test_a_target_that_jumps_by_its_period_does_not_move_faster_there():
+    x = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, -1.0, 0.0]])
+
+    def turning(t):
+        return (0.5 * t**2 + t + 2 * np.pi) % (2 * np.pi) - np.pi
+
+    for target in (turning, MovingTarget(turning, lambda t: t + 1)):
+        item = Dihedral([[0, 1, 2, 3], [3, 2, 1, 0]], target).select([0])
+        held = ConstraintSet(item, x, np.ones(4))
+        assert held.velocity_target(x) == pytest.approx([1.0], rel=1e-11)
+        assert held.acceleration_target(x, 0 * x) == pytest.approx([1.0], rel=1e-9)

@@ -12,7 +12,7 @@ from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.periodic.images import Images, image_error
 from kcons.constraints.periodic.one_piece import lattice_of, lined_up, make_whole, minimum_image, spanning_tree
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
 
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
@@ -218,10 +218,7 @@ class InCell:
     def _sigma(self, c: Constraint, r: FloatArray, time: float) -> FloatArray:
         if not c.holonomic:
             return np.zeros(c.n_rows)
-        difference = c.measure(r, time) - c.target_at(time)
-        if c.period is not None:
-            difference -= c.period * np.round(difference / c.period)
-        return difference
+        return nearest_image(c.measure(r, time) - c.target_at(time), c.period)
 
     def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
         return joined([function(c) for c in self.constraints])

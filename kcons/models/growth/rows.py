@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
+from kcons.constraints.target import WRONG, contradicted
 from kcons.errors import ConstraintError, InputError
 from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate, taken
 
 #: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
 START_TOLERANCE = 1e-10
-#: Relative deviation of a given derivative from differences that counts as a mistake.
-_WRONG = 0.01
 EPSILON = float(np.finfo(np.float64).eps)
 
 
@@ -151,7 +150,7 @@ class HolonomicRow(Row):
         """
         if self._gradient is not None:
             given, found = self.gradient(p) * p.x, relative_differences(self.measure, p) * p.x
-            wrong = np.abs(given - found) > _WRONG * np.abs(found).sum(axis=0)
+            wrong = ~(np.abs(given - found) <= WRONG * np.abs(found).sum(axis=0))
             if wrong.any():
                 k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
                 raise InputError(
@@ -167,8 +166,7 @@ class HolonomicRow(Row):
     def _compare_rates(self, p: Populations, given: FloatArray | float, said: str) -> None:
         """Compare a derivative in time at the state `p` with differences, where these are smooth."""
         coarse, fine = (self._rate_by_differences(p, h) for h in (1e-3, 5e-4))
-        size = np.maximum(np.abs(given), np.abs(fine)) + 1e-9 * self._magnitude(p)
-        wrong = (np.abs(fine - given) > _WRONG * size) & (np.abs(fine - coarse) <= 0.1 * _WRONG * size)
+        wrong = contradicted(given, coarse, fine, 1e-9 * self._magnitude(p))
         if np.any(wrong):
             k = int(np.argmax(wrong))
             values = [float(np.broadcast_to(v, np.shape(wrong)).ravel()[k]) for v in (given, fine)]
