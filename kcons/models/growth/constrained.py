@@ -13,14 +13,22 @@ Horvath & Kneller, J. Chem. Phys. 131, 171101 (2009). Bott & Duffin, Trans. AMS 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints import projection
-from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError, SingularGeometryError
+from kcons.constraints.arguments import refuse_other
+from kcons.errors import (
+    ConstraintError,
+    ContradictionError,
+    ConvergenceError,
+    InputError,
+    NonFiniteError,
+    SingularGeometryError,
+)
 from kcons.models.growth import orthogonal_rows
 from kcons.models.growth.model import FloatArray, GrowthModel, Populations
 from kcons.models.growth.rows import EPSILON, Row
@@ -62,8 +70,12 @@ class ConstrainedGrowth:
     """
 
     def __init__(self, model: GrowthModel, rows: Sequence[Row] | Row = ()) -> None:
+        refuse_other(model, GrowthModel, "model", "a kcons.models.growth.GrowthModel")
+        refuse_other(rows, (Row, Iterable), "rows", "rows of kcons.models.growth, or an empty list")
         self.model = model
         self.rows: tuple[Row, ...] = (rows,) if isinstance(rows, Row) else tuple(rows)
+        for row in self.rows:
+            refuse_other(row, Row, "rows", "rows of kcons.models.growth, such as TotalPopulation(n)")
         if len(self.rows) > model.n:
             raise ConstraintError(
                 f"{len(self.rows)} rows for {model.n} species: give at most as many rows as there are species",
@@ -115,6 +127,14 @@ class ConstrainedGrowth:
     def _held(self, p: Populations, drift: FloatArray | None = None) -> orthogonal_rows.Solution:
         """z where the rows allow one."""
         found = self._solve(p, self.model.drift(p) if drift is None else drift)
+        if not np.all(np.isfinite(found.z)):
+            for number, row in enumerate(self.rows):
+                if not (np.all(np.isfinite(row.gradient(p))) and np.all(np.isfinite(row.rate(p)))):
+                    raise NonFiniteError(
+                        f"row {number} ({row.name}) has a coefficient or a rate that is not finite at "
+                        f"t = {float(np.max(p.time)):.8g}; mend its functions, or end the run before (an event)",
+                        item="rows",
+                    )
         self._refuse(found, p)
         return found
 

@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import check_call, numbers, whole_number
 from kcons.constraints.target import WRONG, contradicted
 from kcons.errors import ConstraintError, InputError
 from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate, taken
@@ -104,6 +104,9 @@ class HolonomicRow(Row):
         vectorized: bool = False,
         name: str = "holonomic row",
     ) -> None:
+        check_call(f"{name}: function", function, ("t", "x"))
+        check_call(f"{name}: gradient", gradient, ("t", "x"))
+        check_call(f"{name}: time_derivative", time_derivative, ("t", "x"))
         self._function = function
         self._gradient = gradient
         self._time_derivative = time_derivative
@@ -270,9 +273,7 @@ class TotalPopulation(LinearRow):
     """sum_i x_i = target (notes eqs. 143, 144), for n species; left out, the target is the sum at the start."""
 
     def __init__(self, n: int, target: float | Callable[[float], tuple[float, float]] | None = None) -> None:
-        if n < 1:
-            raise InputError(f"there is at least one species, not {n}", item="n")
-        super().__init__(np.ones(n), target, name="total population")
+        super().__init__(np.ones(whole_number(n, "n")), target, name="total population")
 
 
 class VelocityRow(Row):
@@ -296,7 +297,7 @@ class VelocityRow(Row):
         vectorized: bool = False,
         name: str = "velocity row",
     ) -> None:
-        self._coefficients = coefficients
+        self._coefficients = coefficients if callable(coefficients) else numbers(coefficients, "coefficients").copy()
         self._rate = rate if callable(rate) else _number(rate, "rate")
         self.vectorized = vectorized
         self.name = name
@@ -304,7 +305,7 @@ class VelocityRow(Row):
     def gradient(self, p: Populations) -> FloatArray:
         if callable(self._coefficients):
             return evaluate(self._coefficients, p, len(p.x), self.vectorized, f"coefficients of {self.name}")
-        c = numbers(self._coefficients, "coefficients")
+        c = self._coefficients
         if c.shape != (len(p.x),):
             raise InputError(f"{self.name}: {c.shape} coefficients for {len(p.x)} species", item="coefficients")
         return np.broadcast_to(c.reshape(-1, *(1,) * (p.x.ndim - 1)), p.x.shape)
