@@ -99,7 +99,7 @@ class ConstraintSet(InCell):
         x = contiguous(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
-        m = contiguous(masses, "masses")
+        m = contiguous(masses, "masses").copy()
         if m.shape != (len(x),):
             raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)

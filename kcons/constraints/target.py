@@ -125,7 +125,7 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
     if not np.all(np.isfinite(array)):
         row = int(np.flatnonzero(~np.isfinite(array.ravel()))[0])
         raise InputError(f"the target of row {row} is not finite: {array.ravel()[row]}", item="target")
-    return np.ascontiguousarray(np.broadcast_to(array, (rows,)))
+    return np.array(np.broadcast_to(array, (rows,)), order="C")
 
 
 # -- derivatives that a user gave, and central differences for those that were not given --------------
