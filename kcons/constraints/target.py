@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import check_call, numbers
+from kcons.constraints.arguments import check_call, has_units, numbers, positive
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -46,6 +46,8 @@ class MovingTarget:
             ("acceleration of the ", self.acceleration),
         ):
             check_call(f"the {name}target", function, ("t",))
+        if not has_units(self.time_step):
+            positive(self.time_step, "the time_step of the target")
 
     def with_time_step(self, time_step: float) -> MovingTarget:
         """The same with other steps of the differences."""
@@ -78,8 +80,8 @@ class MovingTarget:
             ("acceleration", self.acceleration, self.acceleration_at, self.rate_at, None),
         ):
             if given is not None:
-                functions = (partial(each, rows=rows) for each in (derivative, function))
-                found = contradiction(*functions, time, self.time_step, jump)
+                own, whole = partial(derivative, rows=rows), partial(function, rows=rows)
+                found = contradiction(own, whole, time, self.time_step, jump)
                 if found is not None:
                     return (
                         f"its {name} is {found.given:.6g} at t = {found.time:g}, but differences give {found.found:.6g}"
@@ -134,7 +136,9 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
 WRONG = 1e-3
 
 
-def contradicted(given: ArrayLike, coarse: FloatArray, fine: FloatArray, rounding: ArrayLike) -> NDArray[np.bool_]:
+def contradicted(
+    given: FloatArray | float, coarse: FloatArray, fine: FloatArray, rounding: FloatArray
+) -> NDArray[np.bool_]:
     """Where a given derivative is not what differences with a step and with half of it agree in.
 
     Sizes of `rounding` count as none.

@@ -89,6 +89,8 @@ def test_masses_are_needed():
     ("make", "message"),
     [
         (lambda: CenterOfMass([0, 1], axes=(0, 3)), "axes must be some of 0, 1, 2"),
+        (lambda: CenterOfMass([0, 1], axes=0), "axes must be some of 0, 1, 2"),
+        (lambda: CenterOfMass([0, 1], axes=(0.0, 1.0)), "axes must be some of 0, 1, 2"),
         (lambda: CenterOfMass([0, 1], axes=(0, 0)), "axes must be some of 0, 1, 2"),
         (lambda: CenterOfMass([[0, 1], [2]]), "groups have different sizes"),
         (lambda: CenterDistance([0, 1], [1, 2]), "names an atom twice"),

@@ -250,3 +250,8 @@ def test_what_was_given_may_be_changed_afterwards():
     assert np.array_equal(held.value(x), before[0])
     assert np.array_equal(held.jacobian(x).toarray(), before[1])
     assert held.masses.tolist() == [1.0, 2.0]
+
+
+def test_periodicity_is_one_flag_or_three():
+    with pytest.raises(InputError, match=r"pbc is \[True, False\]; give True, False, or one for each"):
+        ConstraintSet([], np.zeros((1, 3)), np.ones(1), cell=[5.0] * 3, pbc=[True, False])

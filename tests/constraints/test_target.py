@@ -114,3 +114,9 @@ def test_a_target_that_jumps_by_its_period_does_not_move_faster_there():
         held = ConstraintSet(item, x, np.ones(4))
         assert held.velocity_target(x) == pytest.approx([1.0], rel=1e-11)
         assert held.acceleration_target(x, 0 * x) == pytest.approx([1.0], rel=1e-9)
+
+
+@pytest.mark.parametrize("time_step", [0.0, np.nan, -0.02])
+def test_steps_of_differences_are_positive(time_step):
+    with pytest.raises(InputError, match=r"the time_step of the target is .*; give a positive number"):
+        MovingTarget(np.cos, time_step=time_step)

@@ -448,7 +448,7 @@ class Custom(FunctionRows):
             atoms, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
         )
         self.translation_invariant = bool(translation_invariant)
-        self.period = period
+        self.period = None if period is None else positive(period, "Custom: period")
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         out = np.empty((self.n_rows, *shape))

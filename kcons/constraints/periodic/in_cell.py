@@ -62,6 +62,8 @@ class InCell:
             raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
         if not np.all(np.isfinite(matrix)):
             raise InputError("cell has a NaN or infinity", item="cell")
+        if np.shape(pbc) not in ((), (3,)):
+            raise InputError(f"pbc is {pbc!r:.60}; give True, False, or one for each lattice vector", item="pbc")
         self.lattice = lattice_of(matrix, pbc)
 
     def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import ANGLE, LENGTH, numbers
-from kcons.constraints.target import FloatArray, nearest_image
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 
 #: Number of a value along each coordinate.
@@ -115,7 +115,9 @@ class Grid:
         """How far a point is from values, in steps of the grid."""
         square = 0.0
         for item, axis, v, w in zip(self.coordinates, self.values, self.at(point), place, strict=True):
-            d = nearest_image(v - w, item.period)
+            d = v - w
+            if item.period is not None:
+                d -= item.period * np.round(d / item.period)
             square += (d / (float(np.diff(axis).mean()) if len(axis) > 1 else 1.0)) ** 2
         return float(np.sqrt(square))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from constraint_cases import MASSES, TIME, hoop, saddle, scattered, spread
 
-from kcons.constraints import Custom, Dihedral, Distance, ImplicitSurface
+from kcons.constraints import Custom, Dihedral, Distance, Formula, ImplicitSurface
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
 from kcons.motion import Motion
@@ -155,3 +155,12 @@ def test_wrong_time_derivatives_are_found_before_they_move_anything(said, rate, 
     item = Custom(0, lambda r, t: r[0, 2] + r[0, 0] * np.sin(t), time_derivatives=derivatives)
     with pytest.raises(InputError, match=rf"time_derivatives give .* for {said} at .* differences give .*; correct"):
         ConstraintSet([item], scattered(0)[:1], np.ones(1), time=0.4)
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, "a"])
+def test_a_period_that_is_none_is_refused(period):
+    """With a period of NaN or 0 the residual of a formula counted as 0, and nothing was held."""
+    with pytest.raises(InputError, match=r"Custom: period is .*; give a positive number"):
+        Custom([0, 1], gap, period=period)
+    with pytest.raises(InputError, match=r"Formula: period is .*; give a positive number"):
+        Formula("x1", 0, period=period)
