@@ -341,7 +341,15 @@ class ConstraintSet(InCell):
 
 def _check_derivatives(item: Constraint, time: float) -> None:
     """Refuse derivatives of a moving target that contradict it: atoms would leave it without another sign."""
-    said = item.target.contradiction(time, item.n_rows, item.period) if isinstance(item.target, MovingTarget) else ""
+    if not isinstance(item.target, MovingTarget):
+        return
+    if item.target.unresolved(time, item.n_rows, item.period):
+        raise InputError(
+            f"{item!r}: the target changes within less than the step of its differences, {item.target.time_step:g}; "
+            "give its rate and acceleration, or MovingTarget(..., time_step=...), 1/50 of the time in which it changes",
+            item="time_step",
+        )
+    said = item.target.contradiction(time, item.n_rows, item.period)
     if said:
         raise InputError(
             f"{item!r}: the target contradicts itself: {said}; correct it, or leave the derivatives out", item="target"

@@ -88,6 +88,19 @@ class MovingTarget:
                     )
         return ""
 
+    def unresolved(self, time: float, rows: int, period: float | None = None) -> bool:
+        """Whether what is not given changes too fast for differences with `time_step`, at two times after `time`."""
+        if self.acceleration is not None:
+            return False
+        function, jump = (self.at, period) if self.rate is None else (self.rate_at, None)
+        for later in (5.0, 15.0):  # so far apart that one kink does not count
+            t, h = time + later * self.time_step, self.time_step
+            coarse, fine = (first_derivative(partial(function, rows=rows), t, step, jump) for step in (h, h / 2))
+            size = np.maximum(np.abs(coarse), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)).max(initial=0.0) / h
+            if not (np.abs(fine - coarse) > ROUGH * size).any():
+                return False
+        return True
+
 
 Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
 
@@ -134,6 +147,8 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
 
 #: By how much of its size a given derivative may differ from differences that are smooth: these have more digits.
 WRONG = 1e-3
+#: By how much of their size differences with a step and with half of it differ where neither says anything.
+ROUGH = 0.1
 
 
 def contradicted(

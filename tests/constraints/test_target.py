@@ -120,3 +120,18 @@ def test_a_target_that_jumps_by_its_period_does_not_move_faster_there():
 def test_steps_of_differences_are_positive(time_step):
     with pytest.raises(InputError, match=r"the time_step of the target is .*; give a positive number"):
         MovingTarget(np.cos, time_step=time_step)
+
+
+def test_a_target_too_fast_for_its_differences_is_refused():
+    x, masses = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.ones(2)
+
+    def fast(t):
+        return 1 + 0.01 * np.sin(300 * t)
+
+    for target in (fast, MovingTarget(fast, lambda t: 3 * np.cos(300 * t))):
+        with pytest.raises(InputError, match=r"changes within less than the step of its differences, 0\.02; give"):
+            ConstraintSet(Distance([[0, 1]], target), x, masses)
+    held = ConstraintSet(Distance([[0, 1]], MovingTarget(fast, time_step=1e-4)), x, masses)
+    assert held.velocity_target(x) == pytest.approx([3.0], rel=1e-9)
+    for kink in (0.0, 0.1, 0.3):
+        ConstraintSet(Distance([[0, 1]], lambda t, kink=kink: 1 + 0.01 * max(t - kink, 0.0)), x, masses)
