@@ -25,6 +25,12 @@ class MassWeighted(Constraint):
     singular_where: ClassVar[tuple[str, str] | None] = None
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.masses is not None:
+            with np.errstate(invalid="ignore"):
+                weightless = np.asarray(np.isnan(self.parameters()).any(axis=1))
+            self.refuse_input(
+                weightless, first_row, lambda k: "all atoms of a group have mass 0; give one of them a mass", "masses"
+            )
         if self.n_rows == 0 or self.singular_where is None:
             return
         what, remedy = self.singular_where
