@@ -25,6 +25,12 @@ class MassWeighted(Constraint):
     singular_where: ClassVar[tuple[str, str] | None] = None
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.masses is not None:
+            with np.errstate(invalid="ignore"):
+                weightless = np.asarray(np.isnan(self.parameters()).any(axis=1))
+            self.refuse_input(
+                weightless, first_row, lambda k: "all atoms of a group have mass 0; give one of them a mass", "masses"
+            )
         if self.n_rows == 0 or self.singular_where is None:
             return
         what, remedy = self.singular_where
@@ -65,9 +71,10 @@ class CenterOfMass(MassWeighted):
     directions: FloatArray
 
     def __init__(self, groups: ArrayLike, axes: Sequence[int] = (0, 1, 2), target: Target = None) -> None:
-        chosen = tuple(axes)
-        if not chosen or len(set(chosen)) != len(chosen) or not set(chosen) <= {0, 1, 2}:
-            raise InputError(f"CenterOfMass: axes must be some of 0, 1, 2, each once, not {chosen}", item="axes")
+        chosen = np.asarray(axes)
+        once = chosen.ndim == 1 and 0 < len(chosen) == len(set(chosen.tolist()))
+        if not once or chosen.dtype.kind not in "iu" or not set(chosen.tolist()) <= {0, 1, 2}:
+            raise InputError(f"CenterOfMass: axes must be some of 0, 1, 2, each once, not {axes!r:.60}", item="axes")
         try:
             table = np.atleast_2d(np.asarray(groups))
         except ValueError:
@@ -75,7 +82,7 @@ class CenterOfMass(MassWeighted):
                 "CenterOfMass: groups have different sizes; use one object for each size", item="groups"
             ) from None
         super().__init__(np.repeat(table, len(chosen), axis=0), target)
-        self._keep(directions=np.tile(np.eye(3)[list(chosen)], (self.n_rows // len(chosen), 1)))
+        self._keep(directions=np.tile(np.eye(3)[chosen], (self.n_rows // len(chosen), 1)))
 
     def _weights(self) -> FloatArray:
         m = self._mass_table()

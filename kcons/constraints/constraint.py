@@ -97,7 +97,7 @@ class Constraint(ABC):
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
 
     def _keep(self, **data: ArrayLike) -> None:
-        """Store data listed in `per_row`, broadcast to all rows."""
+        """Store data listed in `per_row`, broadcast to all rows; copies, which users cannot change."""
         for name, value in data.items():
             shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
             try:
@@ -113,7 +113,7 @@ class Constraint(ABC):
             if not np.all(np.isfinite(array)):
                 row = int(np.argwhere(~np.isfinite(array))[0][0])
                 raise InputError(f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row])
-            setattr(self, name, np.ascontiguousarray(array))
+            setattr(self, name, np.array(array, order="C"))
 
     def _settle(self) -> None:
         """Derive and check what follows from the per-row data; called once, when these were set."""
@@ -270,7 +270,7 @@ class Constraint(ABC):
         if isinstance(self.target, np.ndarray):
             copy.target = self.target[rows]
         elif self.target is not None:
-            copy.target = _selected(self.target, rows, self.n_rows)
+            copy.target = _selected(self.target, rows, self.n_rows, self.period)
         return copy
 
     def renumbered(self, new_index: IntArray) -> Self:
@@ -337,11 +337,11 @@ class Constraint(ABC):
         return f"<{what}>"
 
 
-def _selected(target: MovingTarget, rows: IntArray, n_rows: int) -> MovingTarget:
+def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
     return MovingTarget(
         value=lambda t: target.at(t, n_rows)[rows],
-        rate=lambda t: target.rate_at(t, n_rows)[rows],
-        acceleration=lambda t: target.acceleration_at(t, n_rows)[rows],
+        rate=lambda t: target.rate_at(t, n_rows, period)[rows],
+        acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
     )
 
 

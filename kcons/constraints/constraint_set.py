@@ -99,7 +99,7 @@ class ConstraintSet(InCell):
         x = contiguous(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
-        m = contiguous(masses, "masses")
+        m = contiguous(masses, "masses").copy()
         if m.shape != (len(x),):
             raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)
@@ -234,7 +234,7 @@ class ConstraintSet(InCell):
             u = velocities[c.atoms]
             if not c.holonomic:
                 return _rate_at(c, time) - c.curvature(r, u, time)
-            second = c.target.acceleration_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else 0.0
+            second = c.target.acceleration_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else 0.0
             return second - c.acceleration_terms(r, u, time)
 
         return self._of_rows(x, b_of)
@@ -341,7 +341,15 @@ class ConstraintSet(InCell):
 
 def _check_derivatives(item: Constraint, time: float) -> None:
     """Refuse derivatives of a moving target that contradict it: atoms would leave it without another sign."""
-    said = item.target.contradiction(time, item.n_rows) if isinstance(item.target, MovingTarget) else ""
+    if not isinstance(item.target, MovingTarget):
+        return
+    if item.target.unresolved(time, item.n_rows, item.period):
+        raise InputError(
+            f"{item!r}: the target changes within less than the step of its differences, {item.target.time_step:g}; "
+            "give its rate and acceleration, or MovingTarget(..., time_step=...), 1/50 of the time in which it changes",
+            item="time_step",
+        )
+    said = item.target.contradiction(time, item.n_rows, item.period)
     if said:
         raise InputError(
             f"{item!r}: the target contradicts itself: {said}; correct it, or leave the derivatives out", item="target"
@@ -384,7 +392,7 @@ def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> N
 
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:
-    return c.target.rate_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
+    return c.target.rate_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
 
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import check_call, numbers
+from kcons.constraints.arguments import check_call, has_units, numbers, positive
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
+Function: TypeAlias = Callable[[Any], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,8 @@ class MovingTarget:
             ("acceleration of the ", self.acceleration),
         ):
             check_call(f"the {name}target", function, ("t",))
+        if not has_units(self.time_step):
+            positive(self.time_step, "the time_step of the target")
 
     def with_time_step(self, time_step: float) -> MovingTarget:
         """The same with other steps of the differences."""
@@ -54,41 +57,49 @@ class MovingTarget:
         """Target at `time`, shape (rows,)."""
         return _per_row(self.value(time), rows, time)
 
-    def rate_at(self, time: float, rows: int) -> FloatArray:
-        """First time derivative, shape (rows,)."""
+    def rate_at(self, time: float, rows: int, period: float | None = None) -> FloatArray:
+        """First time derivative, shape (rows,), of values that may jump by a `period`."""
         if self.rate is not None:
             return _per_row(self.rate(time), rows, time)
         if self.acceleration is not None:
             raise InputError("a moving target with an acceleration also needs its rate", item="target")
-        return first_derivative(lambda t: self.at(t, rows), time, self.time_step)
+        return first_derivative(lambda t: self.at(t, rows), time, self.time_step, period)
 
-    def acceleration_at(self, time: float, rows: int) -> FloatArray:
-        """Second time derivative, shape (rows,)."""
+    def acceleration_at(self, time: float, rows: int, period: float | None = None) -> FloatArray:
+        """Second time derivative, shape (rows,), of values that may jump by a `period`."""
         if self.acceleration is not None:
             return _per_row(self.acceleration(time), rows, time)
         if self.rate is not None:
             return first_derivative(lambda t: self.rate_at(t, rows), time, self.time_step)
-        return second_derivative(lambda t: self.at(t, rows), time, self.time_step)
+        return second_derivative(lambda t: self.at(t, rows), time, self.time_step, period)
 
-    def contradiction(self, time: float, rows: int) -> str:
+    def contradiction(self, time: float, rows: int, period: float | None = None) -> str:
         """What a given derivative and differences say at two times soon after `time`, where they differ; or ''."""
-        said = ""
-        for name, given, function in (("rate", self.rate, self.at), ("acceleration", self.acceleration, self.rate_at)):
-            if given is None:
-                continue
-            for later in (1.3, 2.7):  # at one alone there may be a kink
-                t, h = time + later * self.time_step, 0.1 * self.time_step
-                derivative = _per_row(given(t), rows, t)
-                coarse, fine = (first_derivative_4(partial(function, rows=rows), t, step) for step in (h, h / 2))
-                size = np.maximum(np.abs(derivative), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)) / h
-                wrong = (np.abs(fine - derivative) > 0.01 * size) & (np.abs(fine - coarse) <= 1e-3 * size)
-                if not wrong.any():
-                    break
-                k = int(np.argmax(wrong))
-                said = f"its {name} is {derivative[k]:.6g} at t = {t:g}, but differences give {fine[k]:.6g}"
-            else:
-                return said
+        for name, given, derivative, function, jump in (
+            ("rate", self.rate, self.rate_at, self.at, period),
+            ("acceleration", self.acceleration, self.acceleration_at, self.rate_at, None),
+        ):
+            if given is not None:
+                own, whole = partial(derivative, rows=rows), partial(function, rows=rows)
+                found = contradiction(own, whole, time, self.time_step, jump)
+                if found is not None:
+                    return (
+                        f"its {name} is {found.given:.6g} at t = {found.time:g}, but differences give {found.found:.6g}"
+                    )
         return ""
+
+    def unresolved(self, time: float, rows: int, period: float | None = None) -> bool:
+        """Whether what is not given changes too fast for differences with `time_step`, at two times after `time`."""
+        if self.acceleration is not None:
+            return False
+        function, jump = (self.at, period) if self.rate is None else (self.rate_at, None)
+        for later in (5.0, 15.0):  # so far apart that one kink does not count
+            t, h = time + later * self.time_step, self.time_step
+            coarse, fine = (first_derivative(partial(function, rows=rows), t, step, jump) for step in (h, h / 2))
+            size = np.maximum(np.abs(coarse), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)).max(initial=0.0) / h
+            if not (np.abs(fine - coarse) > ROUGH * size).any():
+                return False
+        return True
 
 
 Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
@@ -129,40 +140,87 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
     if not np.all(np.isfinite(array)):
         row = int(np.flatnonzero(~np.isfinite(array.ravel()))[0])
         raise InputError(f"the target of row {row} is not finite: {array.ravel()[row]}", item="target")
-    return np.ascontiguousarray(np.broadcast_to(array, (rows,)))
+    return np.array(np.broadcast_to(array, (rows,)), order="C")
 
 
-# -- derivatives that a user did not give: central differences ---------------------------------------
+# -- derivatives that a user gave, and central differences for those that were not given --------------
+
+#: By how much of its size a given derivative may differ from differences that are smooth: these have more digits.
+WRONG = 1e-3
+#: By how much of their size differences with a step and with half of it differ where neither says anything.
+ROUGH = 0.1
+
+
+def contradicted(
+    given: FloatArray | float, coarse: FloatArray, fine: FloatArray, rounding: FloatArray
+) -> NDArray[np.bool_]:
+    """Where a given derivative is not what differences with a step and with half of it agree in.
+
+    Sizes of `rounding` count as none.
+    """
+    size = np.maximum(np.abs(given), np.abs(fine)) + rounding
+    return np.asarray((np.abs(fine - given) > WRONG * size) & (np.abs(fine - coarse) <= WRONG * size))
+
+
+class Contradiction(NamedTuple):
+    """The number in the array, the time, the derivative that was given there and the one found by differences."""
+
+    number: int
+    time: float
+    given: float
+    found: float
+
+
+def contradiction(
+    derivative: Function, function: Function, time: float, time_step: float, period: float | None = None
+) -> Contradiction | None:
+    """What a given derivative and differences of its function say soon after `time`; None where they agree."""
+    told = None
+    for later in (1.3, 2.7):  # at one alone there may be a kink
+        t, h = time + later * time_step, 0.1 * time_step
+        given = derivative(t)
+        coarse, fine = (first_derivative_4(function, t, step, period) for step in (h, h / 2))
+        wrong = contradicted(given, coarse, fine, 1e-9 * np.abs(function(t)) / h)
+        if not wrong.any():
+            return None
+        k = int(np.argmax(wrong))
+        told = Contradiction(k, t, float(given.flat[k]), float(fine.flat[k]))
+    return told
+
 
 # Weights of f(a + kh) -/+ f(a - kh), k = 1, 2, ...
 FIRST_4 = (2 / 3, -1 / 12)
 _FIRST_8 = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 _SECOND_8 = (8 / 5, -1 / 5, 8 / 315, -1 / 560)
 
-Function = Callable[[Any], FloatArray]
+
+def nearest_image(difference: FloatArray, period: float | None) -> FloatArray:
+    """A difference of two values of a coordinate with this period, or without one."""
+    return difference if period is None else difference - period * np.round(difference / period)
 
 
-def first_derivative_4(function: Function, at: Any, step: Any) -> FloatArray:
+def first_derivative_4(function: Function, at: Any, step: Any, period: float | None = None) -> FloatArray:
     """df/ds, error of order step^4; best at a step of about 1e-3 of the scale of f (12 digits)."""
-    return _first(function, at, step, FIRST_4)
+    return _first(function, at, step, FIRST_4, period)
 
 
-def first_derivative(function: Function, at: Any, step: Any) -> FloatArray:
+def first_derivative(function: Function, at: Any, step: Any, period: float | None = None) -> FloatArray:
     """df/ds, error of order step^8; best at a step of about 1/50 of the scale of f (13 digits)."""
-    return _first(function, at, step, _FIRST_8)
+    return _first(function, at, step, _FIRST_8, period)
 
 
-def second_derivative(function: Function, at: Any, step: Any) -> FloatArray:
+def second_derivative(function: Function, at: Any, step: Any, period: float | None = None) -> FloatArray:
     """d2f/ds2, error of order step^8; best at a step of about 1/50 of the scale of f (11 digits)."""
     centre = function(at)
     total = np.zeros_like(centre)
     for k, c in enumerate(_SECOND_8, start=1):
-        total = total + c * ((function(at + k * step) - centre) + (function(at - k * step) - centre))
+        later, earlier = (nearest_image(function(at + sign * k * step) - centre, period) for sign in (1, -1))
+        total = total + c * (later + earlier)
     return total / step**2
 
 
-def _first(function: Function, at: Any, step: Any, weights: tuple[float, ...]) -> FloatArray:
+def _first(function: Function, at: Any, step: Any, weights: tuple[float, ...], period: float | None) -> FloatArray:
     total: FloatArray | float = 0.0
     for k, c in enumerate(weights, start=1):
-        total = total + c * (function(at + k * step) - function(at - k * step))
+        total = total + c * nearest_image(function(at + k * step) - function(at - k * step), period)
     return np.asarray(total / step)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANY, SPEED, TAKES_TIME, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.target import FloatArray, Target, first_derivative_4
+from kcons.constraints.target import FloatArray, Target, contradiction, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
 from kcons.errors import InputError
 
@@ -353,6 +353,31 @@ class CustomVelocity(VelocityRows):
             first_row,
             lambda k, row: f"{row}: the coefficients are zero or not finite; move the atoms",
         )
+        if self.derivative is None:
+            return
+        # A wrong derivative would give wrong motion without any other sign.
+        along = self.length * unit(np.random.default_rng(0).normal(size=(self.width, 3)), "along")
+        for k in range(self.n_rows):
+            self._check_derivative(k, r[k], along, 0.01, time, first_row)
+            if self.time_dependent:
+                self._check_derivative(k, r[k], np.zeros_like(along), self.time_step, time, first_row)
+
+    def _check_derivative(
+        self, k: int, r: FloatArray, v: FloatArray, time_step: float, time: float, first_row: int
+    ) -> None:
+        def given(s: float) -> FloatArray:
+            return self._call(self.derivative, "derivative", k, r + s * v, v, time + s)  # type: ignore[arg-type]
+
+        found = contradiction(given, lambda s: self.row(k, r + s * v, time + s), 0.0, time_step)
+        if found is not None:
+            atom, axis = divmod(found.number, 3)
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: derivative gives {found.given:.6g} for {'xyz'[axis]} of its "
+                f"atom {self.atoms[k, atom]}, but differences of the coefficients give {found.found:.6g}; correct it, "
+                "or leave it out",
+                item="derivative",
+                atoms=self.atoms[k].tolist(),
+            )
 
 
 def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:

@@ -110,7 +110,7 @@ def compilable(held: ConstraintSet) -> bool:
 
 def _second(item: Constraint, time: float) -> FloatArray:
     if isinstance(item.target, MovingTarget):
-        return item.target.acceleration_at(time, item.n_rows)
+        return item.target.acceleration_at(time, item.n_rows, item.period)
     return np.zeros(item.n_rows)
 
 

@@ -10,11 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import TAKES_TIME, FloatArray, check_call, lent, numbers, positive
-from kcons.constraints.target import first_derivative, first_derivative_4, second_derivative
+from kcons.constraints.target import WRONG, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError, NonFiniteError
-
-#: Relative deviation of given derivatives from difference quotients that counts as a mistake.
-WRONG = 1e-3
 
 
 class MultibodyFunctions:

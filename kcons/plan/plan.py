@@ -17,7 +17,7 @@ from kcons.plan.rank import rank_of_shape, ranked, small_enough
 from kcons.plan.solver_table import solver_of
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.rank_revealing import RANK_TOLERANCE
+from kcons.solvers.rank_revealing import independent
 
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
@@ -176,10 +176,18 @@ class Plan:
             transposed = part.T.tocsr()
             used = np.flatnonzero((np.diff(transposed.indptr) > 0) & movable)
             transposed = transposed[used]
-            force = transposed @ lam[rows]
             if len(rows) <= DENSE_ROWS:
-                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=RANK_TOLERANCE)[0]
+                # What no force shows: the combinations of unit rows that vanish, in the units of the rows.
+                dense = np.zeros((max(transposed.shape), len(rows)))
+                dense[: transposed.shape[0]] = transposed.toarray()
+                size = np.linalg.norm(dense, axis=0)
+                size[size == 0] = 1.0
+                singular, directions = np.linalg.svd(dense / size, full_matrices=False)[1:]
+                hidden = directions[int(independent(singular).sum()) :].T
+                hidden = np.where(np.abs(hidden) > 1e-12, hidden, 0.0) / size[:, None]
+                lam[rows] -= hidden @ np.linalg.lstsq(hidden, lam[rows])[0]
             else:
+                force = transposed @ lam[rows]
                 from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
 
                 lam[rows] = lsqr(transposed, force, atol=1e-15, btol=1e-15, iter_lim=20 * len(rows))[0]
@@ -216,7 +224,9 @@ def make_plan(
     loose[pinned_rows] = False
     if loose.any():
         plan.loose = np.flatnonzero(loose)
-        plan.check_loose_rows(positions, time)
+        in_place = positions.copy()
+        in_place[pinned] = plan.pinned_targets(constraint_set.target(time))
+        plan.check_loose_rows(in_place, time)
         if not constraint_set.moving:
             plan.loose = None
     whole_positions = constraint_set.whole(positions)
@@ -283,7 +293,7 @@ def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:
 
 
 def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
-    """Fixed atoms and their rows."""
+    """Fixed atoms and their rows, the first three of those that name an atom again."""
     atoms: list[IntArray] = []
     rows: list[IntArray] = []
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
@@ -292,4 +302,6 @@ def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
             rows.append(start + np.arange(item.n_rows))
     if not atoms:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return np.concatenate(atoms), np.concatenate(rows)
+    every = np.concatenate(atoms)
+    first = np.sort(np.unique(every, return_index=True)[1])
+    return every[first], np.concatenate(rows).reshape(-1, 3)[first].ravel()

@@ -175,11 +175,11 @@ def run(
         state = stepper.start(system, state)  # type: ignore[attr-defined]  # the first state shown has a cell
     kept = Trajectory()
     rhythms = [(observer, every) for observer in observers] + ([(kept, record)] if record is not None else [])
-    for observer, _ in rhythms:
-        observer(state.shown())
     march = getattr(stepper, "march", None)
     done = 0
     try:
+        for observer, _ in rhythms:
+            observer(state.shown())
         while done < steps:
             # Until somebody looks.
             n = min([steps - done, *(rhythm - done % rhythm for _, rhythm in rhythms)])

@@ -14,7 +14,7 @@ from weakref import ReferenceType, ref
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_call, finite_array, lent, numbers, refuse_other
+from kcons.constraints.arguments import as_array, check_call, finite_array, finite_number, lent, numbers, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
@@ -238,10 +238,10 @@ class System:
         taken = ("x", "v", "t") if velocity_dependent else ("x", "t")
         check_call("force", force, taken, "; velocity_dependent says whether it gets velocities v")
         check_call("potential", potential, ("x", "t"))
-        if not far >= 1:
-            raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.motion = motion
-        self.far = float(far)
+        self.far = far if far == math.inf else finite_number(far, "far")
+        if not self.far >= 1:
+            raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.force, self.potential = force, potential
         self.velocity_dependent = velocity_dependent and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
@@ -318,8 +318,7 @@ class System:
         OverdeterminedError
             The rows leave no degree of freedom, and the velocities are not what they prescribe.
         """
-        if not math.isfinite(time):
-            raise InputError(f"time is {time}", item="time")
+        time = finite_number(time, "time")
         x = finite_array(positions, self.n_atoms, "positions")
         given = velocities is not None
         v = finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)

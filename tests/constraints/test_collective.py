@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from constraint_cases import MASSES, scattered
 
-from kcons.constraints import CenterDistance, CenterOfMass, RadiusOfGyration, RowKind
+from kcons.constraints import CenterDistance, CenterOfMass, FixedAtoms, RadiusOfGyration, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
 
@@ -89,6 +89,8 @@ def test_masses_are_needed():
     ("make", "message"),
     [
         (lambda: CenterOfMass([0, 1], axes=(0, 3)), "axes must be some of 0, 1, 2"),
+        (lambda: CenterOfMass([0, 1], axes=0), "axes must be some of 0, 1, 2"),
+        (lambda: CenterOfMass([0, 1], axes=(0.0, 1.0)), "axes must be some of 0, 1, 2"),
         (lambda: CenterOfMass([0, 1], axes=(0, 0)), "axes must be some of 0, 1, 2"),
         (lambda: CenterOfMass([[0, 1], [2]]), "groups have different sizes"),
         (lambda: CenterDistance([0, 1], [1, 2]), "names an atom twice"),
@@ -108,3 +110,12 @@ def test_undefined_gradients_are_refused():
         ConstraintSet([RadiusOfGyration([3, 4])], x, np.ones(5))
     with pytest.raises(InputError, match="target -1 is not positive"):
         ConstraintSet([RadiusOfGyration([0, 1], -1.0)], x, np.ones(5))
+
+
+@pytest.mark.parametrize(
+    "row", [CenterOfMass([0, 1]), CenterDistance([2], [0, 1]), RadiusOfGyration([0, 1])], ids=lambda row: row.family
+)
+def test_groups_without_any_mass_are_refused(row):
+    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    with pytest.raises(InputError, match="all atoms of a group have mass 0; give one of them a mass"):
+        ConstraintSet([FixedAtoms([0, 1]), row], x, [0.0, 0.0, 1.0])

@@ -237,3 +237,21 @@ def test_moving_is_known():
     assert ConstraintSet([Distance([[0, 1]], lambda t: 1 + t)], x, MASSES).moving
     assert ConstraintSet([CASES["ImplicitSurface moving"]()], x, MASSES).moving
     assert not ConstraintSet([LinearCombination([0], [[1, 0, 0]])], x, MASSES).moving
+
+
+def test_what_was_given_may_be_changed_afterwards():
+    target, center, coefficients = np.array([1.0]), np.array([[0.0, 0.0, 3.0]]), np.ones((1, 2, 3))
+    x, masses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([1.0, 2.0])
+    rows = [Distance([0, 1], target), Sphere(0, center, 3.0), LinearCombination([0, 1], coefficients)]
+    held = ConstraintSet(rows, x, masses)
+    before = held.value(x), held.jacobian(x).toarray()
+    for array in (target, center, coefficients, masses):
+        array += 7.0
+    assert np.array_equal(held.value(x), before[0])
+    assert np.array_equal(held.jacobian(x).toarray(), before[1])
+    assert held.masses.tolist() == [1.0, 2.0]
+
+
+def test_periodicity_is_one_flag_or_three():
+    with pytest.raises(InputError, match=r"pbc is \[True, False\]; give True, False, or one for each"):
+        ConstraintSet([], np.zeros((1, 3)), np.ones(1), cell=[5.0] * 3, pbc=[True, False])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons import ConstraintSet
-from kcons.constraints import Distance
+from kcons.constraints import Dihedral, Distance
 from kcons.constraints.target import MovingTarget, as_target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
 
@@ -101,3 +101,37 @@ def test_a_distance_that_moves_below_zero_is_refused_there():
     assert held.target(0.9) == pytest.approx(0.1)
     with pytest.raises(InputError, match=r"Distance\(0, 1\): target -0.5 is not positive at t = 1.5"):
         held.target(1.5)
+
+
+def test_a_target_that_jumps_by_its_period_does_not_move_faster_there():
+    x = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, -1.0, 0.0]])
+
+    def turning(t):
+        return (0.5 * t**2 + t + 2 * np.pi) % (2 * np.pi) - np.pi
+
+    for target in (turning, MovingTarget(turning, lambda t: t + 1)):
+        item = Dihedral([[0, 1, 2, 3], [3, 2, 1, 0]], target).select([0])
+        held = ConstraintSet(item, x, np.ones(4))
+        assert held.velocity_target(x) == pytest.approx([1.0], rel=1e-11)
+        assert held.acceleration_target(x, 0 * x) == pytest.approx([1.0], rel=1e-9)
+
+
+@pytest.mark.parametrize("time_step", [0.0, np.nan, -0.02])
+def test_steps_of_differences_are_positive(time_step):
+    with pytest.raises(InputError, match=r"the time_step of the target is .*; give a positive number"):
+        MovingTarget(np.cos, time_step=time_step)
+
+
+def test_a_target_too_fast_for_its_differences_is_refused():
+    x, masses = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.ones(2)
+
+    def fast(t):
+        return 1 + 0.01 * np.sin(300 * t)
+
+    for target in (fast, MovingTarget(fast, lambda t: 3 * np.cos(300 * t))):
+        with pytest.raises(InputError, match=r"changes within less than the step of its differences, 0\.02; give"):
+            ConstraintSet(Distance([[0, 1]], target), x, masses)
+    held = ConstraintSet(Distance([[0, 1]], MovingTarget(fast, time_step=1e-4)), x, masses)
+    assert held.velocity_target(x) == pytest.approx([3.0], rel=1e-9)
+    for kink in (0.0, 0.1, 0.3):
+        ConstraintSet(Distance([[0, 1]], lambda t, kink=kink: 1 + 0.01 * max(t - kink, 0.0)), x, masses)

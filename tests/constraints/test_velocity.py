@@ -117,3 +117,20 @@ def test_directions_that_do_not_exist():
 def test_bad_input_is_named(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+@pytest.mark.parametrize("explicit", [0.0, 1.0])
+def test_a_wrong_derivative_of_coefficients_is_found_before_it_moves_anything(explicit):
+    """Wrong in the part that motion makes, or in the one of time itself."""
+
+    def coefficients(r, t):
+        return np.array([[r[0, 1] * np.cos(t), 1.0, 0.0]])
+
+    def derivative(r, v, t):
+        motion = v[0, 1] * np.cos(t)
+        return np.array([[(motion if explicit else 2 * motion) - (1 + explicit) * r[0, 1] * np.sin(t), 0.0, 0.0]])
+
+    x = np.array([[0.3, 0.7, 0.1]])
+    item = CustomVelocity(0, coefficients, derivative, time_dependent=True)
+    with pytest.raises(InputError, match=r"derivative gives .* for x of its atom 0, but differences .* give"):
+        ConstraintSet(item, x, np.ones(1), time=0.5)

@@ -93,3 +93,33 @@ def test_too_large_for_the_dense_rescue() -> None:
     with pytest.raises(UnsupportedError, match="cluster of 19 rows around #0 Distance"):
         plan.general_for_all(18)
     assert len(plan.general_for_all(19).rows) == 19
+
+
+# -- rows that are named twice ----------------------------------------------------------------------
+
+
+def test_atoms_that_are_fixed_twice_count_once() -> None:
+    held_twice = [held.FixedAtoms([0, 1]), held.FixedAtoms([1, 0]), held.Distance([1, 2])]
+    motion = Motion(ConstraintSet(held_twice, WATER, np.ones(3)), WATER)
+    assert (motion.rank, motion.degrees_of_freedom) == (7, 2)
+    f = np.arange(9.0).reshape(3, 3)
+    force = motion.constraint_force(WATER, 0 * WATER, f)
+    assert force == pytest.approx(motion.acceleration(WATER, 0 * WATER, f) - f, abs=1e-13)
+
+
+def test_atoms_that_are_fixed_at_two_places_are_refused() -> None:
+    rows = [held.FixedAtoms(0), held.FixedAtoms(0, [9.0, 9.0, 9.0])]
+    with pytest.raises(ContradictionError, match=r"row #3 FixedAtoms\(0\) .* is off by .*; remove it"):
+        planned(rows, WATER)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_multipliers_of_dependent_rows_in_very_different_units(unit: float) -> None:
+    x, rng = unit * np.array([[0.0, 0, 0], [1.0, 0.2, 0], [0.3, 1.1, 0.4]]), np.random.default_rng(0)
+    volume = held.Custom([0, 1], lambda r: float(np.sum((r[0] - r[1]) ** 2) ** 2), length=unit)
+    motion = Motion(ConstraintSet([held.Distance([1, 2]), volume, volume, held.Angle([0, 1, 2])], x, np.ones(3)), x)
+    f = rng.normal(size=x.shape)
+    motion_force = motion.acceleration(x, 0 * x, f) - f
+    assert motion.constraint_force(x, 0 * x, f) == pytest.approx(motion_force, abs=1e-9)
+    twice = motion.multipliers(x, 0 * x, f)[1:3]
+    assert twice[0] == pytest.approx(twice[1], rel=1e-6)

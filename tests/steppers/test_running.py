@@ -142,3 +142,13 @@ def test_bad_rhythm(record):
     system, state = rotor()
     with pytest.raises(InputError, match=f"record is {record}; give a whole number, 1 or more"):
         run(system, state, 0.01, 10, record=record)
+
+
+def test_what_raises_at_the_first_state_has_a_trajectory_too() -> None:
+    def refuses(state: State) -> None:
+        raise KeyError("first")
+
+    system, state = molecule()
+    with pytest.raises(KeyError) as raised:
+        run(system, state, 0.01, 3, observers=[refuses], record=1)
+    assert len(raised.value.trajectory) == 0

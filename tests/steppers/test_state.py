@@ -395,7 +395,7 @@ def test_far_may_be_switched_off() -> None:
     assert state.remainder is not None
 
 
-@pytest.mark.parametrize("far", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("far", [0.0, -1.0, np.nan, "far"])
 def test_bad_far(far) -> None:
     with pytest.raises(InputError, match="far is"):
         rotor(far=far)

@@ -14,10 +14,13 @@ from kcons.constraints.arguments import ANY, TAKES_TIME, check_call, lent, numbe
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
+    WRONG,
     FloatArray,
     Target,
+    contradiction,
     first_derivative,
     first_derivative_4,
+    nearest_image,
     second_derivative,
 )
 from kcons.errors import InputError
@@ -26,8 +29,6 @@ _FLOAT = np.dtype(np.float64)
 #: Places of a first derivative, in steps, and the weights of the values there.
 _PLACES = (1, -1, 2, -2)
 _DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
-#: Relative deviation of a given derivative from a difference quotient that counts as a mistake.
-_WRONG = 1e-3
 
 
 class FunctionRows(Constraint):
@@ -108,7 +109,7 @@ class FunctionRows(Constraint):
     def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
         """Differenced change of the value along a direction of unit length."""
         return first_derivative_4(
-            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
+            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
         )
 
     def row_value(self, k: int, r: FloatArray, time: float) -> float:
@@ -130,8 +131,10 @@ class FunctionRows(Constraint):
         # Four places a coordinate, of which the function may keep what it sees.
         displaced = r + step * _along(self.width)
         displaced.setflags(False)  # type: ignore[call-arg]
-        values = [self.row_value(k, place, time) for place in displaced]
-        return np.dot(_DIFFERENCE, np.array(values).reshape(4, -1)).reshape(r.shape) / step
+        values = np.array([self.row_value(k, place, time) for place in displaced])
+        if self.period is not None:
+            values = nearest_image(values - values[0], self.period)
+        return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
 
     def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
         """What a function returned for row `k`, as float64 of that shape."""
@@ -160,7 +163,7 @@ class FunctionRows(Constraint):
         if self.gradient_function is None:
             step = 0.02 * self._length(r)
             bend = second_derivative(
-                lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
+                lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
             )
             return bend * speed**2
         slope = first_derivative_4(
@@ -177,8 +180,8 @@ class FunctionRows(Constraint):
             both = self._call(self.time_derivatives, "time_derivatives", (2,), r, v, time)
             return both[:, 0], both[:, 1]
         h = self.time_step
-        rate = first_derivative(lambda t: self.measure(r, t), time, h)
-        second = second_derivative(lambda t: self.measure(r, t), time, h)
+        rate = first_derivative(lambda t: self.measure(r, t), time, h, self.period)
+        second = second_derivative(lambda t: self.measure(r, t), time, h, self.period)
         mixed = first_derivative(lambda t: _contract(self.gradient(r, t), v), time, h) if v.any() else 0.0
         return rate, 2 * mixed + second
 
@@ -226,6 +229,37 @@ class FunctionRows(Constraint):
                 np.abs(curvature) + size / length,
                 first_row,
             )
+        if self.time_derivatives is not None:
+            self._check_time_derivatives(r, along, time, first_row)
+
+    def _check_time_derivatives(self, r: FloatArray, v: FloatArray, time: float, first_row: int) -> None:
+        still = np.zeros_like(r)
+
+        def rate(t: float) -> FloatArray:
+            return self.time_terms(r, still, t)[0]
+
+        def second(t: float) -> FloatArray:
+            return self.time_terms(r, still, t)[1]
+
+        for name, given, function, period in (
+            ("dq/dt", rate, lambda t: self.measure(r, t), self.period),
+            ("d2q/dt2", second, rate, None),
+            (
+                "(d2q/dr dt) . v",
+                lambda t: (self.time_terms(r, v, t)[1] - second(t)) / 2,
+                lambda t: _contract(self.gradient(r, t), v),
+                None,
+            ),
+        ):
+            found = contradiction(given, function, time, self.time_step, period)
+            if found is not None:
+                raise InputError(
+                    f"row {first_row + found.number}, {self.row_name(found.number)}: time_derivatives give "
+                    f"{found.given:.6g} for {name} at t = {found.time:g}, but differences give {found.found:.6g}; "
+                    "correct them, or leave them out",
+                    item="time_derivatives",
+                    atoms=self.atoms[found.number].tolist(),
+                )
 
     def _compare(
         self,
@@ -251,7 +285,7 @@ class FunctionRows(Constraint):
                 "give the length over which the function varies (length=...)"
             )
 
-        self.refuse_input(~(np.abs(given - found) <= _WRONG * size), first_row, said, name)
+        self.refuse_input(~(np.abs(given - found) <= WRONG * size), first_row, said, name)
 
 
 class ImplicitSurface(FunctionRows):
@@ -414,7 +448,7 @@ class Custom(FunctionRows):
             atoms, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
         )
         self.translation_invariant = bool(translation_invariant)
-        self.period = period
+        self.period = None if period is None else positive(period, "Custom: period")
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         out = np.empty((self.n_rows, *shape))

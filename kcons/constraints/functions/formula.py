@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, MD_UNITS, numbers, without_units
+from kcons.constraints.arguments import ANY, MD_UNITS, numbers, positive, without_units
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part, width_of
 from kcons.constraints.target import FloatArray, Target
@@ -80,7 +80,8 @@ class Formula(Constraint):
                 item="parameters",
             )
         given = dict(parameters or {})
-        self.formula, self.period, self.names = formula, period, list(given)
+        self.formula, self.names = formula, list(given)
+        self.period = None if period is None else positive(period, "Formula: period")
         for name in self.names:
             taken = name in (*FUNCTIONS, "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):

@@ -30,7 +30,7 @@ import scipy.sparse as sp
 from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import ImageError, InputError
 
 #: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbours in the list.
@@ -306,10 +306,7 @@ class _Links:
         return long[body[self.item.atoms[long, 0]] != body[self.item.atoms[long, 1]]]
 
     def _sigma(self, r: FloatArray) -> FloatArray:
-        difference = self.item.measure(r, self.time) - self.item.target_at(self.time)
-        if self.item.period is not None:
-            difference -= self.item.period * np.round(difference / self.item.period)
-        return difference
+        return nearest_image(self.item.measure(r, self.time) - self.item.target_at(self.time), self.item.period)
 
     def settle(self, component: IntArray, frameworks: BoolArray, held: sp.csr_array) -> None:
         """Rows beside the tree: in a body they have its images, in a framework they are local."""

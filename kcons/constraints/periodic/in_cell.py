@@ -12,7 +12,7 @@ from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.periodic.images import Images, image_error
 from kcons.constraints.periodic.one_piece import lattice_of, lined_up, make_whole, minimum_image, spanning_tree
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
 
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
@@ -62,6 +62,8 @@ class InCell:
             raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
         if not np.all(np.isfinite(matrix)):
             raise InputError("cell has a NaN or infinity", item="cell")
+        if np.shape(pbc) not in ((), (3,)):
+            raise InputError(f"pbc is {pbc!r:.60}; give True, False, or one for each lattice vector", item="pbc")
         self.lattice = lattice_of(matrix, pbc)
 
     def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
@@ -218,10 +220,7 @@ class InCell:
     def _sigma(self, c: Constraint, r: FloatArray, time: float) -> FloatArray:
         if not c.holonomic:
             return np.zeros(c.n_rows)
-        difference = c.measure(r, time) - c.target_at(time)
-        if c.period is not None:
-            difference -= c.period * np.round(difference / c.period)
-        return difference
+        return nearest_image(c.measure(r, time) - c.target_at(time), c.period)
 
     def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
         return joined([function(c) for c in self.constraints])

@@ -140,7 +140,13 @@ class Pendulum(HamiltonianFlow):
         if m == 0.0:
             return np.stack(np.broadcast_arrays(theta0 + 0 * times, 0.0 * times), axis=-1)
         k = np.sqrt(m)
-        if m <= 1.0:
+        if m == 1.0:
+            # On the separatrix, where the elliptic functions are infinite; at rest at the top, arctanh is.
+            with np.errstate(divide="ignore", over="ignore"):
+                u = np.sign(rate0) * self.omega * times + np.arctanh(sine)
+                half, rate = np.arctan(np.sinh(u)), 2.0 * np.sign(rate0) / np.cosh(u)
+            return np.stack([2.0 * half + 2 * np.pi * turns, rate], axis=-1)
+        if m < 1.0:
             start = ellipkinc(np.arctan2(sine, half_rate), m)
             sn, cn, dn, _ = ellipj(self.omega * times + start, m)
             half = np.arctan2(k * sn, dn)

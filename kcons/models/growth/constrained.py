@@ -13,14 +13,22 @@ Horvath & Kneller, J. Chem. Phys. 131, 171101 (2009). Bott & Duffin, Trans. AMS 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints import projection
-from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError, SingularGeometryError
+from kcons.constraints.arguments import refuse_other
+from kcons.errors import (
+    ConstraintError,
+    ContradictionError,
+    ConvergenceError,
+    InputError,
+    NonFiniteError,
+    SingularGeometryError,
+)
 from kcons.models.growth import orthogonal_rows
 from kcons.models.growth.model import FloatArray, GrowthModel, Populations
 from kcons.models.growth.rows import EPSILON, Row
@@ -62,13 +70,9 @@ class ConstrainedGrowth:
     """
 
     def __init__(self, model: GrowthModel, rows: Sequence[Row] | Row = ()) -> None:
+        refuse_other(model, GrowthModel, "model", "a kcons.models.growth.GrowthModel")
         self.model = model
-        self.rows: tuple[Row, ...] = (rows,) if isinstance(rows, Row) else tuple(rows)
-        if len(self.rows) > model.n:
-            raise ConstraintError(
-                f"{len(self.rows)} rows for {model.n} species: give at most as many rows as there are species",
-                rows=range(model.n, len(self.rows)),
-            )
+        self.rows = _rows_in(rows, model.n)
 
     @property
     def n(self) -> int:
@@ -115,6 +119,7 @@ class ConstrainedGrowth:
     def _held(self, p: Populations, drift: FloatArray | None = None) -> orthogonal_rows.Solution:
         """z where the rows allow one."""
         found = self._solve(p, self.model.drift(p) if drift is None else drift)
+        _refuse_not_finite(found.z, self.rows, p)
         self._refuse(found, p)
         return found
 
@@ -346,3 +351,30 @@ def _misses(rows: Sequence[Row], p: Populations, lanes: tuple[int, ...]) -> tupl
         sizes = [np.maximum(row.size(p), np.finfo(np.float64).tiny) for row in rows]
         left = np.max([np.abs(v) / (EPSILON * s) for v, s in zip(values, sizes, strict=True)], axis=0)
     return values, np.where(np.isfinite(left), left, np.inf)
+
+
+def _rows_in(given: Sequence[Row] | Row, n: int) -> tuple[Row, ...]:
+    """The rows for n species."""
+    refuse_other(given, (Row, Iterable), "rows", "rows of kcons.models.growth, or an empty list")
+    rows = (given,) if isinstance(given, Row) else tuple(given)
+    for row in rows:
+        refuse_other(row, Row, "rows", "rows of kcons.models.growth, such as TotalPopulation(n)")
+    if len(rows) > n:
+        raise ConstraintError(
+            f"{len(rows)} rows for {n} species: give at most as many rows as there are species",
+            rows=range(n, len(rows)),
+        )
+    return rows
+
+
+def _refuse_not_finite(z: FloatArray, rows: Sequence[Row], p: Populations) -> None:
+    """Raise where z is not finite, for the first row of which a number is not."""
+    if np.all(np.isfinite(z)):
+        return
+    for number, row in enumerate(rows):
+        if not (np.all(np.isfinite(row.gradient(p))) and np.all(np.isfinite(row.rate(p)))):
+            raise NonFiniteError(
+                f"row {number} ({row.name}) has a coefficient or a rate that is not finite at "
+                f"t = {float(np.max(p.time)):.8g}; mend its functions, or end the run before (an event)",
+                item="rows",
+            )

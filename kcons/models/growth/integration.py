@@ -159,7 +159,7 @@ def solve(
     ContradictionError, SingularGeometryError
         Rows that contradict each other, at the start or where their rank is lost on the way.
     NonFiniteError
-        Rates or sources that are not finite where the run has come to.
+        Rates, sources or rows that are not finite where the run has come to.
     """
     solver = solver_of(method)
     t0, t1 = span_of(t_span)
@@ -217,7 +217,7 @@ def solve(
 
 
 def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:
-    """Raise if it is the model that is not finite at a finite state."""
+    """Raise if it is the model, or a row, that is not finite at a finite state."""
     p = Populations.from_logarithms(t, y)
     if not np.all(np.isfinite(p.x)):
         return
@@ -229,6 +229,7 @@ def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:
             f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
             item=f"{what}s",
         )
+    system._held(p)
 
 
 # -- the result --------------------------------------------------------------------------------------
@@ -276,7 +277,8 @@ def _assemble(
         tail = _tail(settled_time, t1)
         if event_list is not None:
             assert t_events is not None and y_events is not None
-            end, status, message = _late_events(event_list, inside, tail, t_events, y_events, end, message)
+            grid = np.append(settled_time, tail)
+            end, status, message = _late_events(event_list, inside, grid, t_events, y_events, end, message)
             tail = tail[tail <= end] if forward else tail[tail >= end]
             tail = np.append(tail, end) if len(tail) == 0 or tail[-1] != end else tail
         times = np.append(times, tail)
@@ -312,13 +314,13 @@ def _tail(start: float, end: float) -> FloatArray:
 def _late_events(
     events: Sequence[Event],
     solution: GrowthInterpolant,
-    tail: FloatArray,
+    grid: FloatArray,
     t_events: list[FloatArray],
     y_events: list[FloatArray],
     end: float,
     message: str,
 ) -> tuple[float, int, str]:
-    """Zeros of the events on the settled part, sought between the times of the tail; new end, status and message."""
+    """Zeros of the events on the settled part, sought between the times of a grid; new end, status and message."""
     from scipy.optimize import brentq
 
     status = 0
@@ -328,16 +330,18 @@ def _late_events(
         def at(t: float, event: Event = event) -> float:
             return float(event(t, np.asarray(solution.logarithms(t))))
 
-        values = [at(float(t)) for t in tail]
+        values = [at(float(t)) for t in grid]
         direction = getattr(event, "direction", 0)
-        for a, b, u, v in zip(tail, tail[1:], values, values[1:], strict=False):
-            if u * v < 0 and direction * (v - u) >= 0:
+        for a, b, u, v in zip(grid, grid[1:], values, values[1:], strict=False):
+            # A zero at a time of the grid belongs to the interval before it.
+            if (u < 0 <= v or u > 0 >= v) and direction * (v - u) >= 0:
                 found.append((float(brentq(at, a, b, xtol=1e-12)), number))
-    forward = len(tail) == 0 or tail[-1] >= tail[0]
+    forward = grid[-1] >= grid[0]
     for t, number in sorted(found, reverse=not forward):
         t_events[number] = np.append(t_events[number], t)
         y_events[number] = np.vstack([y_events[number].reshape(-1, solution._system.n), solution(t)])
-        if getattr(events[number], "terminal", False):
+        most = getattr(events[number], "terminal", False)
+        if most and len(t_events[number]) >= most:
             return t, 1, "A termination event occurred."
     return end, status, message
 

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import DOP853
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import finite_number, numbers, whole_number
 from kcons.errors import InputError
 from kcons.models.growth.compensated_sums import two_sum
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
+from kcons.models.projected_steps import check_sizes
 
 #: Trajectories that take their steps together.
 BATCH = 2048
@@ -97,6 +98,8 @@ def solve_ensemble(
     ConstraintError, BudgetError, ContradictionError, SingularGeometryError
         As `solve`, if any start cannot be held.
     """
+    t0, batch, threads = finite_number(t0, "t0"), whole_number(batch, "batch"), whole_number(threads, "threads")
+    check_sizes({"rtol": rtol, "atol": atol}, 1)
     times = np.atleast_1d(numbers(t_eval, "t_eval"))
     if not np.all(np.isfinite(times)) or np.any(np.diff(times, axis=0) <= 0) or np.any(times[0] < t0):
         raise InputError("t_eval holds finite times that increase, none before t0", item="t_eval")

@@ -16,7 +16,7 @@ from typing import NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import check_call, lent, numbers, whole_number
 from kcons.errors import InputError, NonFiniteError
 
 FloatArray = NDArray[np.float64]
@@ -116,13 +116,13 @@ class GrowthModel:
     Raises
     ------
     InputError
-        If n < 1.
+        `n` is no whole number from 1 on; functions of other arguments.
     """
 
     def __init__(self, rates: OfState, sources: OfState | None = None, *, n: int, vectorized: bool = False) -> None:
-        if n < 1:
-            raise InputError(f"a growth model has at least one species, not {n}", item="n")
-        self.n = int(n)
+        self.n = whole_number(n, "n")
+        check_call("rates", rates, ("t", "x"))
+        check_call("sources", sources, ("t", "x"))
         self._rates = rates
         self._sources = sources
         self.vectorized = vectorized

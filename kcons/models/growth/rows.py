@@ -15,14 +15,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import check_call, numbers, whole_number
+from kcons.constraints.target import WRONG, contradicted
 from kcons.errors import ConstraintError, InputError
 from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate, taken
 
 #: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
 START_TOLERANCE = 1e-10
-#: Relative deviation of a given derivative from differences that counts as a mistake.
-_WRONG = 0.01
 EPSILON = float(np.finfo(np.float64).eps)
 
 
@@ -105,6 +104,9 @@ class HolonomicRow(Row):
         vectorized: bool = False,
         name: str = "holonomic row",
     ) -> None:
+        check_call(f"{name}: function", function, ("t", "x"))
+        check_call(f"{name}: gradient", gradient, ("t", "x"))
+        check_call(f"{name}: time_derivative", time_derivative, ("t", "x"))
         self._function = function
         self._gradient = gradient
         self._time_derivative = time_derivative
@@ -151,7 +153,7 @@ class HolonomicRow(Row):
         """
         if self._gradient is not None:
             given, found = self.gradient(p) * p.x, relative_differences(self.measure, p) * p.x
-            wrong = np.abs(given - found) > _WRONG * np.abs(found).sum(axis=0)
+            wrong = ~(np.abs(given - found) <= WRONG * np.abs(found).sum(axis=0))
             if wrong.any():
                 k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
                 raise InputError(
@@ -167,8 +169,7 @@ class HolonomicRow(Row):
     def _compare_rates(self, p: Populations, given: FloatArray | float, said: str) -> None:
         """Compare a derivative in time at the state `p` with differences, where these are smooth."""
         coarse, fine = (self._rate_by_differences(p, h) for h in (1e-3, 5e-4))
-        size = np.maximum(np.abs(given), np.abs(fine)) + 1e-9 * self._magnitude(p)
-        wrong = (np.abs(fine - given) > _WRONG * size) & (np.abs(fine - coarse) <= 0.1 * _WRONG * size)
+        wrong = contradicted(given, coarse, fine, 1e-9 * self._magnitude(p))
         if np.any(wrong):
             k = int(np.argmax(wrong))
             values = [float(np.broadcast_to(v, np.shape(wrong)).ravel()[k]) for v in (given, fine)]
@@ -272,9 +273,7 @@ class TotalPopulation(LinearRow):
     """sum_i x_i = target (notes eqs. 143, 144), for n species; left out, the target is the sum at the start."""
 
     def __init__(self, n: int, target: float | Callable[[float], tuple[float, float]] | None = None) -> None:
-        if n < 1:
-            raise InputError(f"there is at least one species, not {n}", item="n")
-        super().__init__(np.ones(n), target, name="total population")
+        super().__init__(np.ones(whole_number(n, "n")), target, name="total population")
 
 
 class VelocityRow(Row):
@@ -298,7 +297,7 @@ class VelocityRow(Row):
         vectorized: bool = False,
         name: str = "velocity row",
     ) -> None:
-        self._coefficients = coefficients
+        self._coefficients = coefficients if callable(coefficients) else numbers(coefficients, "coefficients").copy()
         self._rate = rate if callable(rate) else _number(rate, "rate")
         self.vectorized = vectorized
         self.name = name
@@ -306,7 +305,7 @@ class VelocityRow(Row):
     def gradient(self, p: Populations) -> FloatArray:
         if callable(self._coefficients):
             return evaluate(self._coefficients, p, len(p.x), self.vectorized, f"coefficients of {self.name}")
-        c = numbers(self._coefficients, "coefficients")
+        c = self._coefficients
         if c.shape != (len(p.x),):
             raise InputError(f"{self.name}: {c.shape} coefficients for {len(p.x)} species", item="coefficients")
         return np.broadcast_to(c.reshape(-1, *(1,) * (p.x.ndim - 1)), p.x.shape)

@@ -29,8 +29,17 @@ class Logistic(GrowthModel):
         return self.alpha / self.beta
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
-        """x(t) (notes eq. 66), written with exp(-alpha t), which does not overflow."""
+        """x(t) (notes eq. 66), written with exp(-alpha t), which does not overflow.
+
+        Raises
+        ------
+        InputError
+            Times before the one at which a population above the plateau came from infinity.
+        """
         exponent = -self.alpha * numbers(t, "t")
+        if x0 > self.plateau and np.any(exponent >= -np.log1p(-self.plateau / x0)):
+            since = np.log1p(-self.plateau / x0) / self.alpha
+            raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
         return np.asarray(self.alpha * x0 / (self.alpha * np.exp(exponent) - self.beta * x0 * np.expm1(exponent)))
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from constraint_cases import MASSES, TIME, hoop, saddle, scattered, spread
 
-from kcons.constraints import Custom, Distance, ImplicitSurface
+from kcons.constraints import Custom, Dihedral, Distance, Formula, ImplicitSurface
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
+from kcons.motion import Motion
 
 
 def gap(r):
@@ -121,3 +122,45 @@ def test_results_of_the_wrong_shape_are_named():
         ConstraintSet([Custom([0, 1], lambda r: r[0], gap_gradient)], x, MASSES)
     with pytest.raises(InputError, match=r"ImplicitSurface: function returned shape \(\).*it must return \(2,\)"):
         ConstraintSet([ImplicitSurface([0, 1], lambda r: 1.0, lambda r: r)], x, MASSES)
+
+
+TRANS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, -1.0, 0.0]])
+
+
+def _torsion(r):
+    return float(Dihedral([0, 1, 2, 3]).measure(r[None], 0.0)[0])
+
+
+@pytest.mark.parametrize("gradient", [None, lambda r: Dihedral([0, 1, 2, 3]).gradient(r[None], 0.0)[0]])
+def test_differences_where_the_value_jumps_by_its_period(gradient):
+    v = scattered(2)[:4]
+    ours = ConstraintSet([Custom([0, 1, 2, 3], _torsion, gradient, period=2 * np.pi)], TRANS, np.ones(4))
+    theirs = ConstraintSet([Dihedral([0, 1, 2, 3])], TRANS, np.ones(4))
+    assert ours.jacobian(TRANS).toarray() == pytest.approx(theirs.jacobian(TRANS).toarray(), abs=1e-10)
+    assert ours.acceleration_target(TRANS, v) == pytest.approx(theirs.acceleration_target(TRANS, v), rel=1e-8)
+    kept = Motion(ours, TRANS).project_positions(TRANS + 0.01 * v, TRANS)
+    assert kept == pytest.approx(Motion(theirs, TRANS).project_positions(TRANS + 0.01 * v, TRANS), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("said", "rate", "second"),
+    [("dq/dt", 2.0, 1.0), ("d2q/dt2", 1.0, 2.0), (r"\(d2q/dr dt\) \. v", 1.0, 1.0)],
+    ids=["rate", "second", "mixed"],
+)
+def test_wrong_time_derivatives_are_found_before_they_move_anything(said, rate, second):
+    def derivatives(r, v, t):
+        mixed = 0.0 if "dr" in said else 2 * v[0, 0] * np.cos(t)
+        return rate * r[0, 0] * np.cos(t), mixed - second * r[0, 0] * np.sin(t)
+
+    item = Custom(0, lambda r, t: r[0, 2] + r[0, 0] * np.sin(t), time_derivatives=derivatives)
+    with pytest.raises(InputError, match=rf"time_derivatives give .* for {said} at .* differences give .*; correct"):
+        ConstraintSet([item], scattered(0)[:1], np.ones(1), time=0.4)
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, "a"])
+def test_a_period_that_is_none_is_refused(period):
+    """With a period of NaN or 0 the residual of a formula counted as 0, and nothing was held."""
+    with pytest.raises(InputError, match=r"Custom: period is .*; give a positive number"):
+        Custom([0, 1], gap, period=period)
+    with pytest.raises(InputError, match=r"Formula: period is .*; give a positive number"):
+        Formula("x1", 0, period=period)

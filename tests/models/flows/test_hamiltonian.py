@@ -178,3 +178,13 @@ def test_hamiltonians_that_are_said_to_be_separable_are_looked_at():
             mixed.symplectic([1.0], [0.0], 0.1, 10, method)
     with pytest.raises(InputError, match="steps"):
         mixed.symplectic([1.0], [0.0], 0.1, 2.5)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_pendulum_on_its_separatrix(direction):
+    flow, times = Pendulum(1.3), np.array([-1.0, 0.0, 2.5])
+    theta = 2 * np.arctan(np.sinh(1.3 * times * direction))
+    expected = np.stack([theta, 2 * direction / np.cosh(1.3 * times)], axis=-1)
+    assert flow.exact(times, [0.0, 2.0 * direction]) == pytest.approx(expected, abs=1e-13)
+    assert flow.exact(times, [3 * np.pi, 0.0]) == pytest.approx(np.tile([3 * np.pi, 0.0], (3, 1)), abs=1e-13)
+    assert flow.exact(1.0, [direction * np.pi, 0.0]) == pytest.approx([direction * np.pi, 0.0], abs=1e-13)

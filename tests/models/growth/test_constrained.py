@@ -152,3 +152,26 @@ def test_literal_formulas_are_for_one_system():
         make().constrained_inverse(0.0, np.ones((4, 2)))
     with pytest.raises(InputError, match="populations"):
         make().bind(Populations.from_values(0.0, np.ones(3)))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda m: GrowthModel(lambda x: x, n=2), r"rates takes \(x\), but is called with \(t, x\)"),
+        (lambda m: GrowthModel(lambda t, x: x, n=2.7), "n is 2.7; give a whole number"),
+        (lambda m: HolonomicRow(3.0), r"function is 3.0; give a function of t, x"),
+        (lambda m: ConstrainedGrowth(None, []), "model is None; give a"),
+        (lambda m: ConstrainedGrowth(m, None), "rows is None; give rows"),
+        (lambda m: ConstrainedGrowth(m, [3.0]), "rows is 3.0; give rows"),
+    ],
+)
+def test_what_is_no_model_and_no_row_is_refused_at_once(make, said):
+    with pytest.raises(InputError, match=said):
+        make(GrowthModel(lambda t, x: x, n=2))
+
+
+def test_coefficients_are_kept_as_they_were_given():
+    given = np.ones(2)
+    row = VelocityRow(given)
+    given[:] = 7.0
+    assert row.gradient(Populations.from_values(0.0, [0.4, 0.6])).tolist() == [1.0, 1.0]

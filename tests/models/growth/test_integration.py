@@ -146,3 +146,39 @@ def test_bad_input_is_refused(keywords, error):
     arguments = {"t_span": (0.0, 1.0), "x0": X0, **keywords}
     with pytest.raises(error):
         solve(Hypercycle().with_fixed_total(), **arguments)
+
+
+@pytest.mark.parametrize("part", [0.0004, 0.005, 0.05], ids=["at once", "between", "at a time shown"])
+def test_events_are_found_wherever_a_settled_motion_passes_them(part):
+    system = Hypercycle().with_entropy_production(1.0)
+    settled = solve(system, (0.0, 100.0), X0, rtol=1e-4, atol=1e-5).settled_time
+    time = settled + part * (100.0 - settled)
+
+    def passed(t, x):
+        return t - time
+
+    passed.terminal = 1
+    found = solve(system, (0.0, 100.0), X0, rtol=1e-4, atol=1e-5, events=passed)
+    assert found.status == 1 and found.settled_time == settled
+    assert found.t_events[0] == pytest.approx([time], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        VelocityRow([np.nan, 1.0, 0.0]),
+        VelocityRow([1.0, 1.0, 0.0], lambda t, x: np.nan),
+        VelocityRow(lambda t, x: [1.0, np.inf, 0.0]),
+    ],
+)
+def test_rows_that_are_not_finite_are_refused_at_the_start(row):
+    model = GrowthModel(lambda t, x: [1.0, 2.0, 0.5], n=3)
+    with pytest.raises(NonFiniteError, match=r"row 0 \(velocity row\) has a .* that is not finite at t = 0; mend"):
+        solve(ConstrainedGrowth(model, row), (0.0, 1.0), [0.2, 0.3, 0.5])
+
+
+def test_rows_that_are_not_finite_are_told_where_the_run_has_come_to():
+    model = GrowthModel(lambda t, x: [1.0, 2.0, 0.5], n=3)
+    row = VelocityRow([1.0, 1.0, 0.0], lambda t, x: 0.0 if t < 0.5 else np.nan)
+    with pytest.raises(NonFiniteError, match=r"row 0 .* is not finite at t = 0\.5"):
+        solve(ConstrainedGrowth(model, row), (0.0, 1.0), [0.2, 0.3, 0.5])

@@ -146,6 +146,9 @@ def test_bad_input_is_refused():
         solve_ensemble(model.with_fixed_total(), [1.0], bad)
     with pytest.raises(InputError, match="either"):
         solve_ensemble(model.with_fixed_total(), [1.0])
+    for option in ({"rtol": 0.0}, {"atol": np.nan}, {"t0": np.nan}, {"batch": 0}, {"threads": 0}):
+        with pytest.raises(InputError, match=f"{next(iter(option))} is "):
+            solve_ensemble(model.with_fixed_total(), [1.0], x0, **option)
     with pytest.raises(BudgetError):
         solve_ensemble(model.with_entropy_production(1.0, 5.0), [1.0], x0)
     fixed = ConstrainedGrowth(model, TotalPopulation(5, 1.0))

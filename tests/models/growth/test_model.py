@@ -76,7 +76,7 @@ def test_functions_cannot_change_the_populations_or_return_complex_rates():
 
 
 def test_bad_models_are_refused():
-    with pytest.raises(InputError, match="at least one"):
+    with pytest.raises(InputError, match="n is 0; give a whole number, 1 or more"):
         GrowthModel(lambda t, x: x, n=0)
     with pytest.raises(InputError, match="shape"):
         GrowthModel(lambda t, x: [1.0, 2.0, 3.0], n=2).velocity(0.0, [1.0, 1.0])

@@ -96,3 +96,10 @@ def test_lotka_volterra_with_four_different_parameters():
 def test_bad_parameters_are_refused(make):
     with pytest.raises(InputError):
         make()
+
+
+def test_logistic_growth_did_not_begin_before_its_population_was_infinite():
+    model = Logistic(1.0, 0.1)
+    assert np.all(model.exact([-0.6, 5.0], 20.0) > model.plateau)
+    with pytest.raises(InputError, match=r"x = 20 at t = 0 came from infinity at t = -0\.693147; give later times"):
+        model.exact([0.0, -1.0], 20.0)
