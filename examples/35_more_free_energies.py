@@ -150,9 +150,9 @@ def ions(folder: Path, full: bool) -> dict[str, object]:
     sampler = OpenMMWindows(
         box.topology, system, box.positions, {"r": Distance([[0, 1]])}, platform="CPU", properties={"Threads": "1"}
     )
-    settings = short(full, timestep=2.0, relax=100, pull=500, equilibration=500, production=3000, every=10)
+    settings = short(full, timestep=2.0, relax=100, pull=500, equilibration=2500, production=10_000, every=10)
     places = np.array([2.4, 2.6, 2.8, 3.1, 3.5, 3.9, 4.5, 5.2])  # angstrom
-    found = sampled(sampler, places if full else places[3:4], folder / "ions", settings, full, both_sides=False)
+    found = sampled(sampler, places if full else places[3:4], folder / "ions", settings, full)
     if not full:
         return {}
     profile = found.profile.without_jacobian("distance", thermal_energy=KT)
