@@ -86,7 +86,7 @@ TABLE = {
     "free_energy.json": Measurement(
         (*BATHS, "openmm", "free_energy"),
         script("29_free_energy", "--full", "--placement", "--recording", "--alanine alanine-windows"),
-        None,
+        95,
     ),
     "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), 11),
     "hard_cases.json": Measurement(HARD, ("kcons hardcases --out hardcases", "cp hardcases/hard_cases.json F"), 6),
@@ -116,7 +116,7 @@ TABLE = {
         None,
     ),
     "more_free_energies.json": Measurement(
-        (*BATHS, "ase", "openmm", "free_energy"), script("35_more_free_energies", "--full more-free-energies"), 80
+        (*BATHS, "ase", "openmm", "free_energy"), script("35_more_free_energies", "--full more-free-energies"), 11
     ),
     "openmm.json": Measurement(OPENMM, script("06_openmm"), 1),
     "openmm_barostats.json": Measurement(
@@ -141,7 +141,7 @@ TABLE = {
     "openmm_thermostats.json": Measurement((*OPENMM, "thermostats"), script("12_openmm_thermostats"), 40),
     "random_cells.json": Measurement(CORE, ("python tests/contracts/random_cells.py --cases 10000 --out F",), 6),
     "report": Measurement((*ASE, "openmm", "comparison"), ("kcons compare --all --out F",), 105),
-    "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), 6),
+    "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), 4),
     "solvated_peptide.json": Measurement((*BATHS, "comparison/averages"), script("40_peptide_steps"), 30),
     "stability.json": Measurement(
         (*CORE, "comparison/stability"),

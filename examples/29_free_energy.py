@@ -3,7 +3,6 @@
     python examples/29_free_energy.py                   some seconds: a chain under three thermostats
     python examples/29_free_energy.py --full            the same with errors of 1 %, into docs/results/free_energy.json
     python examples/29_free_energy.py --alanine FOLDER  phi of alanine dipeptide: windows against umbrellas and MBAR
-    python examples/29_free_energy.py --alanine FOLDER --again   once more, kept beside the first
     python examples/29_free_energy.py --placement       how many windows five profiles need
     python examples/29_free_energy.py --recording       what a sample costs beside a step
 
@@ -296,18 +295,6 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
     return found
 
 
-def again(first: dict[str, object], second: dict[str, object]) -> dict[str, object]:
-    """What a second run says: how far it is from MBAR, and how far its windows are from those of the first."""
-    kept = ("largest difference below 30 kJ/mol", "root mean square difference", "held")
-    apart, low = (np.array(second["held"]) - first["held"], np.array(first["MBAR"]) < HIGHEST)
-    apart -= apart[low].mean()
-    about = environment()
-    return {name: second[name] for name in kept} | {
-        "root mean square difference of both runs": float(np.sqrt(np.mean(apart[low] ** 2))),
-        "machine": {name: about[name] for name in ("cpu", "commit", "date")},
-    }
-
-
 def pulls(sampler: object, settings: Settings, folder: Path, profile: object, workers: int) -> dict[str, object]:
     """From the lowest minimum over the lower barrier, 20 ps each, both ways; and the windows between the same ends."""
     from kcons.free_energy import Windows
@@ -425,9 +412,6 @@ def main(arguments: list[str]) -> None:
         folder = Path(arguments[arguments.index("--alanine") + 1])
         folder.mkdir(parents=True, exist_ok=True)
         found = {"alanine dipeptide": alanine(folder, 24, 36, 480_000, 1)}
-        if "--again" in arguments:
-            first = json_files.read(RESULT)["alanine dipeptide"]
-            found = {"alanine dipeptide": first | {"again": again(first, found["alanine dipeptide"])}}
     elif "--placement" in arguments:
         found = {"placement": placement()}
     elif "--recording" in arguments:
@@ -437,8 +421,7 @@ def main(arguments: list[str]) -> None:
         if "--full" not in arguments:
             return
     known = json_files.read(RESULT) if RESULT.exists() else {}
-    new = [] if "--again" in arguments else list(found)
-    machines = known.get("machines", {}) | dict.fromkeys(new, environment())
+    machines = known.get("machines", {}) | dict.fromkeys(found, environment())
     json_files.write(RESULT, known | found | {"machines": machines})
     print(f"wrote {RESULT}")
 

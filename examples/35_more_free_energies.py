@@ -2,7 +2,7 @@
 
 python examples/35_more_free_energies.py                 one short window of each but the ions, to see how it goes
 python examples/35_more_free_energies.py ions            one short window of these
-python examples/35_more_free_energies.py --full FOLDER   profiles (some 40 minutes on two cores), pictures and numbers
+python examples/35_more_free_energies.py --full FOLDER   profiles (some ten minutes), pictures and numbers
 python examples/35_more_free_energies.py --full FOLDER pore ions   only these
 """
 
@@ -230,8 +230,9 @@ def main(arguments: list[str]) -> None:
     for name in arguments[2 if full else 0 :] or (STUDIES if full else ["pucker", "torsions", "pore"]):
         found = STUDIES[name](folder, full)
         if full:
-            known = json_files.read(result) if result.exists() else {}
-            json_files.write(result, known | {name: found, "machine": environment()})
+            known, machine = json_files.read(result) if result.exists() else {}, environment()
+            of = {key: machine[key] for key in ("commit", "date")}
+            json_files.write(result, known | {name: found | of, "machine": machine})
             print(name, {key: value for key, value in found.items() if not isinstance(value, list) or len(value) < 5})
 
 

@@ -56,5 +56,5 @@ def test_ions():
 
 
 def test_both_sides_of_every_window_agree():
-    for name in ("pucker", "pore"):
+    for name in ("pucker", "ions", "pore"):
         assert FOUND[name]["least probability of both sides"] > 0.01 / FOUND[name]["windows"]
