@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import openmm
 from openmm import unit
 
@@ -105,6 +106,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         self.parts = _listed(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
+        _refuse_shared(self.parts)
         for k, part in enumerate(self.parts, start=1):
             part.forget()
             part.code = k
@@ -269,3 +271,16 @@ def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
                 item="parts",
             )
     return given
+
+
+def _refuse_shared(parts: Sequence[Part]) -> None:
+    """Refuse particles that two parts hold: each would undo what the other does."""
+    known: set[int] = set()
+    for part in parts:
+        atoms = {int(a) for held in getattr(part, "atoms", ()) for a in np.ravel(held)}
+        if known & atoms:
+            raise UnsupportedError(
+                f"two parts hold particle {min(known & atoms)}; give all rows that share particles to one call of "
+                "kcons.openmm.hold"
+            )
+        known |= atoms

@@ -361,3 +361,13 @@ def test_what_is_no_system_and_no_context() -> None:
     for call in (rows.check, rows.multipliers, rows.report, rows.apply_positions, rows.apply_velocities):
         with pytest.raises(InputError, match=r"context is a VerletIntegrator; give the Context"):
             call(openmm.VerletIntegrator(0.001))
+
+
+def test_two_parts_that_share_particles_are_refused():
+    system, x = openmm.System(), np.array([[0, 0, 0], [0.15, 0, 0], [0.2, 0.14, 0], [0.35, 0.14, 0.05]])
+    for _ in x:
+        system.addParticle(12.0)
+    parts = [hold(system, Distance([pair]), x) for pair in ([0, 1], [1, 2], [2, 3])]
+    with pytest.raises(UnsupportedError, match="two parts hold particle 1; give all rows"):
+        ProjectedIntegrator(0.001, parts=parts)
+    assert len(ProjectedIntegrator(0.001, parts=parts[::2]).parts) == 2
