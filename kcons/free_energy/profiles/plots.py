@@ -57,7 +57,7 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
     below.plot(profile.x, slope, color=_BLUE, linewidth=1.0, label="slope of F")
     below.errorbar(
         profile.windows,
-        profile.mean_forces,
+        profile.mean_forces + profile.added_slope(profile.windows),
         _BAND * profile.mean_force_errors,
         color=_RED,
         linestyle="none",

@@ -208,6 +208,12 @@ class Profile:
         shift = added(np.append(self.x, self.zero))
         return replace(self, F=self.F + shift[:-1] - shift[-1], _added=added)
 
+    def added_slope(self, at: FloatArray) -> FloatArray:
+        """What `without_jacobian` added to dF/dx, shape of `at`; 0 where it was not asked for."""
+        if self._added is None:
+            return np.zeros_like(at)
+        return np.asarray(np.interp(at, self.x, np.gradient(self._added(self.x), self.x)))
+
     def next_window(self, *, between: tuple[float, float] | None = None, below: float | None = None) -> float:
         """Where one more window would tell most; see `next_windows`."""
         return self.next_windows(1, between=between, below=below)[0]
