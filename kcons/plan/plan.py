@@ -185,7 +185,7 @@ class Plan:
                 singular, directions = np.linalg.svd(dense / size, full_matrices=False)[1:]
                 hidden = directions[int(independent(singular).sum()) :].T
                 hidden = np.where(np.abs(hidden) > 1e-12, hidden, 0.0) / size[:, None]
-                lam[rows] -= hidden @ np.linalg.lstsq(hidden, lam[rows])[0]
+                lam[rows] -= hidden @ np.linalg.lstsq(hidden, lam[rows], rcond=None)[0]
             else:
                 force = transposed @ lam[rows]
                 from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
