@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import ContradictionError, InfeasibleError
 
 #: Relative difference of two targets (radian for angles) that counts as rounding.
@@ -92,9 +92,7 @@ def found_as_given(items: Sequence[Constraint], found: Sequence[bool], time: flo
 
 def _refuse_two_targets(atoms: IntArray, rows: IntArray, target: FloatArray, period: float | None) -> None:
     repeated = np.flatnonzero((atoms[1:] == atoms[:-1]).all(axis=1))
-    difference = target[repeated + 1] - target[repeated]
-    if period is not None:
-        difference -= period * np.round(difference / period)
+    difference = nearest_image(target[repeated + 1] - target[repeated], period)
     bad = np.abs(difference) > _SAME * np.maximum(np.abs(target[repeated]), np.abs(target[repeated + 1]))
     if bad.any():
         k = int(repeated[np.argmax(bad)])
