@@ -194,9 +194,15 @@ _FIRST_8 = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 _SECOND_8 = (8 / 5, -1 / 5, 8 / 315, -1 / 560)
 
 
-def nearest_image(difference: FloatArray, period: float | None) -> FloatArray:
-    """A difference of two values of a coordinate with this period, or without one."""
-    return difference if period is None else difference - period * np.round(difference / period)
+def nearest_image(difference: FloatArray, period: float | FloatArray | None) -> FloatArray:
+    """Differences of two values of a coordinate with this period, or without one.
+
+    A period for each of several coordinates, 0 where there is none, belongs to the last axis.
+    """
+    if period is None:
+        return difference
+    whole = np.where(period > 0, period, np.inf) if isinstance(period, np.ndarray) else period
+    return difference - period * np.round(difference / whole)
 
 
 def first_derivative_4(function: Function, at: Any, step: Any, period: float | None = None) -> FloatArray:

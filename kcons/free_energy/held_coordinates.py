@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from kcons.constraints.arguments import as_array
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet, rows_like
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.free_energy.compiled_samples import CompiledSamples, compilable
 from kcons.free_energy.rigid_turns import RigidTurn, leaves_the_rest, rigid_turn
@@ -229,8 +229,7 @@ class HeldCoordinates:
         still, moving = metric.inverse @ (rest - pushed), metric.inverse @ (driven - pushed)
         value = self._named(self._own.measure(here[self._own_atoms], time))
         gradient = self._change_of_z(bent[1:])
-        off = value - self._named(self._own.target(time))
-        off -= self.periods * np.round(off / np.where(self.periods, self.periods, np.inf))
+        off = nearest_image(value - self._named(self._own.target(time)), self.periods)
         largest = float(np.abs(off).max())
         unknown = np.full(len(self), np.nan)
         return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, largest, turned, unknown)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.arguments import positive, refuse_other, whole_number
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import weighted_mean
 from kcons.free_energy.series import Series
@@ -113,9 +113,7 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
         raise InputError(f"{discard} of {len(series)} samples are to be discarded; keep some", item="discard")
     kept = series[discard:]
     value = kept.value
-    moved = value - value[0]
-    turns = kept.periods > 0
-    moved[:, turns] -= kept.periods[turns] * np.round(moved[:, turns] / kept.periods[turns])
+    moved = nearest_image(value - value[0], kept.periods)
     allowed = 1e-5 * np.maximum(np.abs(value[0]), 1.0)
     if not np.all(np.isfinite(moved)):
         name = kept.names[int(np.argmin(np.isfinite(moved).all(axis=0)))]

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 
 #: A trial turn in radian, what it may change of other rows, and by which factor a bond may change before it is broken.
 _TRIAL, _SAME, _BROKEN = 0.3, 1e-8, 1.5
@@ -107,9 +107,8 @@ def leaves_the_rest(
     there = turn.turned(x, _TRIAL)
     change = everything.measure(there, time) - everything.measure(x, time)
     change[row] -= _TRIAL
-    periods = np.concatenate([np.full(c.n_rows, c.period or np.inf) for c in everything.constraints])
-    change -= np.where(np.isfinite(periods), periods, 0.0) * np.round(change / periods)
-    if not np.abs(change).max() < _SAME:
+    periods = np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in everything.constraints])
+    if not np.abs(nearest_image(change, periods)).max() < _SAME:
         return False
     part, atoms = everything.subset(others)
     before, after = (_volume(part, place[atoms]) for place in (x, there))

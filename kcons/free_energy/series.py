@@ -9,7 +9,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
 from kcons.steppers.files import in_one_piece, stored_arrays
@@ -64,9 +64,8 @@ class Series:
         done = 0.0
         if self._samples:
             before = self._samples[-1]
-            ends = (before.value, sample.value, before.multiplier, sample.multiplier, self.periods)
-            for a, b, first, last, period in zip(*(array.tolist() for array in ends), strict=True):
-                done += (first + last) / 2 * (b - a - (period * round((b - a) / period) if period else 0.0))
+            moved = nearest_image(sample.value - before.value, self.periods)
+            done = float((before.multiplier + sample.multiplier) / 2 @ moved)
         self._samples.append(sample)
         return done
 
@@ -159,9 +158,7 @@ class Series:
         if not self._samples:
             return np.zeros(0)
         value, force = self.value, self.multiplier
-        moved = np.diff(value, axis=0)
-        turns = self.periods > 0
-        moved[:, turns] -= self.periods[turns] * np.round(moved[:, turns] / self.periods[turns])
+        moved = nearest_image(np.diff(value, axis=0), self.periods)
         return np.concatenate([[0.0], np.cumsum(np.sum((force[1:] + force[:-1]) / 2 * moved, axis=1))])
 
     # -- files ----------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import ANGLE, LENGTH, numbers
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, UnsupportedError
 
 #: Number of a value along each coordinate.
@@ -113,13 +113,10 @@ class Grid:
 
     def apart(self, point: Point, place: Sequence[float]) -> float:
         """How far a point is from values, in steps of the grid."""
-        square = 0.0
-        for item, axis, v, w in zip(self.coordinates, self.values, self.at(point), place, strict=True):
-            d = v - w
-            if item.period is not None:
-                d -= item.period * np.round(d / item.period)
-            square += (d / (float(np.diff(axis).mean()) if len(axis) > 1 else 1.0)) ** 2
-        return float(np.sqrt(square))
+        off = np.subtract(self.at(point), place)
+        steps = [float(np.diff(axis).mean()) if len(axis) > 1 else 1.0 for axis in self.values]
+        periods = np.array([item.period or 0.0 for item in self.coordinates])
+        return float(np.linalg.norm(nearest_image(off, periods) / steps))
 
 
 def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:

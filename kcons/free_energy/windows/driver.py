@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import seed_number, whole_number
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 from kcons.free_energy.mean_forces import MeanForce, mean_force
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
@@ -248,9 +248,7 @@ class Windows:
         file = self.file(window)
         if not file.exists():
             return False
-        away = Series.load(file).value[:1] - np.array(window.target)
-        turns = self.periods > 0
-        away[:, turns] -= self.periods[turns] * np.round(away[:, turns] / self.periods[turns])
+        away = nearest_image(Series.load(file).value[:1] - np.array(window.target), self.periods)
         if np.abs(away).max(initial=0.0) > 1e-4:
             wanted = ", ".join(f"{q:g}" for q in self._targets[window.number])
             raise OccupiedError(

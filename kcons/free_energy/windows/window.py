@@ -15,7 +15,7 @@ from kcons.constraints import Constraint, Distance, MovingTarget
 from kcons.constraints.arguments import ANGLE, LENGTH, numbers, positive, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.motion.motion import Motion
@@ -256,8 +256,7 @@ class Held:
 
     def _walked(self, values: FloatArray) -> FloatArray | None:
         """The initial structure brought to `values` by small steps; None where a bond would change too much."""
-        way, turns = values - self.found, self.periods > 0
-        way[turns] -= self.periods[turns] * np.round(way[turns] / self.periods[turns])
+        way = nearest_image(values - self.found, self.periods)
         x = self.positions
         for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
             rows = [*self.others, *self.at(self.found + share * way)]
