@@ -345,7 +345,13 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     folder.mkdir(parents=True, exist_ok=True)
     with Bars() as watcher:
         result = sampling.compare(
-            fluid, methods=chosen.methods, budget=budget, seed=chosen.seed, watcher=watcher, settings=asked
+            fluid,
+            methods=chosen.methods,
+            budget=budget,
+            seed=chosen.seed,
+            watcher=watcher,
+            settings=asked,
+            partial=True,
         )
     table, explained = sampling_report.table(result), sampling_report.explanation(result)
     ranked = answer.answer_of_averages(result)
@@ -355,7 +361,7 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
         terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(table, explained, terminal)
     say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
-    return 0
+    return 130 if "interrupted" in result.settings else 0
 
 
 def _take_only(chosen: argparse.Namespace, known: Collection[str], why: str) -> None:

@@ -122,11 +122,15 @@ def compare_steps(
             seed=chosen.seed,
             watcher=watcher,
             settings=asked,
+            partial=True,
         )
     table, explained = report.table(result.runs, result.units, result.title), report.explanation(result.runs)
+    stopped = result.settings.get("interrupted")
+    if stopped:
+        explained = f"{stopped}\n{explained}"
     show(table, explained, console())
     say_written(report.write(result, folder, tables=[rendered(table), explained]))
-    return 0
+    return 130 if stopped else 0
 
 
 def _layers(chosen: argparse.Namespace, with_forces: Callable[[str], TestSystem]) -> Layers:

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from kcons.cli import main
+from kcons.comparison.averages import long_steps, sampling
 from kcons.comparison.stability import fuzz
 
 
@@ -59,3 +60,31 @@ def test_expensive_and_cheap_forces_that_cannot_be(command, text, tmp_path, monk
     (tmp_path / "run.pdb").touch()
     assert main.main(command.split()) == 2
     assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "module, function, planned, command",
+    [
+        (sampling, "_measured", 2, "compare thermostat --size 8 --methods isokinetic --dt 0.01,0.005 --budget 0.4"),
+        (long_steps, "measure", 4, "compare thermostat-water --quick --fast 3.8 --methods spheres --dt 4,8 --budget 1"),
+    ],
+)
+def test_ctrl_c_writes_the_runs_that_are_done(module, function, planned, command, tmp_path, monkeypatch, capsys):
+    measure, calls = getattr(module, function), []
+
+    def second_is_stopped(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) > 1:
+            raise KeyboardInterrupt
+        return measure(*arguments, **options)
+
+    monkeypatch.setattr(module, function, second_is_stopped)
+    assert main.main([*command.split(), "--out", str(tmp_path / "found")]) == 130
+    said = f"interrupted: 1 of {planned} runs were measured"
+    assert said in capsys.readouterr().out and said in (tmp_path / "found" / "compare.txt").read_text(encoding="utf-8")
+    data = json.loads((tmp_path / "found" / "compare.json").read_text(encoding="utf-8"))
+    assert data["settings"]["interrupted"] == said
+    assert len(data["runs" if "runs" in data else "measurements"]) == 1
+    calls[:] = [None]  # before anything is done
+    assert main.main([*command.split(), "--out", str(tmp_path / "empty")]) == 130
+    assert not (tmp_path / "empty" / "compare.json").exists()

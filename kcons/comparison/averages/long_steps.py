@@ -19,7 +19,7 @@ import numpy as np
 
 from kcons.comparison.averages.layers import Layers
 from kcons.comparison.study.machine import environment
-from kcons.comparison.study.study import Watcher, picked
+from kcons.comparison.study.study import Watcher, interruptible, picked
 from kcons.comparison.test_systems.system import Units
 from kcons.errors import InputError
 from kcons.steppers import BlanesMoan4, State, Stepper, System
@@ -392,6 +392,7 @@ def compare(
     seed: int = 1,
     watcher: Watcher | None = None,
     settings: Mapping[str, Any] | None = None,
+    partial: bool = False,
 ) -> StepComparison:
     """Run methods at several steps and frictions.
 
@@ -410,6 +411,8 @@ def compare(
     watcher : Watcher, optional
     settings : mapping, optional
         What else to record with the result.
+    partial : bool
+        Whether Ctrl-C ends the comparison with the runs that are done, which `settings["interrupted"]` then says.
 
     Raises
     ------
@@ -425,13 +428,15 @@ def compare(
     wanted, watching = chosen(methods), watcher or Watcher()
     asked = sorted(layers.steps if steps is None else steps)
     rates = (1 / (12.5 * layers.inner), 1 / (50 * layers.inner)) if frictions is None else tuple(frictions)
-    runs = []
+    planned: list[tuple[Method, float, float, float]] = []
     for method in wanted:
         lengths = asked if method.several or steps is not None else asked[:2]
         pairs = [(step, rate) for step in lengths for rate in (rates if method.frictions else rates[:1])]
-        for step, rate in pairs:
+        planned += [(method, *pair, budget / len(pairs)) for pair in pairs]
+    runs: list[Stepped] = []
+    with interruptible(lambda: len(runs), len(planned), "runs", partial) as interrupted:
+        for method, step, rate, share in planned:
             shown = f"{method.title}, {step / layers.units.time_unit:.3g} {layers.units.time}"
-            share = budget / len(pairs)
             with watching.piece(shown, 1):
                 runs.append(measure(layers, method, step, rate, budget=share, seed=seed, watcher=watching))
     known = layers.reference
@@ -440,7 +445,13 @@ def compare(
         units=layers.units,
         reference=None if known is None else (known.value / layers.molecules, known.error / layers.molecules),
         runs=runs,
-        settings={"methods": [m.name for m in wanted], "budget_seconds": budget, "seed": seed, **(settings or {})},
+        settings={
+            "methods": [m.name for m in wanted],
+            "budget_seconds": budget,
+            "seed": seed,
+            **(settings or {}),
+            **interrupted,
+        },
         environment=environment(),
     )
 

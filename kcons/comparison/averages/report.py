@@ -135,7 +135,8 @@ def explanation(comparison: SamplingComparison) -> str:
         "g": comparison.scene["degrees_of_freedom"],
     }
     notes = footnotes(numbered(m.note for m in comparison.measurements))
-    return "\n".join([*notes, *(line.format(**known) for line in EXPLANATION)])
+    said = [comparison.settings["interrupted"]] if "interrupted" in comparison.settings else []
+    return "\n".join([*said, *notes, *(line.format(**known) for line in EXPLANATION)])
 
 
 def figure(comparison: SamplingComparison) -> Figure:

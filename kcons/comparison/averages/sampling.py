@@ -17,7 +17,7 @@ import numpy as np
 
 from kcons.comparison.averages.step_zero import Extrapolated, extrapolate
 from kcons.comparison.study.machine import environment
-from kcons.comparison.study.study import Watcher, picked
+from kcons.comparison.study.study import Watcher, interruptible, picked
 from kcons.comparison.test_systems.fluid import Fluid
 from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray
@@ -233,6 +233,7 @@ def compare(
     seed: int = 1,
     watcher: Watcher | None = None,
     settings: Mapping[str, Any] | None = None,
+    partial: bool = False,
 ) -> SamplingComparison:
     """Sample `fluid` by thermostats.
 
@@ -251,6 +252,8 @@ def compare(
     watcher : Watcher, optional
     settings : mapping, optional
         What else to record with the result.
+    partial : bool
+        Whether Ctrl-C ends the comparison with the runs that are done, which `settings["interrupted"]` then says.
 
     Raises
     ------
@@ -268,10 +271,12 @@ def compare(
 
     measurements: list[Sampled] = []
     share = budget / len(fluid.time_steps)
-    for method in thermostats:
-        for dt in fluid.time_steps:
-            with watching.piece(f"{method.title}, {dt / fluid.units.time_unit:.3g} {fluid.units.time}", share):
-                measurements.append(_measured(fluid, method, dt, start, energy, share, most, seed, watching))
+    planned = len(thermostats) * len(fluid.time_steps)
+    with interruptible(lambda: len(measurements), planned, "runs", partial) as interrupted:
+        for method in thermostats:
+            for dt in fluid.time_steps:
+                with watching.piece(f"{method.title}, {dt / fluid.units.time_unit:.3g} {fluid.units.time}", share):
+                    measurements.append(_measured(fluid, method, dt, start, energy, share, most, seed, watching))
     return SamplingComparison(
         scene=_described(fluid, start, seed),
         reference={
@@ -280,7 +285,13 @@ def compare(
             "standard_error": energy.error / fluid.n_molecules,
             "moves_of_each_molecule": moves,
         },
-        settings={"methods": [m.name for m in thermostats], "budget_seconds": budget, "most": most, **(settings or {})},
+        settings={
+            "methods": [m.name for m in thermostats],
+            "budget_seconds": budget,
+            "most": most,
+            **(settings or {}),
+            **interrupted,
+        },
         environment=environment(),
         measurements=measurements,
     )

@@ -44,6 +44,24 @@ class Watcher:
             self.end()
 
 
+@contextmanager
+def interruptible(done: Callable[[], int], planned: int, what: str, partial: bool) -> Iterator[dict[str, str]]:
+    """Work that Ctrl-C ends with what is done of it, if `partial` and anything is.
+
+    Yields
+    ------
+    dict
+        Empty, or {'interrupted': what was done} afterwards: it belongs to the settings of the result.
+    """
+    said: dict[str, str] = {}
+    try:
+        yield said
+    except KeyboardInterrupt:
+        if not (partial and done()):
+            raise
+        said["interrupted"] = f"interrupted: {done()} of {planned} {what} were measured"
+
+
 class Kept:
     """A result in a file, with the code and the settings that made it.
 

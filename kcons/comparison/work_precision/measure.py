@@ -18,7 +18,7 @@ import numpy as np
 from kcons.comparison.methods.method import Method, OverBudgetError, Run, first_line, interrupted_after
 from kcons.comparison.methods.methods import METHODS, chosen
 from kcons.comparison.study.machine import environment, kernels_cached
-from kcons.comparison.study.study import Watcher
+from kcons.comparison.study.study import Watcher, interruptible
 from kcons.comparison.study.tables import duration
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import Potential
@@ -94,16 +94,11 @@ def compare(
 
     bench = Bench(test_system, reference, budget, watching, rounds)
     measurements: list[Measurement] = []
-    margin, interrupted = None, {}
-    try:
+    margin = None
+    with interruptible(lambda: len({m.method for m in measurements}), len(picked), "methods", partial) as interrupted:
         for method in picked:
             measurements += bench.all_settings(method)
         measurements, margin = bench.timed_again(measurements)
-    except KeyboardInterrupt:
-        if not (partial and measurements):
-            raise
-        done = len({m.method for m in measurements})
-        interrupted = {"interrupted": f"interrupted: {done} of {len(picked)} methods were measured"}
     unit = test_system.units.time_unit
     return Comparison(
         scene={
