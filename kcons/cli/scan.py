@@ -155,6 +155,8 @@ def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
         if n < 0 or (n == 0 and low != high):
             raise InputError(f"--steps is {n}; give a positive number", item="steps")
         axis = np.linspace(low, high, int(n) + 1)
+        if family == "angle" and (min(low, high) <= 0 or max(low, high) >= 180):
+            raise InputError(f"--angle from {low:g} to {high:g}: angles are between 0 and 180 degrees", item="angle")
         coordinates.append(_made(family, atoms, chosen))
         values.append(axis if family == "distance" else np.radians(axis))
     return coordinates, values

@@ -16,6 +16,9 @@ from kcons.cli import main
 needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 
 
+ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
+
+
 def run(*arguments):
     return main.main([str(a) for a in arguments])
 
@@ -153,6 +156,7 @@ def test_version(capsys):
         (["compare", "--redraw", ".", "--only", "rotor"], "--only does not go with --redraw"),
         (["compare", "--into", "page.md", "--methods", "rattle"], "--into goes with --redraw DIR"),
         (["compare", "thermostat", "--forces", "lj"], "--forces is not for fluids"),
+        (["plan", str(ALANINE), "--constrain", "none"], "none with kcons compare --forces"),
         (["plan", "thermostat", "--constrain", "hbonds"], "--constrain is not for fluids"),
         (["plan", "thermostat", "--select", "all", "--add-hydrogens"], "is not for fluids"),
     ],
@@ -200,8 +204,6 @@ def test_importing_the_command_imports_no_md_engine():
 
 
 # -- molecules in OpenMM ----------------------------------------------------------------------------
-
-ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 
 
 @needs_openmm

@@ -133,6 +133,7 @@ TURN = ("--dihedral", 2, 0, 1, 3)
         (("none.xyz", *TURN), "there is no file none.xyz"),
         (("peroxide.xyz",), "name what is scanned: --dihedral"),
         (("peroxide.xyz", "--distance", 0, 1), "give --from: only dihedrals have a range by themselves"),
+        (("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190), "angles are between 0 and 180 degrees"),
         (("peroxide.xyz", *TURN, "--to", 1, 2), "--to has 2 numbers for 1 coordinates"),
         (("peroxide.xyz", *TURN, "--steps", 0), "--steps is 0; give a positive number"),
         (("peroxide.xyz", *TURN, "--count-from", 1), "there is no atom 0; atoms are counted from 1"),

@@ -293,7 +293,11 @@ def _test_system(
     from kcons.openmm.integrator.system_checks import SystemRows
 
     if constrain not in CONSTRAIN:
-        raise InputError(f"cannot constrain {constrain!r}; there are {', '.join(CONSTRAIN)}", item="constrain")
+        raise InputError(
+            f"cannot constrain {constrain!r} by a force field of OpenMM; there are {', '.join(CONSTRAIN)} (allangles "
+            "and none with kcons compare --forces)",
+            item="constrain",
+        )
     box = _box(topology)
     if box is None:
         topology.setPeriodicBoxVectors(None)

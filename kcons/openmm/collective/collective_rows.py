@@ -76,8 +76,8 @@ class CollectiveRows(ReportedRows):
     Raises
     ------
     InputError
-        A number that is not finite, a name of no context parameter, a target to find without positions,
-        meets_system=False where a row does.
+        A number that is not finite, a particle or context parameter that is not there, a target to find without
+        positions, meets_system=False where a row does.
     UnsupportedError
         More rows than free force groups; rows on virtual sites. The System is unchanged then.
 

@@ -65,7 +65,7 @@ class ReportedRows(GroupRows):
 
         In kJ/mol per unit of q, z = A^T lambda. It is the mean of 2 L/h^2 of the first drift and 2 mu/h of the
         velocity projection before it, at the same positions; after a start, or when somebody moved x, only the former,
-        to first order.
+        to first order. NaN before the first step.
 
         Raises
         ------
@@ -86,7 +86,10 @@ class ReportedRows(GroupRows):
         return self._read(integrator, "lambda")
 
     def mean_multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
-        """Impulses of the last step over its length, shape (n_rows,): lambda averaged over the step, every scheme."""
+        """Impulses of the last step over its length, shape (n_rows,): lambda averaged over it, every scheme.
+
+        NaN before the first step.
+        """
         return self._read(integrator, "mean")
 
     def work(self, integrator: openmm.CustomIntegrator) -> FloatArray:

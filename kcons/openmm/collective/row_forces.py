@@ -197,9 +197,21 @@ def _united(sets: Iterable[set[int] | None]) -> set[int] | None:
 
 
 def moved_atoms(system: openmm.System, forces: Sequence[openmm.Force]) -> set[int]:
-    """The particles whose positions determine the sum of the Forces; all where that cannot be told."""
-    atoms = _united(atoms_of(force) for force in forces)
-    return set(range(system.getNumParticles())) if atoms is None else atoms
+    """The particles whose positions determine the sum of the Forces; all where that cannot be told.
+
+    Raises
+    ------
+    InputError
+        One is not in the System.
+    """
+    atoms, every = _united(atoms_of(force) for force in forces), set(range(system.getNumParticles()))
+    if atoms is not None and atoms - every:
+        raise InputError(
+            f"{forces[0].getName()} names particle {min(atoms - every)}; the System has {len(every)} particles",
+            item="force",
+            atoms=sorted(atoms - every),
+        )
+    return every if atoms is None else atoms
 
 
 class Rigid:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import openmm
@@ -82,8 +83,8 @@ class GroupRows(Part):
             p.number(self._of("sigma", k), "coordinate less target")
             p.number(self._of("now", k), "the same, after the last push")
             p.number(self._of("impulse", k), "multiplier times time, over this step")
-            p.number(self._of("mean", k), "multiplier, mean over the last step")
-            p.number(self._of("lambda", k), "multiplier at the start of the last step, to second order")
+            p.number(self._of("mean", k), "multiplier, mean over the last step", math.nan)  # none before it
+            p.number(self._of("lambda", k), "multiplier at the start of the last step, to second order", math.nan)
             p.number(self._of("end", k), "multiplier of the last velocity projection")
             p.number(self._of("work", k), "work done by moving the target")
             p.number(self._of("slope", k), "rate of the coordinate less that of the target")

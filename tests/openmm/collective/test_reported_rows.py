@@ -72,6 +72,7 @@ def test_multipliers_of_a_static_load():
     part = CollectiveRows(system, [Row(bond(0, 1), 0.3 * unit.nanometer)])
     integrator = ProjectedIntegrator(0.002, parts=[part])
     context = context_of(system, integrator, [[0, 0, 0], [-0.3, 0, 0]], np.zeros((2, 3)))
+    assert np.isnan([part.multipliers(integrator), part.mean_multipliers(integrator)]).all()
     integrator.step(10)
     # f = -30 along the rod, outwards: z = A^T lambda = +30, and grad r = -1 there.
     assert part.multipliers(integrator) == pytest.approx([-30.0], abs=1e-9)

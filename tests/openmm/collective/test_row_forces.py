@@ -395,3 +395,11 @@ def test_rows_on_virtual_sites_are_refused():
     system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
     with pytest.raises(UnsupportedError, match="particle 4, a virtual site"):
         CollectiveRows(system, [Row(bonds((2, 4)), 0.1)])
+
+
+@pytest.mark.parametrize("row", [bonds((0, 7)), Row(bonds((0, 7)), 0.1)])
+def test_rows_on_particles_that_are_not_there(row):
+    system = particles()
+    with pytest.raises(InputError, match=f"names particle 7; the System has {len(X)} particles") as raised:
+        CollectiveRows(system, [row], positions=X)
+    assert list(raised.value.atoms) == [7] and system.getNumForces() == 0

@@ -115,6 +115,15 @@ def test_start_off_the_constraints_is_refused(kind):
     assert residuals(system, context)[0] < 1e-9
 
 
+@kinds
+def test_a_context_without_positions_is_refused(kind):
+    system, integrator = alanine()[0], kind(1e-3)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    with pytest.raises(InputError, match="at the start; set positions first"):
+        integrator.step(1)
+    assert context.getStepCount() == 0
+
+
 def test_small_misses_at_the_start_are_tidied_up():
     system, x, v = alanine()
     rng = np.random.default_rng(0)
