@@ -131,6 +131,9 @@ TABLE = {
     "openmm_constraints.json": Measurement(OPENMM, script("08_openmm_constraints"), 5),
     "openmm_four_femtoseconds.json": Measurement(OPENMM, script("24_openmm_four_femtoseconds"), 50),
     "openmm_heavy_hydrogens.json": Measurement(OPENMM, script("25_openmm_heavy_hydrogens"), 4),
+    "openmm_mixed_drift.json": Measurement(
+        OPENMM, script("23_openmm_platforms", '--platform "OpenCL mixed" --drift 10 --starts 3 --out F'), 75
+    ),
     "openmm_platforms.json": Measurement(
         OPENMM,
         script("23_openmm_platforms", '--platform "CUDA mixed" --full --pdb FILE --out F'),

@@ -30,3 +30,16 @@ def test_rattle_has_the_speed_of_verlet_and_drifts_no_more():
             assert drift["picoseconds"] >= 100
         for row in rows.values():
             assert row["residual"] < 6e-8
+
+
+def test_rattle_drifts_no_more_than_verlet_on_opencl():
+    file = FILE.with_name("openmm_mixed_drift.json")
+    assert printed("23_openmm_platforms.py", file.name) in page("openmm_platforms.md")
+    (part,) = json.loads(file.read_text(encoding="utf-8"))["measurements"]
+    assert "Villin in water" in part["title"] and "OpenCL, mixed precision" in part["title"]
+    verlet = part["rows"]["VerletIntegrator"]["drift"]
+    for row in part["rows"].values():
+        assert row["residual"] < 6e-8
+        assert row["drift"]["picoseconds"] >= 10 and len(row["runs"]) == 3
+        error = (row["drift"]["error"] ** 2 + verlet["error"] ** 2) ** 0.5
+        assert abs(row["drift"]["slope"]) <= abs(verlet["slope"]) + 2 * error
