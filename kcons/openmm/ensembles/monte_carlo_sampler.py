@@ -168,6 +168,7 @@ class HamiltonianMonteCarlo:
             raise InputError("the state is none of a HamiltonianMonteCarlo", item="state")
         self._held, self.number = state.thermostat.copy(), int(state.step)
         self._put(state.positions, state.velocities, state.time)
+        self._expected = None  # the state may be of other forces
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the state; `restart=file` goes on, to the last bit where the platform is reproducible."""
@@ -342,10 +343,10 @@ class HamiltonianMonteCarlo:
         self._expected = positions_of(context), self._surroundings()
 
     def _others_acted(self, x: FloatArray) -> bool:
-        """Whether positions, box, parameters or forces are not what this object left."""
+        """Whether positions, box, parameters or forces are not what this object left, as far as it knows."""
         known = self._expected
         if known is None:
-            return False
+            return True
         return not np.array_equal(x, known[0]) or self._surroundings() != known[1]
 
     def _surroundings(self) -> tuple[Any, dict[str, float], int]:

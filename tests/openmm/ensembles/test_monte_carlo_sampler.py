@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -18,7 +19,7 @@ from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, WaysBackIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import exchange
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL, PROPOSAL, stream
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import ACCEPTED, POTENTIAL, PROPOSAL, SIZE, stream
 
 
 @cache
@@ -118,6 +119,16 @@ def test_restarts_go_on_to_the_last_bit():
     for name in ("positions", "velocities", "thermostat", "time", "step"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     assert a.step == 9 and 0 < whole.counts.accepted < 9
+
+
+def test_a_state_of_other_forces_is_judged_by_those_of_the_context():
+    _, sampler = waters(0.002)
+    sampler.step(2)
+    state = sampler.state
+    told = replace(state, thermostat=state.thermostat - 500 * (np.arange(SIZE) == POTENTIAL))
+    sampler.take(told)
+    sampler.step(3)
+    assert sampler.counts.accepted == state.thermostat[ACCEPTED] + 3
 
 
 def test_reporters_of_a_simulation_see_every_proposal():

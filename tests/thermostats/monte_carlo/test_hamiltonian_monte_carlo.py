@@ -135,6 +135,23 @@ def test_a_state_of_another_system_is_judged_by_the_energy_of_this_one():
     assert potential_of(carried) == potential_of(new) == soft.potential(carried.positions, 0.0)
 
 
+def test_a_loaded_state_is_judged_by_the_energy_of_its_forces_now():
+    """A run was saved with another force field, whose energies and forces mean nothing here."""
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 3, 12)
+    saved = run(held, state, 0.02, 2, stepper=sampler)
+    file = io.BytesIO()
+    saved.save(file)
+    other = System(held.motion, lambda x, t: 3 * waves(x), potential=lambda x, t: 3 * waves_potential(x) + 40)
+    file.seek(0)
+    after = HamiltonianMonteCarlo(0.5, 3, 12).step(other, State.load(file), 0.02)
+    plain = replace(saved, forces=None, thermostat=None, origin=None)
+    expected = HamiltonianMonteCarlo(0.5, 3, 12).step(other, plain, 0.02)
+    assert np.array_equal(after.positions, expected.positions)
+    assert after.thermostat[CHANGE] == expected.thermostat[CHANGE]
+    assert Counts.of(after).accepted == 3
+
+
 def test_what_has_no_solution_or_no_way_back_is_rejected_and_counted():
     """On a torus large steps land on the far side, from where the way back leads elsewhere."""
     x = np.array([[1.4, 0, 0]])
