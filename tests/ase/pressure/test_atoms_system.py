@@ -84,6 +84,24 @@ def test_a_run_goes_on_bit_for_bit(name, which, tmp_path):
     assert np.array_equal(again.state.barostat, whole.state.barostat)
 
 
+def test_a_step_that_fails_after_its_trial_leaves_no_cell_behind(monkeypatch):
+    """In the engine neither, which would take other images from then on."""
+    atoms, _ = gas()
+    dyn = MADE["langevin"](atoms, barostat=barostats()["monte carlo"], check_every=1)
+    before = atoms.cell.array.copy()
+    with monkeypatch.context() as broken:
+        broken.setattr(dyn.motion, "certify", lambda *args, **kwargs: 1 / 0)
+        for _ in range(2):
+            with pytest.raises(ZeroDivisionError):
+                dyn.run(1)
+            assert np.array_equal(atoms.cell.array, before)
+            assert np.array_equal(dyn.motion.lattice[0], before)
+    again, _ = gas()
+    for each in (dyn, MADE["langevin"](again, barostat=barostats()["monte carlo"], check_every=1)):
+        each.run(3)
+    assert np.array_equal(again.positions, atoms.positions) and not np.array_equal(atoms.cell.array, before)
+
+
 def test_a_run_goes_on_without_its_barostat_in_its_cell(tmp_path):
     """Also where it is refused, the cell of the atoms is their own."""
     atoms, _ = gas()
