@@ -79,7 +79,14 @@ class Counts:
 
     @classmethod
     def of(cls, state: State) -> Counts:
-        """Those of a state; all 0 before the first proposal."""
+        """Those of a state; all 0 before the first proposal.
+
+        Raises
+        ------
+        InputError
+            The state carries variables of another thermostat.
+        """
+        carried(state, SIZE, "HamiltonianMonteCarlo")
         held = np.zeros(SIZE) if state.thermostat is None else state.thermostat
         accepted, energy, irreversible, unsolved, not_finite = (
             round(float(n)) for n in held[ACCEPTED : NOT_FINITE + 1]
