@@ -48,7 +48,7 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     step_range,
     stream,
 )
-from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals
+from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals, refuse_failure
 
 #: What acts on a state between steps and knows no way back.
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
@@ -203,6 +203,8 @@ class HamiltonianMonteCarlo:
         ------
         InputError
             A share that is not between 0 and 1, fewer than 20 proposals.
+        ConvergenceError
+            No proposal of the second half could be made, however small the step became.
         """
         integrator = self.integrator
         assert integrator.scheme is not None
@@ -211,13 +213,16 @@ class HamiltonianMonteCarlo:
             best_share(integrator.scheme.order) if wanted is None else wanted,
         )
         check_proposals(proposals)
-        begun = integrator.getStepSize()
+        begun, late = integrator.getStepSize(), 0.0
         try:
-            for _ in range(proposals):
+            for k in range(proposals):
                 integrator.setStepSize(search.dt)
                 before = self._held[SUM]
                 self._propose()
-                search.learn(float(self._held[SUM] - before))
+                probability = float(self._held[SUM] - before)
+                search.learn(probability)
+                late += probability * (2 * k >= proposals)
+            refuse_failure(late, search)
         except BaseException:
             integrator.setStepSize(begun)
             raise

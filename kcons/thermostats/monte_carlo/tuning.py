@@ -137,12 +137,17 @@ def tune(
         probability = sum_of(state) - before
         search.learn(probability)
         late += probability * (2 * k >= proposals)
-    if not late > 0:
-        raise ConvergenceError(f"no proposal succeeded with time steps down to {search.dt:.3g}; is the start sound?")
+    refuse_failure(late, search)
     assert state.thermostat is not None
     held = np.zeros(SIZE)
     held[POTENTIAL] = state.thermostat[POTENTIAL]
     return Tuned(search.result, late / (proposals - (proposals + 1) // 2), replace(state, thermostat=held))
+
+
+def refuse_failure(late: float, search: DualAveraging) -> None:
+    """Raise `ConvergenceError` where the probabilities of the second half of the proposals add up to nothing."""
+    if not late > 0:
+        raise ConvergenceError(f"no proposal succeeded with time steps down to {search.dt:.3g}; is the start sound?")
 
 
 def sum_of(state: State) -> float:

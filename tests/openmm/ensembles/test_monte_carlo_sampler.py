@@ -15,7 +15,7 @@ from openmm import app, unit
 from openmm_systems import GPUS, context_of, loose_alanine, potential_energy, state_of, water_box
 
 from kcons.constraints import Plane, Sphere
-from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, WaysBackIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import exchange
@@ -228,6 +228,14 @@ def test_a_step_is_found():
     assert sampler.counts.proposals == 0
     sampler.step(60)
     assert 0.6 < sampler.counts.acceptance < 0.97
+
+
+def test_no_step_is_found_where_no_proposal_succeeds():
+    _, sampler = waters(0.002, steps=1, tolerance=1e-30)
+    with pytest.raises(ConvergenceError, match="no proposal succeeded"):
+        sampler.tune(proposals=20)
+    assert sampler.integrator.getStepSize()._value == 0.002
+    assert sampler.counts.irreversible == 20
 
 
 def test_configurations_are_exchanged():
