@@ -48,7 +48,7 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     step_range,
     stream,
 )
-from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals, refuse_failure
+from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals
 
 #: What acts on a state between steps and knows no way back.
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
@@ -213,16 +213,14 @@ class HamiltonianMonteCarlo:
             best_share(integrator.scheme.order) if wanted is None else wanted,
         )
         check_proposals(proposals)
-        begun, late = integrator.getStepSize(), 0.0
+        begun = integrator.getStepSize()
         try:
-            for k in range(proposals):
+            for _ in range(proposals):
                 integrator.setStepSize(search.dt)
                 before = self._held[SUM]
                 self._propose()
-                probability = float(self._held[SUM] - before)
-                search.learn(probability)
-                late += probability * (2 * k >= proposals)
-            refuse_failure(late, search)
+                search.learn(float(self._held[SUM] - before))
+            search.refuse_failure()
         except BaseException:
             integrator.setStepSize(begun)
             raise
@@ -326,8 +324,7 @@ class HamiltonianMonteCarlo:
         return potential, change / self.thermal_energy
 
     def _potential(self) -> float:
-        groups = self.integrator.getIntegrationForceGroups()
-        state = self.context.getState(energy=True, groups=groups)
+        state = self.context.getState(energy=True, groups=self.integrator.getIntegrationForceGroups())
         return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole))
 
     def _kinetic(self, v: FloatArray) -> float:
@@ -344,15 +341,12 @@ class HamiltonianMonteCarlo:
         self._note()
 
     def _note(self) -> None:
-        context = self.context
-        self._expected = positions_of(context), self._surroundings()
+        self._expected = positions_of(self.context), self._surroundings()
 
     def _others_acted(self, x: FloatArray) -> bool:
         """Whether positions, box, parameters or forces are not what this object left, as far as it knows."""
         known = self._expected
-        if known is None:
-            return True
-        return not np.array_equal(x, known[0]) or self._surroundings() != known[1]
+        return known is None or not np.array_equal(x, known[0]) or self._surroundings() != known[1]
 
     def _surroundings(self) -> tuple[Any, dict[str, float], int]:
         return _box(self.context), dict(self.context.getParameters()), self.integrator.refreshed
