@@ -219,6 +219,7 @@ class ConstrainedDynamics(MolecularDynamics):
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
             self.atoms.cell[...] = np.frombuffer(self._cell[0]).reshape(3, 3)  # which barostats change
+            self._bound.cell = b""  # type: ignore[union-attr]  # the engine takes it again
             name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)

@@ -113,13 +113,20 @@ class ThermostattedDynamics(ConstrainedDynamics):
     @property
     def thermostat_degrees_of_freedom(self) -> int:
         """g: 3 N less the rank of the rows and less the components of total momentum that are left alone."""
-        state = self._state
-        if isinstance(self.stepper, Isokinetic | NoseHooverChain) and state is not None:
-            return self.degrees_of_freedom if state.thermostat is None else int(state.thermostat[-1])
+        if isinstance(self.stepper, Isokinetic | NoseHooverChain):
+            return int(self._variables()[-1])
         count = self.degrees_of_freedom
         if getattr(self.stepper, "conserve_momentum", False):
             count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
         return count
+
+    def _variables(self) -> FloatArray:
+        """Those of the thermostat, which begins anew where masses or constraints have changed."""
+        self._systems()
+        if self._state is None or self._state.thermostat is None:
+            self._begin()
+        assert self._state is not None and self._state.thermostat is not None
+        return self._state.thermostat
 
     def get_temperature(self) -> float:
         """Kinetic temperature in K by the degrees of freedom that the thermostat acts on."""
@@ -201,12 +208,8 @@ class IsokineticDynamics(ThermostattedDynamics):
 
     def get_temperature(self) -> float:
         """Temperature in K of the configurations, 2K/((g - 1) k)."""
-        state = self._state
-        if state is None or state.thermostat is None:
-            self._begin()
-            state = self._state
-        assert state is not None and state.thermostat is not None
-        return float(state.thermostat[0] / ((state.thermostat[3] - 1) * units.kB))
+        twice, _, _, count = self._variables()
+        return float(twice / ((count - 1) * units.kB))
 
 
 class ConstrainedLangevin(ThermostattedDynamics):

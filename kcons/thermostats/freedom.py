@@ -110,6 +110,18 @@ def freedom(
     return Freedom(count, chosen, directions, turns)
 
 
+def may_be(count: float, system: System, state: State, atoms: ArrayLike | None, momentum: Momentum) -> bool:
+    """Whether `freedom` could find this count: states that were loaded may be of other rows, or of other `momentum`."""
+    chosen = None if atoms is None else atom_numbers(atoms, system.n_atoms)
+    if chosen is not None and len(chosen) == system.n_atoms:
+        chosen = None
+    most = system.motion.degrees_of_freedom if chosen is None else _count(system, state, chosen)
+    if momentum == "free" or (momentum == "auto" and chosen is not None):
+        return count == most
+    least = most - len(open_directions(system.motion, state.positions, state.time))
+    return count == least if momentum == "conserved" else least <= count <= most
+
+
 def _count(system: System, state: State, chosen: IntArray) -> int:
     held = system.motion.constraint_set
     count = 3 * len(chosen)

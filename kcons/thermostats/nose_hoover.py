@@ -20,6 +20,7 @@ from kcons.thermostats.freedom import (
     Momentum,
     carried,
     freedom,
+    may_be,
     refuse_friction,
     warn_of_conserved_momenta,
 )
@@ -117,6 +118,8 @@ class NoseHooverChain(Listed):
             raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
         self.momentum: Momentum = momentum
         self.force_evaluations = self.stepper.force_evaluations
+        #: Variables of the state that the last step ended in.
+        self._left: FloatArray | None = None
 
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
@@ -136,17 +139,22 @@ class NoseHooverChain(Listed):
         self.stepper.check(system)
 
     def start(self, system: System, state: State) -> State:
-        """The state with its forces and a chain at rest."""
+        """The state with its forces, and a chain at rest if it carries none, or one of other degrees of freedom."""
         if not state.is_of(system):
             state = replace(state, thermostat=None)  # degrees of freedom are those of another system
         known = carried(state, 2 * self.length + 1, "this NoseHooverChain")
         state = system.with_forces(state)
-        if known:
+        if known and (state.thermostat is self._left or self._fits(system, state)):
             return state
         assert state.forces is not None
         free = freedom(system, state, state.forces, None, self.momentum)
         warn_of_conserved_momenta(system.masses, state.velocities, free.directions, free.turns, stacklevel=4)
         return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
+
+    def _fits(self, system: System, state: State) -> bool:
+        """Whether g is that of this system."""
+        assert state.thermostat is not None
+        return may_be(float(state.thermostat[-1]), system, state, None, self.momentum)
 
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.
@@ -173,6 +181,7 @@ class NoseHooverChain(Listed):
                 "at most a twentieth of the period",
                 item="dt",
             ) from None
+        self._left = chain
         return replace(after, velocities=v, thermostat=chain)
 
     def _masses(self, count: float) -> FloatArray:

@@ -268,6 +268,22 @@ def test_isokinetic_goes_on_at_another_temperature(tmp_path):
     assert hotter.get_temperature() == pytest.approx(600) and hotter.nsteps == 9
 
 
+@pytest.mark.parametrize("kind", ["isokinetic", "nose-hoover"])
+def test_degrees_of_freedom_follow_masses_and_constraints_before_the_next_step(kind):
+    atoms = waters(2, Pairs(), zero_momentum=True)
+    moving = made(kind, atoms)
+    moving.run(2)
+    count = moving.thermostat_degrees_of_freedom
+    assert count == moving.degrees_of_freedom - 3
+    atoms.set_masses(2 * atoms.get_masses())
+    assert moving.degrees_of_freedom == count + 3
+    assert moving.thermostat_degrees_of_freedom == count
+    atoms.set_constraint()
+    assert moving.thermostat_degrees_of_freedom == 18 - 3
+    moving.run(1)
+    assert moving.thermostat_degrees_of_freedom == 18 - 3
+
+
 def test_files_that_hold_no_restart(tmp_path):
     atoms = waters()
     before = state(atoms)

@@ -82,6 +82,28 @@ def test_a_saved_run_goes_on_to_the_last_bit():
         assert np.array_equal(getattr(whole, name), getattr(again, name)), name
 
 
+def loaded(state):
+    file = io.BytesIO()
+    state.save(file)
+    file.seek(0)
+    return State.load(file)
+
+
+def test_a_loaded_chain_of_other_degrees_of_freedom_begins_anew():
+    """Fewer rows, or another `momentum`, than the run had that was saved."""
+    x = METHANE
+    held = system([Distance(TEN)], x, [12.0, 1, 1, 1, 1], waves)
+    state = State(x, thermal_velocities(held, x, 0.5, 1))
+    saved = run(held, state, 0.02, 5, stepper=NoseHooverChain(0.5, 1.0, momentum="free"))
+    assert saved.thermostat[-1] == 6
+    assert NoseHooverChain(0.5, 1.0).start(held, loaded(saved)).thermostat[-1] == 6
+    told = NoseHooverChain(0.5, 1.0, momentum="conserved")
+    with pytest.warns(UserWarning, match="total momentum is not zero"):
+        assert told.start(held, loaded(saved)).thermostat[-1] == 3
+    fewer = system([Distance(TEN[:4])], x, [12.0, 1, 1, 1, 1], waves)
+    assert np.array_equal(NoseHooverChain(0.5, 1.0).start(fewer, loaded(saved)).thermostat, [0.0] * 6 + [11.0])
+
+
 def test_another_stepper_of_order_two():
     held, state = started()
     a, b = (run(held, state, 0.01, 100, stepper=NoseHooverChain(0.5, 1.0, stepper=s)) for s in (None, Geodesic()))

@@ -15,6 +15,7 @@ from openmm import unit
 from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.conserved_momenta import (
     NONE,
     Momenta,
@@ -249,6 +250,7 @@ class Isokinetic(Value):
         twice = self._twice_kinetic(_count(self.atoms, integrator, context, momenta), int(np.sum(masses > 0)), found)
         turns = momenta.turns and self.temperature is not None
         warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=6)
+        warn_of_barostat(context, self.temperature, stacklevel=5)
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())

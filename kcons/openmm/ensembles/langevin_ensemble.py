@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
@@ -35,6 +38,11 @@ class Langevin(ConstantEnergy):
     ------
     InputError
         A temperature or a friction below zero.
+
+    Warns
+    -----
+    UserWarning
+        At the first step: a barostat has another temperature. So do the other ensembles, and `setTemperature`.
 
     Notes
     -----
@@ -87,6 +95,10 @@ class Langevin(ConstantEnergy):
         p.let("spread", "sqrt(2*kT*kept_share*sinh(friction*dt))", "noise")
         p.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
         project()
+
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Compare with a barostat."""
+        warn_of_barostat(context, self.temperature, stacklevel=5)
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}

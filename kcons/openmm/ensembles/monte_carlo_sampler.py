@@ -168,6 +168,7 @@ class HamiltonianMonteCarlo:
             raise InputError("the state is none of a HamiltonianMonteCarlo", item="state")
         self._held, self.number = state.thermostat.copy(), int(state.step)
         self._put(state.positions, state.velocities, state.time)
+        self._expected = None  # the state may be of other forces
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the state; `restart=file` goes on, to the last bit where the platform is reproducible."""
@@ -202,6 +203,8 @@ class HamiltonianMonteCarlo:
         ------
         InputError
             A share that is not between 0 and 1, fewer than 20 proposals.
+        ConvergenceError
+            No proposal of the second half could be made, however small the step became.
         """
         integrator = self.integrator
         assert integrator.scheme is not None
@@ -217,6 +220,7 @@ class HamiltonianMonteCarlo:
                 before = self._held[SUM]
                 self._propose()
                 search.learn(float(self._held[SUM] - before))
+            search.refuse_failure()
         except BaseException:
             integrator.setStepSize(begun)
             raise
@@ -320,8 +324,7 @@ class HamiltonianMonteCarlo:
         return potential, change / self.thermal_energy
 
     def _potential(self) -> float:
-        groups = self.integrator.getIntegrationForceGroups()
-        state = self.context.getState(energy=True, groups=groups)
+        state = self.context.getState(energy=True, groups=self.integrator.getIntegrationForceGroups())
         return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole))
 
     def _kinetic(self, v: FloatArray) -> float:
@@ -338,15 +341,12 @@ class HamiltonianMonteCarlo:
         self._note()
 
     def _note(self) -> None:
-        context = self.context
-        self._expected = positions_of(context), self._surroundings()
+        self._expected = positions_of(self.context), self._surroundings()
 
     def _others_acted(self, x: FloatArray) -> bool:
-        """Whether positions, box, parameters or forces are not what this object left."""
+        """Whether positions, box, parameters or forces are not what this object left, as far as it knows."""
         known = self._expected
-        if known is None:
-            return False
-        return not np.array_equal(x, known[0]) or self._surroundings() != known[1]
+        return known is None or not np.array_equal(x, known[0]) or self._surroundings() != known[1]
 
     def _surroundings(self) -> tuple[Any, dict[str, float], int]:
         return _box(self.context), dict(self.context.getParameters()), self.integrator.refreshed

@@ -11,6 +11,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.conserved_momenta import Momenta, Momentum, check_momentum, conserved_momenta
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.ensemble import ConstantEnergy
@@ -243,6 +244,7 @@ class NoseHoover(ConstantEnergy):
         if removes_centre_of_mass_motion(system):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
         warn_of_conserved_momenta(masses, v, momenta.directions, momenta.turns, stacklevel=6)
+        warn_of_barostat(context, self.temperature, stacklevel=5)
         integrator.program.write("momenta", count)
 
     def _count(self, integrator: Integrator, momenta: Momenta) -> int:

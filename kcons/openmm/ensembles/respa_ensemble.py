@@ -153,6 +153,7 @@ class LangevinRespa(Langevin):
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
+        super().begin(integrator, context)
         system = context.getSystem()
         for force in system.getForces():
             left = groups_of(force) - set(self.groups)

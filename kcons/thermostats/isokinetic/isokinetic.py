@@ -25,6 +25,7 @@ from kcons.thermostats.freedom import (
     Momentum,
     carried,
     freedom,
+    may_be,
     refuse_friction,
     warn_of_conserved_momenta,
 )
@@ -190,7 +191,7 @@ class Isokinetic(Splitting):
         elif not state.has_forces_of(system):
             state = replace(state, forces=None)
         share = self._share(system)
-        if carried(state, 4, "Isokinetic") and self._goes_on_from(share, state):
+        if carried(state, 4, "Isokinetic") and self._goes_on_from(system, share, state):
             if state.forces is None and state.thermostat is not None:
                 state = system.with_forces(state)
                 variables = np.array(state.thermostat)
@@ -222,14 +223,16 @@ class Isokinetic(Splitting):
         variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
 
-    def _goes_on_from(self, share: Share, state: State) -> bool:
-        """Whether the variables of the state are those of this temperature or energy, and of these atoms."""
+    def _goes_on_from(self, system: System, share: Share, state: State) -> bool:
+        """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
         left = self._left
         if state.thermostat is left[0] and self.thermal_energy == left[1] and self.kinetic_energy == left[2]:
             return True  # most often, and in no time
         assert state.thermostat is not None
         twice, _, _, count = state.thermostat.tolist()
         if abs(self._twice_kinetic(share, count, twice) - twice) > ROUNDING * twice:
+            return False
+        if not may_be(count, system, state, self.atoms, self.momentum):
             return False
         return abs(share.square(state.velocities) - twice) <= KEPT * twice
 

@@ -79,7 +79,14 @@ class Counts:
 
     @classmethod
     def of(cls, state: State) -> Counts:
-        """Those of a state; all 0 before the first proposal."""
+        """Those of a state; all 0 before the first proposal.
+
+        Raises
+        ------
+        InputError
+            The state carries variables of another thermostat.
+        """
+        carried(state, SIZE, "HamiltonianMonteCarlo")
         held = np.zeros(SIZE) if state.thermostat is None else state.thermostat
         accepted, energy, irreversible, unsolved, not_finite = (
             round(float(n)) for n in held[ACCEPTED : NOT_FINITE + 1]
@@ -169,6 +176,8 @@ class HamiltonianMonteCarlo(Portable):
         self.conserve_momentum = bool(conserve_momentum)
         self.tolerance = positive(tolerance, "tolerance")
         self._known: tuple[System, ReversedSteps, FloatArray] | None = None
+        #: Variables of the state that the last step ended in.
+        self._left: FloatArray | None = None
 
     def __repr__(self) -> str:
         few, most = self.steps
@@ -230,9 +239,12 @@ class HamiltonianMonteCarlo(Portable):
             raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
         held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
         held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
-        # Positions without forces may be new ones, and what a state carries that of another system.
-        if not state.has_forces_of(system) or math.isnan(held[POTENTIAL]):
-            held[POTENTIAL] = energy_at(system, state)
+        # Positions without forces may be new ones, and what a state carries, or a file, that of other forces.
+        strange = state.thermostat is not self._left and (state.origin is None or state.origin[0] is None)
+        if strange or not state.has_forces_of(system) or math.isnan(held[POTENTIAL]):
+            known, held[POTENTIAL] = held[POTENTIAL], energy_at(system, state)
+            if not math.isnan(known) and known != held[POTENTIAL]:
+                state = replace(state, forces=None)
             if not math.isfinite(held[POTENTIAL]):
                 raise NonFiniteError(
                     f"the potential energy is {held[POTENTIAL]} before step {state.step + 1}",
@@ -256,6 +268,7 @@ class HamiltonianMonteCarlo(Portable):
             held[POTENTIAL] = potential
         time, left_over = state.later(length)
         number, origin = state.step + 1, (ref(system), end.positions)
+        self._left = held
         return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 
     def trajectory(self, system: System, state: State, dt: float, count: int) -> State:

@@ -42,6 +42,7 @@ class DualAveraging:
         self.wanted = wanted_share(wanted)
         self._centre = self._log = math.log(positive(dt, "dt"))
         self._sum = self._mean = 0.0
+        self._told: list[float] = []
         self.made = 0
 
     @property
@@ -54,9 +55,21 @@ class DualAveraging:
         """The mean, later proposals counting more."""
         return math.exp(self._mean) if self.made else self.dt
 
+    @property
+    def acceptance(self) -> float:
+        """Mean probability of the second half of the proposals."""
+        second = self._told[(self.made + 1) // 2 :]
+        return sum(second) / len(second)
+
+    def refuse_failure(self) -> None:
+        """Raise `ConvergenceError` where none of the second half of the proposals succeeded."""
+        if not self.acceptance > 0:
+            raise ConvergenceError(f"no proposal succeeded with time steps down to {self.dt:.3g}; is the start sound?")
+
     def learn(self, probability: float) -> None:
         """A proposal with `dt` had this probability of being accepted."""
         self.made += 1
+        self._told.append(probability)
         self._sum += self.wanted - probability
         self._log = self._centre - math.sqrt(self.made) / PULL * self._sum / (self.made + BEFORE)
         share = self.made**-FORGET
@@ -130,19 +143,15 @@ def tune(
     search = DualAveraging(dt, best_share(sampler.order) if wanted is None else wanted)
     check_proposals(proposals)
     sampler.check(system)
-    late = 0.0
-    for k in range(proposals):
+    for _ in range(proposals):
         before = sum_of(state)
         state = sampler.step(system, state, search.dt)
-        probability = sum_of(state) - before
-        search.learn(probability)
-        late += probability * (2 * k >= proposals)
-    if not late > 0:
-        raise ConvergenceError(f"no proposal succeeded with time steps down to {search.dt:.3g}; is the start sound?")
+        search.learn(sum_of(state) - before)
+    search.refuse_failure()
     assert state.thermostat is not None
     held = np.zeros(SIZE)
     held[POTENTIAL] = state.thermostat[POTENTIAL]
-    return Tuned(search.result, late / (proposals - (proposals + 1) // 2), replace(state, thermostat=held))
+    return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
 
 
 def sum_of(state: State) -> float:

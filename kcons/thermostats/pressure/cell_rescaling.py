@@ -94,6 +94,10 @@ class CellRescaling(Barostat):
         mean, wide = self._drift(system, pieces, after, state.time, thermal_energy, dt)
         return _log_normal(-trial.e, mean, wide)
 
+    def acceptance(self, state: State) -> FloatArray:
+        """Mean probability of acceptance so far, the same for all modes, which change together; NaN without trials."""
+        return np.full(len(self.strains), super().acceptance(state)[0])
+
 
 def energy_by_strain(system: CellSystem, pieces: Pieces, place: Place) -> FloatArray:
     """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centres.

@@ -155,7 +155,8 @@ def find_pieces(
         raise UnsupportedError(
             f"row {constraint_set.row_name(row)} holds atom {atom} in space along {axis_name}, and the barostat moves "
             "everything along with the cell. Use a kind that leaves this axis alone, or held='stay': what is held then "
-            "stays as a wall from outside, and the pressure is that of the rest"
+            "stays as a wall from outside, and the pressure is that of the rest. Where only a pressure is asked for, "
+            "virial='atomic' tells it"
         )
     if not opened[:, axes].any():
         raise UnsupportedError("no piece of the system could follow the cell: all are held in space")

@@ -7,7 +7,7 @@ import pytest
 from ase import units
 from ase.build import bulk
 from ase.calculators.emt import EMT
-from ase.constraints import Hookean
+from ase.constraints import FixAtoms, Hookean
 from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 
@@ -83,6 +83,15 @@ def test_forces_of_ase_constraints_have_no_stress():
     reporter = PressureReporter(dynamics, virial="difference")
     reporter()
     assert np.isfinite(reporter.mean)
+
+
+def test_beside_fixed_atoms_the_pressure_is_the_atomic_one():
+    atoms = copper()
+    atoms.set_constraint(FixAtoms([0]))
+    dynamics = ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1)
+    with pytest.raises(UnsupportedError, match=r"holds atom 0 in space.*only a pressure is asked for, virial='atomic'"):
+        PressureReporter(dynamics)()
+    PressureReporter(dynamics, virial="atomic")()
 
 
 def test_what_is_no_way_to_the_pressure():

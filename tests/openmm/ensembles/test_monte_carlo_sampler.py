@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,11 +15,11 @@ from openmm import app, unit
 from openmm_systems import GPUS, context_of, loose_alanine, potential_energy, state_of, water_box
 
 from kcons.constraints import Plane, Sphere
-from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, WaysBackIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import exchange
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL, PROPOSAL, stream
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import ACCEPTED, POTENTIAL, PROPOSAL, SIZE, stream
 
 
 @cache
@@ -120,6 +121,16 @@ def test_restarts_go_on_to_the_last_bit():
     assert a.step == 9 and 0 < whole.counts.accepted < 9
 
 
+def test_a_state_of_other_forces_is_judged_by_those_of_the_context():
+    _, sampler = waters(0.002)
+    sampler.step(2)
+    state = sampler.state
+    told = replace(state, thermostat=state.thermostat - 500 * (np.arange(SIZE) == POTENTIAL))
+    sampler.take(told)
+    sampler.step(3)
+    assert sampler.counts.accepted == state.thermostat[ACCEPTED] + 3
+
+
 def test_reporters_of_a_simulation_see_every_proposal():
     system, x = water_box(8)
     topology = app.Topology()
@@ -217,6 +228,14 @@ def test_a_step_is_found():
     assert sampler.counts.proposals == 0
     sampler.step(60)
     assert 0.6 < sampler.counts.acceptance < 0.97
+
+
+def test_no_step_is_found_where_no_proposal_succeeds():
+    _, sampler = waters(0.002, steps=1, tolerance=1e-30)
+    with pytest.raises(ConvergenceError, match="no proposal succeeded"):
+        sampler.tune(proposals=20)
+    assert sampler.integrator.getStepSize()._value == 0.002
+    assert sampler.counts.irreversible == 20
 
 
 def test_configurations_are_exchanged():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import io
 import math
 
 import numpy as np
 import pytest
 from isokinetic_systems import ORDERS, water_and_more
 from reference import cases
-from thermostat_systems import dumbbells, integrated, quartic, quartic_potential, system, waves
+from thermostat_systems import dumbbells, integrated, quartic, quartic_potential, swirling, system, waves
 
 from kcons.constraints import Distance, Ellipsoid, KnifeEdge, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
@@ -295,6 +296,22 @@ def test_kinetic_energy_is_constant():
 @pytest.mark.validation
 def test_kinetic_energy_is_constant_over_a_million_steps():
     assert constancy(1_000_000, 1000) <= 1e-13
+
+
+@pytest.mark.parametrize(("momentum", "expected"), [("auto", 9), ("free", 12), ("conserved", 9)])
+def test_a_loaded_run_of_other_degrees_of_freedom_begins_anew(momentum, expected):
+    """Fewer rows, or another `momentum`, than the run had that was saved."""
+    held, x = dumbbells(2, force=swirling, potential=None)
+    v = thermal_velocities(held, x, 1.0, 1, zero_momentum=True)
+    saved = run(held, State(x, v), 0.01, 5, stepper=Isokinetic(1.0))
+    assert saved.thermostat[3] == 7
+    file = io.BytesIO()
+    saved.save(file)
+    file.seek(0)
+    free = system([], x, held.masses, swirling)
+    after = run(free, State.load(file), 0.01, 5, stepper=Isokinetic(1.0, momentum=momentum))
+    assert after.thermostat[3] == expected
+    assert (held.masses[:, None] * after.velocities**2).sum() == pytest.approx(expected - 1, rel=1e-12)
 
 
 @pytest.mark.parametrize("changed", ["temperature", "attribute", "energy", "convention", "atoms"])

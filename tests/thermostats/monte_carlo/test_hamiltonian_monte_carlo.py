@@ -16,6 +16,7 @@ from kcons.constraints import Distance, FixedAtoms, Formula, MovingTarget, Plane
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, ReversibilityCheck, State, Suzuki4, System, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats.freedom import MARK
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import CHANGE, POTENTIAL, PROPOSAL, stream
 from kcons.thermostats.monte_carlo.replica_exchange import potential_of
 
@@ -133,6 +134,30 @@ def test_a_state_of_another_system_is_judged_by_the_energy_of_this_one():
     carried = sampler.step(soft, replace(state, step=0, time=0.0), 0.1)
     np.testing.assert_array_equal(carried.positions, new.positions)
     assert potential_of(carried) == potential_of(new) == soft.potential(carried.positions, 0.0)
+
+
+def test_a_loaded_state_is_judged_by_the_energy_of_its_forces_now():
+    """A run was saved with another force field, whose energies and forces mean nothing here."""
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 3, 12)
+    saved = run(held, state, 0.02, 2, stepper=sampler)
+    file = io.BytesIO()
+    saved.save(file)
+    other = System(held.motion, lambda x, t: 3 * waves(x), potential=lambda x, t: 3 * waves_potential(x) + 40)
+    file.seek(0)
+    after = HamiltonianMonteCarlo(0.5, 3, 12).step(other, State.load(file), 0.02)
+    plain = replace(saved, forces=None, thermostat=None, origin=None)
+    expected = HamiltonianMonteCarlo(0.5, 3, 12).step(other, plain, 0.02)
+    assert np.array_equal(after.positions, expected.positions)
+    assert after.thermostat[CHANGE] == expected.thermostat[CHANGE]
+    assert Counts.of(after).accepted == 3
+
+
+@pytest.mark.parametrize("variables", [[0.5], [MARK, *range(9)]], ids=["Langevin", "IsokineticSpheres"])
+def test_states_of_other_thermostats_have_no_counts(variables):
+    _, state = started()
+    with pytest.raises(InputError, match="another thermostat, not of HamiltonianMonteCarlo"):
+        Counts.of(replace(state, thermostat=np.array(variables, dtype=float)))
 
 
 def test_what_has_no_solution_or_no_way_back_is_rejected_and_counted():

@@ -10,6 +10,7 @@ import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.isokinetic_ensemble import kelvins
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
@@ -68,6 +69,9 @@ class Settings(Integrator):
             The ensemble has none.
         """
         self._take(self.ensemble.at(kelvins(temperature)))
+        guard = self._guard
+        if guard is not None and guard.alive is not None and guard.started:
+            warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
 
     def getTemperature(self) -> unit.Quantity:
         """The temperature of the ensemble.
