@@ -40,9 +40,9 @@ _IONS = {
     "SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb", "BAR": "Ba", "CIO": "Cs",
 }  # fmt: skip
 #: Names of massless sites.
-_SITES = ("MW", "EP", "LP", "M", "OM", "VS", "XX", "X", "DUM")
-#: How far a mass may be from that of its element.
-_NEAR = 0.06
+_SITES = ("MW", "EP", "EPW", "LP", "M", "OM", "VS", "XX", "X", "DUM")
+#: How far a mass may be from that of its element; hydrogens heavier than this took mass from their neighbours.
+_NEAR, _HEAVY = 0.06, 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +327,11 @@ def elements_of(names: StrArray, residues: IntArray, residue_names: StrArray, ma
     nearest = np.abs(standard[None, :] - distinct[:, None]).argmin(axis=1)
     sure = np.abs(standard[nearest] - distinct) < _NEAR
     known = (sure & (symbols[nearest] != "He"))[which.ravel()]
+    # Where hydrogens are heavier than they are, their neighbours are lighter, as light as other elements.
+    if ((found == "H") & (masses > _HEAVY) & (masses < MASSES["Li"])).any():
+        known &= found == ""
+    # Nothing else is lighter than helium; Drude particles are lighter than hydrogen.
+    found = np.where((found == "") & (masses > MASSES["H"] - _NEAR) & (masses < 3.5), "H", found)
     found = np.where(known, symbols[nearest][which.ravel()], found)
     # Without mass there is no atom.
     return np.asarray(np.where(masses == 0, "", found))
