@@ -7,6 +7,7 @@ from typing import Any, Unpack
 
 import MDAnalysis
 import numpy as np
+from MDAnalysis.guesser import tables
 from MDAnalysis.lib.mdamath import triclinic_vectors
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,6 +21,7 @@ from kcons.topology.topology import (
     Topology,
     as_written,
     elements_of,
+    guessed_masses,
     listed,
     near_misses,
     require_kind,
@@ -175,14 +177,19 @@ def topology_of(universe: Any) -> Topology:
     residue_names = _texts(whole.residues[old], "resnames", len(old))
     known = hasattr(group, "resnames") and bool((np.char.strip(residue_names) != "").any())
     masses = np.asarray(group.masses, dtype=np.float64) if hasattr(group, "masses") else np.zeros(n)
-    measured = hasattr(group, "masses") and not _guessed(whole, "masses")
+    measured = hasattr(group, "masses") and not masses_guessed(whole)
     elements = _texts(group, "elements", n) if hasattr(group, "elements") else np.full(n, "")
     elements = np.char.capitalize(np.char.strip(elements))
-    elements = np.where(elements == "D", "H", elements)
+    heavy = elements == "D"
+    elements = np.where(heavy, "H", elements)
     lacking = elements == ""
     if lacking.any():
         found = elements_of(names, residues.astype(np.int64), residue_names, masses if measured else None)
         elements = np.where(lacking, found, elements)
+    if hasattr(group, "masses") and not measured:
+        # Masses that somebody set later are theirs.
+        mended = guessed_masses(masses, names, np.where(heavy, "D", elements))
+        masses = np.where(masses == _first_guess(group), mended, masses)
     ids = _texts(whole.residues[old], "resids", len(old)) if hasattr(whole.residues, "resids") else old.astype(str)
     chain = next((a for a in ("chainIDs", "segids") if hasattr(group, a)), None)
     if chain == "chainIDs":
@@ -227,9 +234,19 @@ def _bonds(whole: Any) -> IntArray:
     return np.asarray(attribute.values, dtype=np.int64).reshape(-1, 2)
 
 
-def _guessed(whole: Any, name: str) -> bool:
-    attribute = next((a for a in whole._topology.attrs if a.attrname == name), None)
+def masses_guessed(whole: Any) -> bool:
+    """Whether masses did not come with the topology."""
+    attribute = next((a for a in whole._topology.attrs if a.attrname == "masses"), None)
     return attribute is None or bool(attribute.is_guessed)
+
+
+def _first_guess(group: Any) -> FloatArray:
+    """Masses that MDAnalysis gives by elements or types, whatever the atoms are."""
+    kinds, kind = np.unique(
+        _texts(group, "elements" if hasattr(group, "elements") else "types", len(group)), return_inverse=True
+    )
+    table = [tables.masses.get(k, tables.masses.get(k.upper(), 0.0)) for k in kinds.tolist()]
+    return np.asarray(np.array(table)[kind.ravel()], dtype=np.float64)
 
 
 def _texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from io import StringIO
 
 import ase
@@ -36,6 +37,33 @@ def waters(count, names=("OW", "HW1", "HW2"), **attributes):
     shape = np.array([[0, 0, 0], [1, 0, 0], [np.cos(angle), np.sin(angle), 0], [0.1, 0.15, 0]])[:width]
     universe.atoms.positions = (shape + rng.uniform(0, 90, size=(count, 1, 3))).reshape(-1, 3)
     return universe
+
+
+def without_elements(atoms):
+    """A Universe of a PDB file that has no column of elements, of (name, residue, number); one atom each 3 angstrom."""
+    lines = [
+        f"ATOM  {k + 1:5d} {name:>4s} {residue:4s}A{number:4d}    {3.0 * k:8.3f}   0.000   0.000  1.00  0.00"
+        for k, (name, residue, number) in enumerate(atoms)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return mda.Universe(StringIO("\n".join([*lines, "END\n"])), format="PDB")
+
+
+def test_guessed_masses_are_those_of_the_elements():
+    """MDAnalysis takes the nitrogen NA of a porphyrin for sodium, selenium for sulfur, calcium for carbon."""
+    atoms = [(name, "HEM", 1) for name in ("NA", "SE", "CD", "EPW", "D1", "HG")]
+    universe = without_elements([*atoms, ("CA", "CA", 2), ("LI", "LI", 3), ("SOD", "SOD", 4)])
+    topology = snapshot_of(universe).topology
+    assert topology.elements.tolist() == ["N", "Se", "C", "", "H", "H", "Ca", "Li", "Na"]
+    standard = [14.007, 78.97, 12.011, 0.0, 2.014, 1.008, 40.08, 6.94, 22.99]
+    np.testing.assert_allclose(topology.masses, standard, atol=0.01)
+
+
+def test_masses_that_somebody_set_stay():
+    universe = without_elements([(name, "SER", 1) for name in ("NA", "HG", "CD")])
+    universe.atoms.masses = [9.0, 3.024, 12.0]
+    assert snapshot_of(universe).topology.masses.tolist() == [9.0, 3.024, 12.0]
 
 
 def test_selections_in_words(villin):
