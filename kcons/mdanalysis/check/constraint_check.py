@@ -23,7 +23,7 @@ from kcons.mdanalysis.check.bound_rows import BoundRows
 from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.check.conclusions import Asked, concluded
 from kcons.mdanalysis.check.files.endings import intact_frames, last_offset, leftover
-from kcons.mdanalysis.check.files.file_precision import FilePrecision, by_frame, precision_of
+from kcons.mdanalysis.check.files.file_precision import by_frame, precision_of_reader
 from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
 from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.findings import (
@@ -156,13 +156,8 @@ class ConstraintCheck(AnalysisBase):
         self._path = str(getattr(reader, "filename", None) or "")
         self._format = format_of(reader)
         called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
-        if self._path and Path(self._path).is_file():
-            in_file = precision_of(self._path, self._format, precision)
-        else:
-            in_file = FilePrecision(self._format or "MEMORY", precision or 0.0)
+        in_file = precision_of_reader(reader, precision)
         if getattr(reader, "transformations", ()):
-            # What a transformation did to the coordinates no longer lies on the grid of the file.
-            in_file = FilePrecision(self._format, in_file.step, in_file.unit)
             remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
         of_frames = None
         if in_file.exact and precision is None:

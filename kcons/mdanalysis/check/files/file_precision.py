@@ -11,14 +11,15 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
-from MDAnalysis.lib.util import anyopen
+from MDAnalysis.lib.util import anyopen, guess_format
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.mdanalysis.loading import format_of
 
 #: Formats whose numbers are floats in nanometres, which MDAnalysis turns into angstrom, in single precision again.
 _NANOMETRES = {"TRR", "H5MD", "TNG"}
@@ -165,6 +166,36 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
     if name in ("XYZ", "LAMMPSDUMP"):
         return _of_xyz(path) if name == "XYZ" else _of_dump(path)
     return FilePrecision(name, unit=10.0 if name in _NANOMETRES else 1.0)
+
+
+def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision:
+    """Precision of the coordinates that a reader of MDAnalysis gives; of several files, that of the coarsest.
+
+    Raises
+    ------
+    InputError
+        `step`, in angstrom, is not positive.
+    """
+    parts = [precision_of_reader(part, step) for part in getattr(reader, "readers", ())]
+    if parts:
+        return replace(max(parts, key=lambda part: float(part.half_step([1.0]))), exact=False)
+    name, path = format_of(reader) or "MEMORY", str(getattr(reader, "filename", None) or "")
+    if not Path(path).is_file():
+        return FilePrecision(name, step or 0.0)
+    changed = bool(getattr(reader, "transformations", ()))
+    if name == "MEMORY":
+        # Read from a file at once; what was done to the coordinates since is not known.
+        name, changed = _format_named(path), True
+    found = precision_of(path, name, step)
+    # What a transformation did to the coordinates no longer lies on the grid of the file.
+    return replace(found, exact=False) if changed else found
+
+
+def _format_named(path: str) -> str:
+    try:
+        return str(guess_format(path))
+    except ValueError:
+        return "MEMORY"
 
 
 def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:

@@ -429,3 +429,21 @@ def test_numbers_of_text_bound_what_they_lost(tmp_path, name, number, options):
     if read is not None:
         lost = np.abs(read.atoms.positions.astype(float) - x[0]).max(axis=1)
         assert np.all(lost <= precision_of(path, "XYZ").half_step(read.atoms.positions))
+
+
+@pytest.mark.parametrize("how", ["memory", "chain"])
+def test_coordinates_of_xtc_in_memory_and_of_several_files(tmp_path, how):
+    """They were rounded to 0.01 angstrom, whoever gives them now."""
+    x = whole()
+    names = [str(files.write(tmp_path / f"{k}.xtc", x[k : k + 4])) for k in (0, 4)]
+    for broken in (False, True):
+        made = files.universe(N)
+        if how == "chain":
+            made.load_new(names)
+        else:
+            made.load_new(names[0])
+            made.transfer_to_memory()
+            made.trajectory.get_array()[2, 4, 0] += 0.1 * broken
+        result = ConstraintCheck(made, BOND).run().check
+        assert result.precision == "XTC stores coordinates in steps of 0.01 Å (0.001 nm)"
+        assert result.status == ("violated" if broken and how == "memory" else "kept"), result.verdict
