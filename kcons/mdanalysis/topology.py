@@ -7,6 +7,7 @@ from typing import Any, Unpack
 
 import MDAnalysis
 import numpy as np
+from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.guesser import tables
 from MDAnalysis.lib.mdamath import triclinic_vectors
 from numpy.typing import ArrayLike, NDArray
@@ -139,7 +140,7 @@ def snapshot_of(universe: Any) -> Snapshot:
     cell = None
     if step.dimensions is not None and np.all(step.dimensions[:3] > 2.0):
         cell = _cell(step)
-    velocities = as_written(group.velocities) if step.has_velocities else None
+    velocities = as_written(group.velocities) if step.has_velocities and velocities_known(whole.trajectory) else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
 
 
@@ -272,6 +273,12 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
 def host_of(whole: Any) -> str:
     """Where a `Snapshot` of a Universe says that it came from."""
     return f"topology {_file(whole)}"
+
+
+def velocities_known(reader: Any) -> bool:
+    """Whether velocities are in angstrom/ps: of dumps of LAMMPS nobody tells their unit."""
+    named = (getattr(reader, "units", None) or {}).get("velocity", "")
+    return named is not None or isinstance(reader, MemoryReader)
 
 
 def _file(whole: Any) -> str:

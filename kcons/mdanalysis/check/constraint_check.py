@@ -36,7 +36,7 @@ from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
-from kcons.mdanalysis.topology import host_of
+from kcons.mdanalysis.topology import host_of, velocities_known
 from kcons.topology.rows_by_name import HeldRows
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
@@ -162,7 +162,10 @@ class ConstraintCheck(AnalysisBase):
         of_frames = None
         if in_file.exact and precision is None:
             of_frames = by_frame(self._path, reader._xdr.offsets, in_file)
-        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames)
+        known = velocities_known(reader)
+        if reader.ts.has_velocities and not known:
+            remarks.append(f"no temperature: velocities of {self._format} files have no unit")
+        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames, known)
         self.asked = Asked(called, labels, mode, text, removed, int(worst), remarks)
         self._pass_of_means = False
 

@@ -40,12 +40,15 @@ class Reading:
         For the kinetic energy.
     intact : int
         Frames before this one are not damaged.
+    velocities : bool
+        Whether velocities, where there are any, are in angstrom/ps.
     """
 
     precision: FilePrecision
     by_frame: Any
     masses: FloatArray | None
     intact: int
+    velocities: bool = True
 
     def precision_at(self, frame: int) -> FilePrecision:
         """Of the coordinates of one frame."""
@@ -120,7 +123,7 @@ class Reading:
 
     def _look(self, table: RowTable, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
         x = _flat(ts.positions)
-        v = _flat(ts.velocities) if ts.has_velocities else None
+        v = _flat(ts.velocities) if ts.has_velocities and self.velocities else None
         time = float(ts.time)
         part.times[k] = time
         table.look(part.found, k, x, v, ts.dimensions, time, summed)

@@ -7,7 +7,7 @@ import water_files as files
 
 from kcons.constraints import CenterOfMass, Distance
 from kcons.errors import InputError
-from kcons.mdanalysis import ConstraintCheck, load_trajectory
+from kcons.mdanalysis import ConstraintCheck, load_trajectory, to_ase
 
 N, SIDE = 40, 12.0
 
@@ -95,3 +95,18 @@ def test_sites_of_water_do_not_count(tmp_path):
         found.append(ConstraintCheck(universe, Distance(pairs), targets="first").run().check)
     assert found[0].degrees_of_freedom == found[1].degrees_of_freedom
     assert found[0].temperature["mean"] == pytest.approx(found[1].temperature["mean"])
+
+
+def test_velocities_without_a_unit_are_no_temperature(tmp_path):
+    """Those of LAMMPS are in angstrom/fs, or in anything else: files do not say."""
+    text = files.write_text(tmp_path / "w.lammpsdump", files.whole(files.water(N, 2))).read_text()
+    lines = [f"{line} 0.01 0 0" if line[0].isdigit() and len(line.split()) == 5 else line for line in text.splitlines()]
+    path = tmp_path / "v.lammpsdump"
+    path.write_text("\n".join(lines).replace("type x y z", "type x y z vx vy vz") + "\n")
+    universe = loaded(path)
+    assert universe.trajectory.ts.has_velocities
+    result = ConstraintCheck(universe, Distance(files.pairs(N), files.targets(N))).run().check
+    assert result.status == "kept" and result.temperature is None and result.units[0].rate_largest is None
+    assert "no temperature: velocities of LAMMPSDUMP files have no unit" in result.remarks
+    with pytest.warns(UserWarning, match="velocities of LAMMPSDUMP files have no unit: they are left out"):
+        assert not to_ase(universe).has("momenta")
