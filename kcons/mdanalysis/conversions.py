@@ -357,6 +357,7 @@ def _openmm(
     x = snapshot.positions
     if rows:
         held = ConstraintSet(rows, x, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist())
+        rows = list(held.constraints)  # with targets
         x = Motion(held, x).restore_positions(x)
         if sites is not None:
             x = sites.in_unit(NM).place(x)
