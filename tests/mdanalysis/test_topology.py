@@ -85,6 +85,10 @@ def test_rigid_bodies_in_words(villin):
         constraints_of, villin, "none", rigid_water=False, rigid_bodies=["resname TRP and name CA CB CG C N"]
     )
     assert rows.constraint_set.n_rows == 3 * 5 - 6
+    body = villin.select_atoms("resname TRP and name CA CB CG C N")
+    for given in (body, [body]):
+        same = quietly(constraints_of, villin, "none", rigid_water=False, rigid_bodies=given)
+        np.testing.assert_array_equal(same[0].atoms, rows[0].atoms)
 
 
 @pytest.mark.parametrize(
