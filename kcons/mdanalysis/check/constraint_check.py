@@ -226,9 +226,15 @@ class ConstraintCheck(AnalysisBase):
             numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
             first = numbers[0] if len(numbers) else None
         else:
-            asked = np.asarray(chosen["frames"])
-            asked = np.flatnonzero(asked) if asked.dtype == bool else asked
-            count = self._trajectory.n_frames
+            asked, count = np.asarray(chosen["frames"]), self._trajectory.n_frames
+            if asked.dtype == bool and asked.shape == (count,):
+                asked = np.flatnonzero(asked)
+            if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
+                raise InputError(
+                    f"frames are {chosen['frames']!r:.60}; give whole numbers, or True and False for each of the "
+                    f"{count} frames; for a slice start, stop and step",
+                    item="frames",
+                )
             for frame in asked[(asked < -count) | (asked >= count)]:
                 raise InputError(f"{self.asked.names[0]}: there is no frame {frame}; it has {count}", item="frames")
             first = int(asked[0]) if len(asked) else None

@@ -287,6 +287,9 @@ def test_wrong_frames_names_and_order(water):
     for frame in (count, -count - 1):
         with pytest.raises(InputError, match=f"there is no frame {frame}; it has {count}"):
             check.run(frames=[0, frame])
+    for frames in (slice(0, 3), [True] * (count - 1), [0.5]):
+        with pytest.raises(InputError, match=rf"give whole numbers, or True and False for each of the {count} frames"):
+            check.run(frames=frames)
     with pytest.raises(InputError, match="step is 0"):
         check.run(step=0)
     assert check.run(frames=[0, count - 1]).check.status
