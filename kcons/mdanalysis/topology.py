@@ -32,6 +32,8 @@ from kcons.topology.topology import (
 
 __all__ = ["constraints_of", "selected", "snapshot_of"]
 
+#: Cells narrower than this, in angstrom, are none: files without one have lengths of 1.
+NARROWEST = 2.0
 _REMEDY = "load a topology that has them (PSF, TPR, PRMTOP, MOL2, ...)"
 
 
@@ -138,7 +140,7 @@ def snapshot_of(universe: Any) -> Snapshot:
     described = topology_of(universe)
     _refuse_alternates(group, described)
     cell = None
-    if step.dimensions is not None and np.all(step.dimensions[:3] > 2.0):
+    if step.dimensions is not None and np.all(step.dimensions[:3] > NARROWEST):
         cell = _cell(step)
     velocities = as_written(group.velocities) if step.has_velocities and velocities_known(whole.trajectory) else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
