@@ -31,7 +31,7 @@ from kcons.mdanalysis.check.findings import (
     joined,
 )
 from kcons.mdanalysis.check.rank_by_pieces import rank_of
-from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by
+from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remarks_on
 from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
@@ -157,15 +157,11 @@ class ConstraintCheck(AnalysisBase):
         self._format = format_of(reader)
         called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         in_file = precision_of_reader(reader, precision)
-        if getattr(reader, "transformations", ()):
-            remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+        remarks += remarks_on(reader)
         of_frames = None
         if in_file.exact and precision is None:
             of_frames = by_frame(self._path, reader._xdr.offsets, in_file)
-        known = velocities_known(reader)
-        if reader.ts.has_velocities and not known:
-            remarks.append(f"no temperature: velocities of {self._format} files have no unit")
-        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames, known)
+        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames, velocities_known(reader))
         self.asked = Asked(called, labels, mode, text, removed, int(worst), remarks)
         self._pass_of_means = False
 
