@@ -136,6 +136,7 @@ def snapshot_of(universe: Any) -> Snapshot:
         raise InputError(
             f"{_file(whole)} has no coordinates; load a coordinates file beside it", item="positions"
         ) from None
+    require_angstrom(whole.trajectory)
     # Of a part, only the atoms of the part; but whole residues keep their numbers.
     described = topology_of(universe)
     _refuse_alternates(group, described)
@@ -161,6 +162,21 @@ def _refuse_alternates(group: Any, topology: Topology) -> None:
                 item="atoms",
                 atoms=[other, atom],
             )
+
+
+def require_angstrom(reader: Any) -> None:
+    """Refuse coordinates that MDAnalysis was told to leave in nanometres.
+
+    Raises
+    ------
+    InputError
+    """
+    length = (getattr(reader, "units", None) or {}).get("length")
+    if getattr(reader, "convert_units", True) is False and length not in (None, "Angstrom", "A"):
+        raise InputError(
+            f"positions are in {length}, since the Universe was made with convert_units=False; make it without",
+            item="positions",
+        )
 
 
 def _require_atoms(universe: Any) -> None:

@@ -13,7 +13,7 @@ from host_systems import VILLIN, quietly, read_universe
 
 from kcons.constraints import CenterDistance, CenterOfMass, Sphere
 from kcons.errors import InputError
-from kcons.mdanalysis import constraints_of, selected, snapshot_of, to_ase
+from kcons.mdanalysis import ConstraintCheck, constraints_of, selected, snapshot_of, to_ase
 
 
 @pytest.fixture(scope="module")
@@ -214,3 +214,19 @@ def test_selections_that_are_neither_words_nor_groups_of_these_atoms(villin):
     for group in (villin.atoms[-3:], protein[:0], read_universe(VILLIN).atoms[:3]):
         with pytest.raises(InputError, match="give some of the atoms of <AtomGroup with 582 atoms>"):
             quietly(constraints_of, protein, select=group)
+
+
+def test_coordinates_left_in_nanometres_are_refused(tmp_path):
+    """Rows would hold O-H at 0.1 angstrom."""
+    path = tmp_path / "w.gro"
+    made = waters(3)
+    made.dimensions = [90.0] * 6
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made.atoms.write(str(path))
+        universes = [mda.Universe(str(path), convert_units=convert) for convert in (True, False)]
+    rows = constraints_of(universes[0])
+    with pytest.raises(InputError, match=r"positions are in nm, .* convert_units=False; make it without"):
+        constraints_of(universes[1])
+    with pytest.raises(InputError, match="positions are in nm"):
+        ConstraintCheck(universes[1], list(rows))

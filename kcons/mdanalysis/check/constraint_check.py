@@ -36,7 +36,7 @@ from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
-from kcons.mdanalysis.topology import host_of, velocities_known
+from kcons.mdanalysis.topology import host_of, require_angstrom, velocities_known
 from kcons.topology.rows_by_name import HeldRows
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
@@ -116,6 +116,7 @@ class ConstraintCheck(AnalysisBase):
         **options: Any,
     ) -> None:
         universe = atoms.universe
+        require_angstrom(universe.trajectory)
         super().__init__(universe.trajectory, **options)
         if isinstance(constraints, HeldRows):
             constraints.require_atoms(len(universe.atoms), universe.atoms.indices, host_of(universe))
