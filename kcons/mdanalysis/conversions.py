@@ -19,7 +19,8 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
-from kcons.mdanalysis.topology import check_box, snapshot_of
+from kcons.mdanalysis.loading import format_of
+from kcons.mdanalysis.topology import check_box, snapshot_of, velocities_known
 from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows
@@ -101,7 +102,7 @@ def to_ase(universe: Any, constraints: Iterable[Constraint] = ()) -> ase.Atoms:
     UserWarning
         Molecules seem to be cut at the edge of a box, which the universe does not have.
     """
-    snapshot = _with_bonds_of(snapshot_of(universe), constraints)
+    snapshot = _with_bonds_of(_snapshot(universe), constraints)
     _warn_of_cut(snapshot)
     return _held_atoms(snapshot, _rows(constraints, 1.0))
 
@@ -169,7 +170,7 @@ def to_openmm(
         The force field does not know a residue; a cell that OpenMM does not take; atoms of a residue scattered; rows
         that were made for another group.
     """
-    return _openmm(snapshot_of(universe), constraints, 1.0, force_field, options)
+    return _openmm(_snapshot(universe), constraints, 1.0, force_field, options)
 
 
 def from_openmm(
@@ -300,6 +301,19 @@ def _rows(constraints: Iterable[Constraint], angstrom: float) -> list[Constraint
     return list(constraints)
 
 
+def _snapshot(universe: Any) -> Snapshot:
+    snapshot = snapshot_of(universe)
+    reader = universe.atoms.universe.trajectory
+    if reader.ts.has_velocities and not velocities_known(reader):
+        warnings.warn(
+            f"velocities of {format_of(reader)} files have no unit: they are left out; set them where they are needed, "
+            "or give a file that has one (TRR, H5MD, NetCDF)",
+            UserWarning,
+            stacklevel=3,
+        )
+    return snapshot
+
+
 def _warn_of_cut(snapshot: Snapshot) -> None:
     """Without a cell, bonds across the box are as long as it is, and nothing can make their molecules whole."""
     bonds, x = snapshot.topology.bonds, snapshot.positions
@@ -343,6 +357,7 @@ def _openmm(
     x = snapshot.positions
     if rows:
         held = ConstraintSet(rows, x, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist())
+        rows = list(held.constraints)  # with targets
         x = Motion(held, x).restore_positions(x)
         if sites is not None:
             x = sites.in_unit(NM).place(x)

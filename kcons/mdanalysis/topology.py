@@ -7,6 +7,8 @@ from typing import Any, Unpack
 
 import MDAnalysis
 import numpy as np
+from MDAnalysis.coordinates.memory import MemoryReader
+from MDAnalysis.guesser import tables
 from MDAnalysis.lib.mdamath import triclinic_vectors
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,6 +22,7 @@ from kcons.topology.topology import (
     Topology,
     as_written,
     elements_of,
+    guessed_masses,
     listed,
     near_misses,
     require_kind,
@@ -29,6 +32,8 @@ from kcons.topology.topology import (
 
 __all__ = ["constraints_of", "selected", "snapshot_of"]
 
+#: Cells narrower than this, in angstrom, are none: files without one have lengths of 1.
+NARROWEST = 2.0
 _REMEDY = "load a topology that has them (PSF, TPR, PRMTOP, MOL2, ...)"
 
 
@@ -131,13 +136,14 @@ def snapshot_of(universe: Any) -> Snapshot:
         raise InputError(
             f"{_file(whole)} has no coordinates; load a coordinates file beside it", item="positions"
         ) from None
+    require_angstrom(whole.trajectory)
     # Of a part, only the atoms of the part; but whole residues keep their numbers.
     described = topology_of(universe)
     _refuse_alternates(group, described)
     cell = None
-    if step.dimensions is not None and np.all(step.dimensions[:3] > 2.0):
+    if step.dimensions is not None and np.all(step.dimensions[:3] > NARROWEST):
         cell = _cell(step)
-    velocities = as_written(group.velocities) if step.has_velocities else None
+    velocities = as_written(group.velocities) if step.has_velocities and velocities_known(whole.trajectory) else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
 
 
@@ -158,6 +164,21 @@ def _refuse_alternates(group: Any, topology: Topology) -> None:
             )
 
 
+def require_angstrom(reader: Any) -> None:
+    """Refuse coordinates that MDAnalysis was told to leave in nanometres.
+
+    Raises
+    ------
+    InputError
+    """
+    length = (getattr(reader, "units", None) or {}).get("length")
+    if getattr(reader, "convert_units", True) is False and length not in (None, "Angstrom", "A"):
+        raise InputError(
+            f"positions are in {length}, since the Universe was made with convert_units=False; make it without",
+            item="positions",
+        )
+
+
 def _require_atoms(universe: Any) -> None:
     if not isinstance(getattr(universe, "atoms", None), MDAnalysis.AtomGroup):
         wanted = "a Universe or AtomGroup, as MDAnalysis.Universe(topology, coordinates) gives it"
@@ -175,14 +196,19 @@ def topology_of(universe: Any) -> Topology:
     residue_names = _texts(whole.residues[old], "resnames", len(old))
     known = hasattr(group, "resnames") and bool((np.char.strip(residue_names) != "").any())
     masses = np.asarray(group.masses, dtype=np.float64) if hasattr(group, "masses") else np.zeros(n)
-    measured = hasattr(group, "masses") and not _guessed(whole, "masses")
+    measured = hasattr(group, "masses") and not masses_guessed(whole)
     elements = _texts(group, "elements", n) if hasattr(group, "elements") else np.full(n, "")
     elements = np.char.capitalize(np.char.strip(elements))
-    elements = np.where(elements == "D", "H", elements)
+    heavy = elements == "D"
+    elements = np.where(heavy, "H", elements)
     lacking = elements == ""
     if lacking.any():
         found = elements_of(names, residues.astype(np.int64), residue_names, masses if measured else None)
         elements = np.where(lacking, found, elements)
+    if hasattr(group, "masses") and not measured:
+        # Masses that somebody set later are theirs.
+        mended = guessed_masses(masses, names, np.where(heavy, "D", elements))
+        masses = np.where(masses == _first_guess(group), mended, masses)
     ids = _texts(whole.residues[old], "resids", len(old)) if hasattr(whole.residues, "resids") else old.astype(str)
     chain = next((a for a in ("chainIDs", "segids") if hasattr(group, a)), None)
     if chain == "chainIDs":
@@ -227,9 +253,19 @@ def _bonds(whole: Any) -> IntArray:
     return np.asarray(attribute.values, dtype=np.int64).reshape(-1, 2)
 
 
-def _guessed(whole: Any, name: str) -> bool:
-    attribute = next((a for a in whole._topology.attrs if a.attrname == name), None)
+def masses_guessed(whole: Any) -> bool:
+    """Whether masses did not come with the topology."""
+    attribute = next((a for a in whole._topology.attrs if a.attrname == "masses"), None)
     return attribute is None or bool(attribute.is_guessed)
+
+
+def _first_guess(group: Any) -> FloatArray:
+    """Masses that MDAnalysis gives by elements or types, whatever the atoms are."""
+    kinds, kind = np.unique(
+        _texts(group, "elements" if hasattr(group, "elements") else "types", len(group)), return_inverse=True
+    )
+    table = [tables.masses.get(k, tables.masses.get(k.upper(), 0.0)) for k in kinds.tolist()]
+    return np.asarray(np.array(table)[kind.ravel()], dtype=np.float64)
 
 
 def _texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
@@ -255,6 +291,12 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
 def host_of(whole: Any) -> str:
     """Where a `Snapshot` of a Universe says that it came from."""
     return f"topology {_file(whole)}"
+
+
+def velocities_known(reader: Any) -> bool:
+    """Whether velocities are in angstrom/ps: of dumps of LAMMPS nobody tells their unit."""
+    named = (getattr(reader, "units", None) or {}).get("velocity", "")
+    return named is not None or isinstance(reader, MemoryReader)
 
 
 def _file(whole: Any) -> str:

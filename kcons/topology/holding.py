@@ -127,7 +127,8 @@ class Holding:
     @cached_property
     def bodies(self) -> tuple[str | Sequence[int] | IntArray, ...]:
         """What is held rigid, as it was given."""
-        return (self.rigid_bodies,) if isinstance(self.rigid_bodies, str) else tuple(self.rigid_bodies)
+        one = isinstance(self.rigid_bodies, str) or hasattr(self.rigid_bodies, "atoms")  # words, or an AtomGroup
+        return (self.rigid_bodies,) if one else tuple(self.rigid_bodies)  # type: ignore[return-value]
 
     @cached_property
     def own_rows(self) -> tuple[tuple[Any, RowMaker], ...]:

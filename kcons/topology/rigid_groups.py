@@ -115,8 +115,8 @@ def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: f
     number, residue = np.unique(topology.residues[atoms], return_inverse=True)
     symbol = topology.elements[atoms]
     oxygen, hydrogen = symbol == "O", symbol == "H"
-    # Anything else counts as a site if it is neither of these elements and has no mass, or no element.
-    site = ~oxygen & ~hydrogen & ((symbol == "") | (topology.masses[atoms] == 0))
+    # Anything else counts as a site if it has no mass; Drude particles have some, and move by themselves.
+    site = ~oxygen & ~hydrogen & (topology.masses[atoms] == 0)
     count = [
         np.bincount(residue, weights=mask, minlength=len(number)) for mask in (oxygen, hydrogen, site, symbol != "?")
     ]
@@ -125,10 +125,13 @@ def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: f
     odd = np.flatnonzero(~whole & ~alone)
     if len(odd):
         where = atoms[residue == odd[0]]
+        n_oxygen, n_hydrogen, n_site, n_all = (int(of_each[odd[0]]) for of_each in count)
+        others = n_all - n_oxygen - n_hydrogen - n_site
+        besides = f" and {others} with mass besides" if others else ""
         raise InputError(
             f"residue {topology.residue_name(int(number[odd[0]]))} (atoms {where[0]} to {where[-1]}) is called water "
-            f"but has the atoms {listed(topology.names[where])}, with {int(count[0][odd[0]])} oxygens and "
-            f"{int(count[1][odd[0]])} hydrogens; rename it, mend the file, or pass rigid_water=False",
+            f"but has the atoms {listed(topology.names[where])}, with {n_oxygen} oxygens and {n_hydrogen} hydrogens"
+            f"{besides}; rename it, mend the file, or pass rigid_water=False",
             item="rigid_water",
             atoms=where.tolist(),
         )

@@ -203,6 +203,7 @@ def rows_of(
     groups += listed_bodies(snapshot, bodies)
     _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))
     bonds = snapshot.topology.bonds
+    bonds = bonds[~_closing(bonds, topology.hydrogen)]
     _refuse_torn(snapshot, bonds[inside_bodies(snapshot.topology.n_atoms, bonds, groups)])
     rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
     rows += waters.rows(geometry, snapshot.angstrom)

@@ -33,16 +33,17 @@ MASSES: dict[str, float] = {
     "Pd": 106.42, "Ag": 107.87, "Cd": 112.41, "Sn": 118.71, "Te": 127.60, "I": 126.90, "Xe": 131.29, "Cs": 132.91,
     "Ba": 137.33, "W": 183.84, "Ir": 192.22, "Pt": 195.08, "Au": 196.97, "Hg": 200.59, "Tl": 204.38, "Pb": 207.2,
 }  # fmt: skip
+_DEUTERIUM = 2.014
 #: Elements with two letters that atom names within a molecule may begin with.
-_LONG = ("CL", "BR", "SE", "SI", "FE", "ZN", "MG", "MN", "LI", "AL")
+_LONG = ("CL", "BR", "SE", "SI", "FE", "ZN", "MG", "MN", "LI", "AL", "CU")
 #: Ions whose name is no symbol.
 _IONS = {
     "SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb", "BAR": "Ba", "CIO": "Cs",
 }  # fmt: skip
 #: Names of massless sites.
-_SITES = ("MW", "EP", "LP", "M", "OM", "VS", "XX", "X", "DUM")
-#: How far a mass may be from that of its element.
-_NEAR = 0.06
+_SITES = ("MW", "EP", "EPW", "LP", "M", "OM", "VS", "XX", "X", "DUM")
+#: How far a mass may be from that of its element; hydrogens heavier than this took mass from their neighbours.
+_NEAR, _HEAVY = 0.06, 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,9 +328,38 @@ def elements_of(names: StrArray, residues: IntArray, residue_names: StrArray, ma
     nearest = np.abs(standard[None, :] - distinct[:, None]).argmin(axis=1)
     sure = np.abs(standard[nearest] - distinct) < _NEAR
     known = (sure & (symbols[nearest] != "He"))[which.ravel()]
+    # Where hydrogens are heavier than they are, their neighbours are lighter, as light as other elements.
+    if ((found == "H") & (masses > _HEAVY) & (masses < MASSES["Li"])).any():
+        known &= found == ""
+    # Nothing else is lighter than helium; Drude particles are lighter than hydrogen.
+    found = np.where((found == "") & (masses > MASSES["H"] - _NEAR) & (masses < 3.5), "H", found)
     found = np.where(known, symbols[nearest][which.ravel()], found)
     # Without mass there is no atom.
     return np.asarray(np.where(masses == 0, "", found))
+
+
+def guessed_masses(guess: FloatArray, names: StrArray, elements: StrArray) -> FloatArray:
+    """Masses that a host guessed from names, with those of the elements where it took the atoms for others.
+
+    Parameters
+    ----------
+    guess : ndarray, shape (n_atoms,)
+    elements : ndarray of str, shape (n_atoms,)
+        With 'D' for deuterium.
+    """
+    kinds, kind = np.unique(np.char.add(np.char.add(elements, "/"), names), return_inverse=True)
+    known = np.array([_mass(*k.split("/", 1)) for k in kinds.tolist()] or [0.0])[kind.ravel()]
+    return np.where(np.abs(known - guess) > _NEAR, known, guess)
+
+
+def _mass(element: str, name: str) -> float:
+    """Of an atom by its element, 0 of a site; NaN where neither is known."""
+    if element in ("", "H"):
+        letters = "".join(c for c in _bare(name.upper()) if c.isalpha())
+        element = "D" if element and letters == "D" else element
+        if not element and letters in _SITES:
+            return 0.0
+    return _DEUTERIUM if element == "D" else MASSES.get(element, np.nan)
 
 
 def _bare(name: str) -> str:

@@ -175,6 +175,13 @@ def test_cut_molecules_are_whole_in_openmm(villin, held):
     assert np.abs(moved - np.round(moved)).max() < 1e-5
 
 
+def test_targets_that_are_left_out_are_those_of_the_frame():
+    universe = ethane_cut(box=True)
+    system = to_openmm(universe, [Distance([(0, 1), (2, 3)])]).system
+    held = [system.getConstraintParameters(k) for k in range(2)]
+    assert [(i, j, round(length._value, 6)) for i, j, length in held] == [(0, 1, 0.1), (2, 3, 0.1)]
+
+
 def test_what_cannot_be_converted_is_refused(villin):
     group = villin.select_atoms("protein and resid 1")
     atoms = to_ase(group)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from io import StringIO
 
 import ase
@@ -12,7 +13,7 @@ from host_systems import VILLIN, quietly, read_universe
 
 from kcons.constraints import CenterDistance, CenterOfMass, Sphere
 from kcons.errors import InputError
-from kcons.mdanalysis import constraints_of, selected, snapshot_of, to_ase
+from kcons.mdanalysis import ConstraintCheck, constraints_of, selected, snapshot_of, to_ase
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,33 @@ def waters(count, names=("OW", "HW1", "HW2"), **attributes):
     return universe
 
 
+def without_elements(atoms):
+    """A Universe of a PDB file that has no column of elements, of (name, residue, number); one atom each 3 angstrom."""
+    lines = [
+        f"ATOM  {k + 1:5d} {name:>4s} {residue:4s}A{number:4d}    {3.0 * k:8.3f}   0.000   0.000  1.00  0.00"
+        for k, (name, residue, number) in enumerate(atoms)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return mda.Universe(StringIO("\n".join([*lines, "END\n"])), format="PDB")
+
+
+def test_guessed_masses_are_those_of_the_elements():
+    """MDAnalysis takes the nitrogen NA of a porphyrin for sodium, selenium for sulfur, calcium for carbon."""
+    atoms = [(name, "HEM", 1) for name in ("NA", "SE", "CD", "EPW", "D1", "HG")]
+    universe = without_elements([*atoms, ("CA", "CA", 2), ("LI", "LI", 3), ("SOD", "SOD", 4)])
+    topology = snapshot_of(universe).topology
+    assert topology.elements.tolist() == ["N", "Se", "C", "", "H", "H", "Ca", "Li", "Na"]
+    standard = [14.007, 78.97, 12.011, 0.0, 2.014, 1.008, 40.08, 6.94, 22.99]
+    np.testing.assert_allclose(topology.masses, standard, atol=0.01)
+
+
+def test_masses_that_somebody_set_stay():
+    universe = without_elements([(name, "SER", 1) for name in ("NA", "HG", "CD")])
+    universe.atoms.masses = [9.0, 3.024, 12.0]
+    assert snapshot_of(universe).topology.masses.tolist() == [9.0, 3.024, 12.0]
+
+
 def test_selections_in_words(villin):
     protein = villin.select_atoms("protein")
     np.testing.assert_array_equal(selected(villin, "protein"), protein.indices)
@@ -57,6 +85,10 @@ def test_rigid_bodies_in_words(villin):
         constraints_of, villin, "none", rigid_water=False, rigid_bodies=["resname TRP and name CA CB CG C N"]
     )
     assert rows.constraint_set.n_rows == 3 * 5 - 6
+    body = villin.select_atoms("resname TRP and name CA CB CG C N")
+    for given in (body, [body]):
+        same = quietly(constraints_of, villin, "none", rigid_water=False, rigid_bodies=given)
+        np.testing.assert_array_equal(same[0].atoms, rows[0].atoms)
 
 
 @pytest.mark.parametrize(
@@ -182,3 +214,19 @@ def test_selections_that_are_neither_words_nor_groups_of_these_atoms(villin):
     for group in (villin.atoms[-3:], protein[:0], read_universe(VILLIN).atoms[:3]):
         with pytest.raises(InputError, match="give some of the atoms of <AtomGroup with 582 atoms>"):
             quietly(constraints_of, protein, select=group)
+
+
+def test_coordinates_left_in_nanometres_are_refused(tmp_path):
+    """Rows would hold O-H at 0.1 angstrom."""
+    path = tmp_path / "w.gro"
+    made = waters(3)
+    made.dimensions = [90.0] * 6
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made.atoms.write(str(path))
+        universes = [mda.Universe(str(path), convert_units=convert) for convert in (True, False)]
+    rows = constraints_of(universes[0])
+    with pytest.raises(InputError, match=r"positions are in nm, .* convert_units=False; make it without"):
+        constraints_of(universes[1])
+    with pytest.raises(InputError, match="positions are in nm"):
+        ConstraintCheck(universes[1], list(rows))

@@ -139,6 +139,16 @@ def test_hydrogens_may_come_before_the_oxygen():
     assert find_waters(made).triples.tolist() == [[1, 0, 2]]
 
 
+def test_particles_with_mass_are_no_sites():
+    """The Drude particle of SWM4 moves by itself; as a site it would be placed on its oxygen for ever."""
+    x = [*WATER, [0.14, 0.19, 0.0], [0.01, 0.0, 0.0]]
+    names = ["OH2", "H1", "H2", "OM", "DOH2"]
+    masses = [15.5994, 1.008, 1.008, 0.0, 0.4]
+    made = snapshot(["O", "H", "H", "", ""], x, names=names, residue_names=("SWM4",), masses=masses)
+    with pytest.raises(InputError, match="1 oxygens and 2 hydrogens and 1 with mass besides; rename it"):
+        find_waters(made, frozenset({"SWM4"}))
+
+
 def test_oxygens_alone_are_left_and_odd_waters_named():
     assert not len(find_waters(snapshot(["O"], WATER[:1], residue_names=["HOH"])).triples)
     with pytest.raises(InputError, match=r"residue HOH 1 \(atoms 0 to 1\).*1 oxygens and 1 hydrogens; rename it"):

@@ -174,6 +174,13 @@ def test_bad_input_is_named(options, said):
         held_rows(solution(), **options)
 
 
+def test_water_whose_hydrogens_are_listed_as_bonded_is_a_rigid_body():
+    """PSF files of TIP3P list H-H; as a bond it would be torn."""
+    made = snapshot(["O", "H", "H"], WATER, [(0, 1), (0, 2), (1, 2)], residue_names=("TIP3",))
+    rows = held_rows(made, "none", rigid_water=False, rigid_bodies=[[0, 1, 2]])
+    assert counts(rows) == {"Distance": 3}
+
+
 def test_no_masses_no_hydrogens_and_torn_molecules():
     with pytest.raises(InputError, match=r"C of EOH 1 \(atom 0\) has no mass, as 11 other atoms; held atoms need"):
         held_rows(solution(masses=np.zeros(12)), "allbonds")

@@ -51,6 +51,20 @@ def test_masses_that_were_read_decide():
     assert found.tolist() == ["Cl", "O", "H", "", "C"]  # 3.024: hydrogens made heavier stay hydrogens
 
 
+def test_names_decide_where_hydrogens_took_mass_from_their_neighbours():
+    """Amide N then weighs as much as C, hydroxyl O as N, CH as Be, the oxygen of water as C."""
+    names = np.array(["CB", "HB1", "HB2", "OG", "HG", "N", "HN", "CA", "HA", "OH2"])
+    masses = np.array([7.979, 3.024, 3.024, 13.983, 3.024, 11.991, 3.024, 8.987, 4.032, 11.967])
+    found = elements_of(names, np.zeros(10, int), np.array(["SER"]), masses)
+    assert found.tolist() == ["C", "H", "H", "O", "H", "N", "H", "C", "H", "O"]
+
+
+def test_without_names_everything_lighter_than_helium_is_hydrogen():
+    masses = np.array([15.999, 1.008, 2.014, 3.024, 4.0026, 0.4])
+    found = elements_of(np.array(["1", "2", "3", "4", "5", "6"]), np.zeros(6, int), np.array([""]), masses)
+    assert found.tolist() == ["O", "H", "H", "H", "", ""]
+
+
 def test_residues_end_where_a_name_comes_again():
     names = np.array(["O", "H1", "H2"] * 3 + ["N"])
     called = np.array(["HOH"] * 9 + ["ALA"])

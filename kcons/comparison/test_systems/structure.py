@@ -227,7 +227,7 @@ def _explained(error: Exception, topology: Any) -> InputError:
         return InputError(f"the force field does not fit: {text}", item="forcefield")
     residue = list(topology.residues())[int(found[1])]
     where = f"residue {residue.name} {residue.id} of chain {residue.chain.id}"
-    if re.search(r"missing \d+ H atoms?\b(?! and)", found[3]):
+    if re.search(r"missing \d+ H atoms?\b(?!,| and)", found[3]):
         remedy = "add hydrogens: --add-hydrogens"
     else:
         remedy = "give a force field that has it (--forcefield FILE ...), or take it out of the file"

@@ -9,6 +9,8 @@ import MDAnalysis.exceptions
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.mdanalysis.topology import topology_of
+
 
 class AtomNames:
     """Names of all atoms of a Universe, as far as its topology has them.
@@ -16,7 +18,7 @@ class AtomNames:
     Attributes
     ----------
     names, elements, residues : ndarray of str, shape (n_atoms,)
-        '' where the topology does not say; elements are then the first letters of the names.
+        '' where the topology does not say; elements are then what names and masses tell, or first letters.
     """
 
     def __init__(self, universe: Any) -> None:
@@ -28,8 +30,9 @@ class AtomNames:
         self._segments = _column(atoms, "segids", n)
         elements = _column(atoms, "elements", n)
         if not np.all(elements != ""):
+            known = topology_of(universe).elements
             first = np.char.lstrip(self.names, "0123456789'\"*").astype("U1")
-            elements = np.where(elements == "", first, elements)
+            elements = np.where(elements == "", np.where(known == "", first, known), elements)
         self.elements: NDArray[np.str_] = elements
 
     def atom(self, index: int) -> str:

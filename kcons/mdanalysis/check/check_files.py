@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from kcons.mdanalysis.check.constraint_check import ConstraintCheck
 from kcons.mdanalysis.check.files.file_precision import precision_of
 from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.result import CheckResult
-from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import constraints_of
 from kcons.topology.holding import Options
 
@@ -82,6 +83,7 @@ def check_trajectory(
         given, text = "given", f"coordinates of {topology}"
     else:
         universe = open_universe(topology, trajectory)
+        _go_to_first(universe, chosen.get("start"))
         constraints, guessed = _rows(universe, constrain, held)
         given = str(targets)
     check = ConstraintCheck(universe, constraints, targets=file or given, names=names, **options)
@@ -121,9 +123,20 @@ def _rows(universe: Any, constrain: str | None, held: dict[str, Any]) -> tuple[A
             found = constraints_of(universe, constrain, **held)
         except InputError as error:
             if error.item == "positions" and not np.isfinite(universe.atoms.positions).all():
-                raise UnreadableError(f"{universe.trajectory.filename}: {error}", item="trajectory") from None
+                reader = universe.trajectory
+                raise UnreadableError(
+                    f"{reader.filename}: {error}, in frame {reader.frame}, the first to be looked at; begin at a later "
+                    "one (--frames A:), or write the file again",
+                    item="trajectory",
+                ) from None
             raise
     return found, found.bonds_guessed
+
+
+def _go_to_first(universe: Any, start: int | None) -> None:
+    """Bonds are looked for in the first frame that is looked at; one that is not there is for the check to refuse."""
+    with quiet(), suppress(*READ_ERRORS):
+        _ = universe.trajectory[start or 0]
 
 
 def _slice(frames: str | None) -> dict[str, int | None]:

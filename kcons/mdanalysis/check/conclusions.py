@@ -82,10 +82,12 @@ def concluded(
     units = by_unit(table, part, np.where(untold, 0.0, rows.of_targets), rounding, rows.tolerance)
     order = np.lexsort((-np.where(violated, found.margins, found.largest), ~violated))
     worst = [row_result(table, asked.labels, int(row), part) for row in order[: max(asked.worst, 1)]]
-    if held.lattice is None and (violated & (table.units == 0) & (found.largest > table.sizes)).any():
+    bare = int(found.without_cell.sum())
+    if bare and (violated & (table.units == 0) & (found.largest > table.sizes)).any():
+        some = "" if bare == n_frames else f"{bare} of {n_frames} "
         asked.remarks.append(
-            f"lengths are off by more than themselves, and frames of {asked.names[0]} have no cell: molecules cut by a "
-            "face of one look like this. Give a format that has the cell (not XYZ), or whole molecules"
+            f"lengths are off by more than themselves, and {some}frames of {asked.names[0]} have no cell: molecules "
+            "cut by a face of one look like this. Give a format that has the cell (not XYZ), or whole molecules"
         )
     in_frame = (found.excess > 0).any(axis=0)
     frames = part.frames[in_frame]

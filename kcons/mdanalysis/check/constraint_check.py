@@ -23,7 +23,7 @@ from kcons.mdanalysis.check.bound_rows import BoundRows
 from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.check.conclusions import Asked, concluded
 from kcons.mdanalysis.check.files.endings import intact_frames, last_offset, leftover
-from kcons.mdanalysis.check.files.file_precision import FilePrecision, by_frame, precision_of
+from kcons.mdanalysis.check.files.file_precision import by_frame, precision_of_reader
 from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
 from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.findings import (
@@ -31,12 +31,12 @@ from kcons.mdanalysis.check.findings import (
     joined,
 )
 from kcons.mdanalysis.check.rank_by_pieces import rank_of
-from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by
+from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remarks_on
 from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
-from kcons.mdanalysis.topology import host_of
+from kcons.mdanalysis.topology import host_of, require_angstrom, velocities_known
 from kcons.topology.rows_by_name import HeldRows
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
@@ -116,6 +116,7 @@ class ConstraintCheck(AnalysisBase):
         **options: Any,
     ) -> None:
         universe = atoms.universe
+        require_angstrom(universe.trajectory)
         super().__init__(universe.trajectory, **options)
         if isinstance(constraints, HeldRows):
             constraints.require_atoms(len(universe.atoms), universe.atoms.indices, host_of(universe))
@@ -156,18 +157,12 @@ class ConstraintCheck(AnalysisBase):
         self._path = str(getattr(reader, "filename", None) or "")
         self._format = format_of(reader)
         called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
-        if self._path and Path(self._path).is_file():
-            in_file = precision_of(self._path, self._format, precision)
-        else:
-            in_file = FilePrecision(self._format or "MEMORY", precision or 0.0)
-        if getattr(reader, "transformations", ()):
-            # What a transformation did to the coordinates no longer lies on the grid of the file.
-            in_file = FilePrecision(self._format, in_file.step, in_file.unit)
-            remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+        in_file = precision_of_reader(reader, precision)
+        remarks += remarks_on(reader)
         of_frames = None
         if in_file.exact and precision is None:
             of_frames = by_frame(self._path, reader._xdr.offsets, in_file)
-        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames)
+        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames, velocities_known(reader))
         self.asked = Asked(called, labels, mode, text, removed, int(worst), remarks)
         self._pass_of_means = False
 
@@ -228,9 +223,15 @@ class ConstraintCheck(AnalysisBase):
             numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
             first = numbers[0] if len(numbers) else None
         else:
-            asked = np.asarray(chosen["frames"])
-            asked = np.flatnonzero(asked) if asked.dtype == bool else asked
-            count = self._trajectory.n_frames
+            asked, count = np.asarray(chosen["frames"]), self._trajectory.n_frames
+            if asked.dtype == bool and asked.shape == (count,):
+                asked = np.flatnonzero(asked)
+            if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
+                raise InputError(
+                    f"frames are {chosen['frames']!r:.60}; give whole numbers, or True and False for each of the "
+                    f"{count} frames; for a slice start, stop and step",
+                    item="frames",
+                )
             for frame in asked[(asked < -count) | (asked >= count)]:
                 raise InputError(f"{self.asked.names[0]}: there is no frame {frame}; it has {count}", item="frames")
             first = int(asked[0]) if len(asked) else None

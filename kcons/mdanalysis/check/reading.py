@@ -19,7 +19,8 @@ from kcons.mdanalysis.check.frames.frame_kernels import farthest, kinetic
 from kcons.mdanalysis.check.frames.length_table import size_of
 from kcons.mdanalysis.check.frames.row_table import RowTable
 from kcons.mdanalysis.check.result import Break
-from kcons.mdanalysis.loading import READ_ERRORS, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
+from kcons.mdanalysis.topology import velocities_known
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
 #: in how many frames at least.
@@ -40,12 +41,15 @@ class Reading:
         For the kinetic energy.
     intact : int
         Frames before this one are not damaged.
+    velocities : bool
+        Whether velocities, where there are any, are in angstrom/ps.
     """
 
     precision: FilePrecision
     by_frame: Any
     masses: FloatArray | None
     intact: int
+    velocities: bool = True
 
     def precision_at(self, frame: int) -> FilePrecision:
         """Of the coordinates of one frame."""
@@ -120,7 +124,7 @@ class Reading:
 
     def _look(self, table: RowTable, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
         x = _flat(ts.positions)
-        v = _flat(ts.velocities) if ts.has_velocities else None
+        v = _flat(ts.velocities) if ts.has_velocities and self.velocities else None
         time = float(ts.time)
         part.times[k] = time
         table.look(part.found, k, x, v, ts.dimensions, time, summed)
@@ -128,6 +132,21 @@ class Reading:
             part.reach[k] = size_of(farthest(x))
         if v is not None and self.masses is not None:
             part.twice_kinetic[k], *part.momentum[k] = kinetic(v, self.masses)
+
+
+def remarks_on(reader: Any) -> list[str]:
+    """What a reader of MDAnalysis does not know, or was told to do."""
+    remarks, name = [], format_of(reader)
+    if getattr(reader, "transformations", ()):
+        remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+    if reader.ts.has_velocities and not velocities_known(reader):
+        remarks.append(f"no temperature: velocities of {name} files have no unit")
+    # Dumps of LAMMPS have numbers of steps.
+    timed = name in ("MEMORY", "CHAIN") or hasattr(reader, "_get_dt") or "dt" in getattr(reader, "_ts_kwargs", {})
+    if not timed and (name == "LAMMPSDUMP" or "time" not in reader.ts.data) and reader.n_frames > 1:
+        apart = "steps" if name == "LAMMPSDUMP" else "frames"
+        remarks.append(f"{name} files have no times: {apart} are taken to be 1 ps apart, in drifts too")
+    return remarks
 
 
 def blocks_of(trajectory: Any, table: RowTable) -> PlainDcd | None:

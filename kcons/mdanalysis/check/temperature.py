@@ -14,6 +14,7 @@ from kcons.errors import InputError
 from kcons.mdanalysis.check.atom_names import AtomNames
 from kcons.mdanalysis.check.findings import Part
 from kcons.mdanalysis.check.result import fitted
+from kcons.mdanalysis.topology import masses_guessed, topology_of
 
 #: Boltzmann's constant in amu Å²/(ps² K).
 BOLTZMANN = 0.831446261815324
@@ -38,6 +39,8 @@ def masses_of(universe: Any, given: Sequence[Constraint], labels: AtomNames) -> 
         )
     try:
         masses: FloatArray = np.asarray(universe.atoms.masses, dtype=np.float64)
+        if masses_guessed(universe):
+            masses = topology_of(universe).masses
     except (NoDataError, AttributeError):
         reason = "the topology has no masses"
     else:

@@ -158,6 +158,14 @@ def test_missing_hydrogens(bare):
         test_systems.from_file(bare)
 
 
+def test_ions_need_no_hydrogens(tmp_path):
+    """OpenMM finds them similar to an amino acid that lacks 5 H atoms, 3 C atoms and more."""
+    path = tmp_path / "ion.pdb"
+    path.write_text("HETATM    1 SOD  SOD A   1       0.000   0.000   0.000  1.00  0.00\nEND\n")
+    with pytest.raises(InputError, match=r"missing 5 H atoms, 3 C atoms.*give a force field that has it"):
+        test_systems.from_file(path)
+
+
 def test_unknown_residue(tmp_path):
     path = tmp_path / "odd.pdb"
     path.write_text(

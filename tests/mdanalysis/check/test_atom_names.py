@@ -33,6 +33,13 @@ def test_elements_are_those_of_the_topology(universe):
     assert AtomNames(universe).elements.tolist() == ["Ca", "C", "C", "C", "C", "C", "C"]
 
 
+def test_elements_of_two_letters_are_told_by_names_and_masses(universe):
+    """As everywhere: a rule for C-C is none for C-Cl."""
+    universe.add_TopologyAttr("names", ["C1", "CL1", "7", "BR", "CA", "OW", "HW1"])
+    universe.add_TopologyAttr("masses", [12.011, 35.45, 28.085, 79.904, 12.011, 15.999, 1.008])
+    assert AtomNames(universe).elements.tolist() == ["C", "Cl", "Si", "Br", "C", "O", "H"]
+
+
 def test_a_topology_that_says_nothing(universe):
     names = AtomNames(universe)
     assert names.atom(4) == "atom 4" and names.row([0, 4]) == "atom 0–atom 4"

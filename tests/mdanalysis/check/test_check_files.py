@@ -1,9 +1,10 @@
 """Checks of files, by their names."""
 
+import numpy as np
 import pytest
 import water_files as files
 
-from kcons.errors import InputError
+from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis import check_trajectory
 
 N = 30
@@ -43,3 +44,12 @@ def test_targets_of_the_topology_need_coordinates(tmp_path, x):
     top.write_text("\n".join([*lines, "", "       0 !NBOND: bonds", "", ""]))
     with pytest.raises(InputError, match=r"t\.psf has no coordinates.*--targets first"):
         check_trajectory(path, top, "none", targets="topology")
+
+
+def test_bonds_are_looked_for_in_the_first_frame_that_is_looked_at(tmp_path, x):
+    y = x.copy()
+    y[0, 4] = np.nan
+    path, top = files.write(tmp_path / "w.dcd", y), files.topology(tmp_path / "t.pdb", N, x[0])
+    with pytest.raises(UnreadableError, match=r"in frame 0, the first to be looked at; begin at a later one"):
+        check_trajectory(path, top)
+    assert check_trajectory(path, top, frames="1:").status == "kept"

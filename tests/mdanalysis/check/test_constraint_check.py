@@ -287,6 +287,9 @@ def test_wrong_frames_names_and_order(water):
     for frame in (count, -count - 1):
         with pytest.raises(InputError, match=f"there is no frame {frame}; it has {count}"):
             check.run(frames=[0, frame])
+    for frames in (slice(0, 3), [True] * (count - 1), [0.5]):
+        with pytest.raises(InputError, match=rf"give whole numbers, or True and False for each of the {count} frames"):
+            check.run(frames=frames)
     with pytest.raises(InputError, match="step is 0"):
         check.run(step=0)
     assert check.run(frames=[0, count - 1]).check.status
@@ -319,3 +322,23 @@ def test_rows_that_were_made_for_a_part_are_refused(water):
     with pytest.raises(InputError, match="their atom 0 is atom 3 of the Universe, and here it is atom 0"):
         ConstraintCheck(whole, constraints_of(whole.atoms[np.r_[3:6, 0:3, 6 : 3 * N]], "none"))
     assert ConstraintCheck(whole, constraints_of(whole.atoms, "none")).run().check.n_rows == 3 * N
+
+
+@pytest.mark.parametrize("ending", ["dcd", "trr"])
+def test_cells_that_are_none_and_cells_that_end(tmp_path, ending):
+    """Files without a cell may have lengths of 1: bonds would be folded into it."""
+    x = files.whole(files.water(N, 6, side=SIDE), SIDE)
+    rows = Distance(files.pairs(N), files.targets(N))
+    assert checked(files.write(tmp_path / f"one.{ending}", x, side=1.0), rows).status == "kept"
+    wrapped, path = x % SIDE, tmp_path / f"ends.{ending}"
+    made = mda.Universe.empty(3 * N, trajectory=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with mda.Writer(str(path), 3 * N) as writer:
+            for k, positions in enumerate(wrapped):
+                made.atoms.positions = positions
+                made.dimensions = [SIDE] * 3 + [90.0] * 3 if k < 4 else None
+                writer.write(made.atoms)
+    result = checked(path, rows)
+    assert result.status == "violated" and result.first_violated_frame == 4
+    assert any(f"2 of 6 frames of {path} have no cell" in remark for remark in result.remarks), result.remarks

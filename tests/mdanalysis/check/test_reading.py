@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import water_files as files
 from MDAnalysis.lib.log import ProgressBar
 from water_files import mda
@@ -10,9 +11,10 @@ from water_files import mda
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import NonFiniteError
+from kcons.mdanalysis import load_trajectory
 from kcons.mdanalysis.check.files.file_precision import FilePrecision
 from kcons.mdanalysis.check.frames.row_table import RowTable
-from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by
+from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remarks_on
 
 N, FRAMES = 6, 7
 PRECISION = FilePrecision("DCD")
@@ -77,3 +79,18 @@ def test_reasons_of_a_break():
     assert broken_by(StopIteration(), Ended(), 3).reason == "frame 3 is short"
     assert broken_by(OSError(), Ended(), 3).reason == "the file ends"
     assert not broken_by(NonFiniteError("a length is no number"), Ended(), 3).ends
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("w.dcd", None), ("w.xyz", "frames are taken to be 1 ps apart"), ("w.lammpsdump", "steps are taken to be 1 ps")],
+)
+def test_times_that_files_do_not_have_are_said(tmp_path, name, said):
+    """A drift a ns means nothing without them."""
+    made, x = files.universe(4), files.water(4, 3)
+    path = (files.write_text if name == "w.lammpsdump" else files.write)(tmp_path / name, x)
+    load_trajectory(made, path)
+    found = remarks_on(made.trajectory)
+    assert [said in remark for remark in found] == [True] if said else found == []
+    made.load_new(str(path), dt=0.5)
+    assert remarks_on(made.trajectory) == []

@@ -1,12 +1,13 @@
 """Temperatures with the right number of degrees of freedom."""
 
+import MDAnalysis as mda
 import numpy as np
 import pytest
 import water_files as files
 
 from kcons.constraints import CenterOfMass, Distance
 from kcons.errors import InputError
-from kcons.mdanalysis import ConstraintCheck, load_trajectory
+from kcons.mdanalysis import ConstraintCheck, load_trajectory, to_ase
 
 N, SIDE = 40, 12.0
 
@@ -71,3 +72,41 @@ def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
     assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
     with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
         checked(path, CenterOfMass([0, 1, 2]), masses=False)
+
+
+def test_sites_of_water_do_not_count(tmp_path):
+    """MDAnalysis takes EPW for phosphorus; as a mass it would be most of the kinetic energy."""
+    x = files.water(N, 3, side=SIDE)
+    four = np.concatenate([x.reshape(3, N, 3, 3), x.reshape(3, N, 3, 3)[:, :, :1]], axis=2).reshape(3, 4 * N, 3)
+    v = np.random.default_rng(1).normal(size=four.shape)
+    pairs = (4 * np.arange(N)[:, None, None] + [[0, 1], [0, 2], [1, 2]]).reshape(-1, 2)
+    found = []
+    for masses in ([15.999, 1.008, 1.008, 0.0], None):
+        universe = mda.Universe.empty(
+            4 * N, n_residues=N, atom_resindex=np.repeat(np.arange(N), 4), trajectory=True, velocities=True
+        )
+        universe.add_TopologyAttr("names", ["O", "H1", "H2", "EPW"] * N)
+        universe.add_TopologyAttr("resnames", ["WAT"] * N)
+        if masses is None:
+            universe.guess_TopologyAttrs(to_guess=["types", "masses"])
+        else:
+            universe.add_TopologyAttr("masses", masses * N)
+        universe.load_new(four, velocities=v, dimensions=[SIDE, SIDE, SIDE, 90.0, 90.0, 90.0])
+        found.append(ConstraintCheck(universe, Distance(pairs), targets="first").run().check)
+    assert found[0].degrees_of_freedom == found[1].degrees_of_freedom
+    assert found[0].temperature["mean"] == pytest.approx(found[1].temperature["mean"])
+
+
+def test_velocities_without_a_unit_are_no_temperature(tmp_path):
+    """Those of LAMMPS are in angstrom/fs, or in anything else: files do not say."""
+    text = files.write_text(tmp_path / "w.lammpsdump", files.whole(files.water(N, 2))).read_text()
+    lines = [f"{line} 0.01 0 0" if line[0].isdigit() and len(line.split()) == 5 else line for line in text.splitlines()]
+    path = tmp_path / "v.lammpsdump"
+    path.write_text("\n".join(lines).replace("type x y z", "type x y z vx vy vz") + "\n")
+    universe = loaded(path)
+    assert universe.trajectory.ts.has_velocities
+    result = ConstraintCheck(universe, Distance(files.pairs(N), files.targets(N))).run().check
+    assert result.status == "kept" and result.temperature is None and result.units[0].rate_largest is None
+    assert "no temperature: velocities of LAMMPSDUMP files have no unit" in result.remarks
+    with pytest.warns(UserWarning, match="velocities of LAMMPSDUMP files have no unit: they are left out"):
+        assert not to_ase(universe).has("momenta")

@@ -11,14 +11,15 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
-from MDAnalysis.lib.util import anyopen
+from MDAnalysis.lib.util import anyopen, guess_format
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.mdanalysis.loading import format_of
 
 #: Formats whose numbers are floats in nanometres, which MDAnalysis turns into angstrom, in single precision again.
 _NANOMETRES = {"TRR", "H5MD", "TNG"}
@@ -26,6 +27,8 @@ _NANOMETRES = {"TRR", "H5MD", "TNG"}
 _DECIMALS = {"PDB": 3, "ENT": 3, "PDBQT": 3, "XPDB": 3, "PQR": 3, "TRJ": 3, "MDCRD": 3, "CRDBOX": 3, "CRD": 5}
 #: Magic numbers of XTC; files of the second hold more than 2^31 bytes a frame.
 XTC_MAGIC = (1995, 2023)
+#: Atoms of a text file whose numbers are looked at.
+MOST_READ = 1000
 #: Half the distance of neighbouring single precision numbers is at most this part of the power of two below them.
 HALF_UNIT = 2.0**-24
 
@@ -44,12 +47,18 @@ class FilePrecision:
         Unit of the floats in angstrom.
     exact : bool
         Whether the numbers of the file can be had back from MDAnalysis' single precision: they lie on a grid.
+    digits : int
+        Significant digits of numbers that are written with as many decimals as they need; 0 if that is not so.
+    shift : float
+        Coordinates were moved by up to this, in angstrom, after they had been rounded to these digits.
     """
 
     format: str
     step: float = 0.0
     unit: float = 1.0
     exact: bool = False
+    digits: int = 0
+    shift: float = 0.0
 
     @property
     def grid(self) -> float:
@@ -80,6 +89,10 @@ class FilePrecision:
         if self.exact:
             # Where a number of the grid cannot be had back, the one taken for it is off by twice the four roundings.
             return 0.5 * self.step, 0.0 if farthest < self.reach else 16 * HALF_UNIT
+        if self.digits:
+            # The last digit is worth 10^(1 - digits) of the number, at most, and numbers are below 2 2^e.
+            part = 10.0 ** (1 - self.digits)
+            return 0.5 * part * self.shift, part + 3 * HALF_UNIT
         # Rounded once, as stored; then, of decimals or nanometres, by the change to angstrom, where 2^e may be twice
         # that of the number stored.
         return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT
@@ -108,6 +121,11 @@ class FilePrecision:
         if self.step > 0:
             return f"{self.format} stores coordinates in steps of {self.step:.3g} Å ({self.step / 10:.3g} nm)"
         step = 2 * float(self.half_step([largest]))
+        if self.digits:
+            return (
+                f"{self.format} stores {self.digits} digits of coordinates: steps of up to {step:.1e} Å where "
+                f"coordinates reach {largest:.0f} Å"
+            )
         return (
             f"{self.format} stores coordinates in single precision: steps of {step:.1e} Å where coordinates reach "
             f"{largest:.0f} Å"
@@ -145,9 +163,39 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
         return FilePrecision(name, 10.0 * 10.0 ** -_gro_decimals(path))
     if name in _DECIMALS:
         return FilePrecision(name, 10.0 ** -_DECIMALS[name])
-    if name == "XYZ":
-        return FilePrecision(name, 10.0 ** -_xyz_decimals(path))
+    if name in ("XYZ", "LAMMPSDUMP"):
+        return _of_xyz(path) if name == "XYZ" else _of_dump(path)
     return FilePrecision(name, unit=10.0 if name in _NANOMETRES else 1.0)
+
+
+def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision:
+    """Precision of the coordinates that a reader of MDAnalysis gives; of several files, that of the coarsest.
+
+    Raises
+    ------
+    InputError
+        `step`, in angstrom, is not positive.
+    """
+    parts = [precision_of_reader(part, step) for part in getattr(reader, "readers", ())]
+    if parts:
+        return replace(max(parts, key=lambda part: float(part.half_step([1.0]))), exact=False)
+    name, path = format_of(reader) or "MEMORY", str(getattr(reader, "filename", None) or "")
+    if not Path(path).is_file():
+        return FilePrecision(name, step or 0.0)
+    changed = bool(getattr(reader, "transformations", ()))
+    if name == "MEMORY":
+        # Read from a file at once; what was done to the coordinates since is not known.
+        name, changed = _format_named(path), True
+    found = precision_of(path, name, step)
+    # What a transformation did to the coordinates no longer lies on the grid of the file.
+    return replace(found, exact=False) if changed else found
+
+
+def _format_named(path: str) -> str:
+    try:
+        return str(guess_format(path))
+    except ValueError:
+        return "MEMORY"
 
 
 def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:
@@ -206,6 +254,41 @@ def _gro_decimals(path: str | Path) -> int:
     return points[1] - points[0] - 5 if len(points) > 1 else 3
 
 
-def _xyz_decimals(path: str | Path) -> int:
-    words = _third_line(path).split()
-    return len(words[1].partition(".")[2]) if len(words) > 3 and "e" not in words[1].lower() else 6
+def _words(file: BinaryIO) -> list[str]:
+    return file.readline().decode("ascii", "replace").split()
+
+
+def _of_xyz(path: str | Path) -> FilePrecision:
+    with anyopen(str(path), "rb") as file:
+        head, _ = _words(file), file.readline()
+        n_atoms = int(head[0]) if head and head[0].isdigit() else 0
+        lines = [_words(file) for _ in range(min(n_atoms, MOST_READ))]
+    return _of_words("XYZ", [word for words in lines for word in words[1:4]])
+
+
+def _of_dump(path: str | Path) -> FilePrecision:
+    """Of a dump of LAMMPS, whose box MDAnalysis moves to the origin."""
+    shift = scale = 0.0
+    lines: list[list[str]] = []
+    with anyopen(str(path), "rb") as file:
+        while (words := _words(file)) and words[:2] != ["ITEM:", "ATOMS"]:
+            if words[:2] == ["ITEM:", "BOX"]:
+                bounds = [(float(low), float(high)) for low, high, *_ in (_words(file) for _ in range(3))]
+                shift, scale = max(abs(low) for low, _ in bounds), max(high - low for low, high in bounds)
+        while len(lines) < MOST_READ and (line := _words(file)) and line[0] != "ITEM:":
+            lines.append(line)
+    for ending in ("", "s", "u", "su"):  # in MDAnalysis' order
+        columns = [words.index(axis + ending) - 2 for axis in "xyz" if axis + ending in words]
+        if len(columns) == 3:
+            break
+    found = [line[k] for line in lines if len(line) > max(columns, default=0) for k in columns]
+    return _of_words("LAMMPSDUMP", found, shift, scale if "s" in ending else 1.0)
+
+
+def _of_words(name: str, words: Sequence[str], shift: float = 0.0, scale: float = 1.0) -> FilePrecision:
+    """Precision of numbers as they are written: all with the same decimals, or with as many as they need."""
+    decimals = {len(word.partition(".")[2]) for word in words}
+    if len(decimals) == 1 and not any("e" in word.lower() for word in words):
+        return FilePrecision(name, scale * 10.0 ** -decimals.pop())
+    digits = [len(word.lower().partition("e")[0].replace(".", "").lstrip("+-0")) for word in words]
+    return FilePrecision(name, digits=max(digits, default=0), shift=shift)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -35,6 +36,8 @@ class Deviations:
         The row with the largest excess.
     rate_worst, rate_row, rate_squares : ndarray, shape (n_units, n_frames)
         Largest absolute A v, its row, and the sum of squares; NaN without velocities.
+    without_cell : ndarray of bool, shape (n_frames,)
+        Frames that have no cell.
     """
 
     n_rows: int
@@ -47,6 +50,7 @@ class Deviations:
     rate_worst: FloatArray = field(init=False)
     rate_row: IntArray = field(init=False)
     rate_squares: FloatArray = field(init=False)
+    without_cell: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
         self.margins, self.largest = np.full(self.n_rows, -np.inf), np.zeros(self.n_rows)
@@ -56,6 +60,7 @@ class Deviations:
         self.by_frame[:, 3] = -np.inf
         self.rate_worst, self.rate_squares = np.full(shape, np.nan), np.full(shape, np.nan)
         self.worst_row, self.rate_row = np.full(shape, -1, np.int64), np.full(shape, -1, np.int64)
+        self.without_cell = np.zeros(self.n_frames, dtype=bool)
 
     total = property(lambda self: self.by_row[0])
     rounded = property(lambda self: self.by_row[1])
@@ -91,4 +96,4 @@ class Deviations:
 
 
 #: Arrays of `Deviations` by frame.
-_OF_FRAMES = ("by_frame", "worst_row", "rate_worst", "rate_row", "rate_squares")
+_OF_FRAMES = ("by_frame", "worst_row", "rate_worst", "rate_row", "rate_squares", "without_cell")

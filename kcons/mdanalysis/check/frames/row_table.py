@@ -18,6 +18,7 @@ from kcons.mdanalysis.check.files.plain_dcd import Block
 from kcons.mdanalysis.check.frames.deviations import UNITS, Deviations
 from kcons.mdanalysis.check.frames.frame_kernels import coordinate_grid, farthest
 from kcons.mdanalysis.check.frames.length_table import LengthTable, size_of
+from kcons.mdanalysis.topology import NARROWEST
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 
 #: What second order adds to the error of rows other than distances, at most.
@@ -143,7 +144,7 @@ class RowTable:
     def _new_cell(self, values: tuple[float, ...]) -> tuple[FloatArray, float]:
         a, b, c, *angles = values
         shortest = min(a, b, c)
-        if angles == [90.0, 90.0, 90.0] and shortest > 0:
+        if angles == [90.0, 90.0, 90.0] and shortest > NARROWEST:
             box = self._box
             box[0, 0, 0], box[0, 1, 1], box[0, 2, 2] = a, b, c
             box[1, 0, 0], box[1, 1, 1], box[1, 2, 2] = 1.0 / a, 1.0 / b, 1.0 / c
@@ -188,6 +189,7 @@ class RowTable:
         lattice, limit = self.cell_of(dimensions)
         if np.isnan(limit):
             self.refuse(x, dimensions)
+        into.without_cell[k] = limit == np.inf
         if v is not None and not np.isfinite(size_of(farthest(v))):
             atom = int(np.argmin(np.isfinite(v.reshape(-1, 3)).all(axis=1)))
             raise NonFiniteError(f"velocity of atom {atom} is {v.reshape(-1, 3)[atom]}", item="velocity", atom=atom)
@@ -227,6 +229,7 @@ class RowTable:
             lattices[f], limits[f] = self.cell_of(block.dimensions[f])
         if alike:
             lattices[1:], limits[1:] = lattices[0], limits[0]
+        into.without_cell[k : k + n] = limits == np.inf
         coefficients = self.precision.coefficients(0.0)
         return self._lengths.look_at_block(into, k, block, points, every, (lattices, limits), coefficients)
 
@@ -304,8 +307,8 @@ class RowTable:
 
 
 def cell_matrix(dimensions: Any) -> FloatArray | None:
-    """Cell vectors as rows, from lengths and angles; None without a cell."""
-    if dimensions is None or not np.all(np.asarray(dimensions)[:3] > 0):
+    """Cell vectors as rows, from lengths and angles; None without a cell, or with what files have in place of one."""
+    if dimensions is None or not np.all(np.asarray(dimensions)[:3] > NARROWEST):
         return None
     a, b, c, alpha, beta, gamma = (float(value) for value in dimensions)
     # Exactly 90 degrees has no rounding.

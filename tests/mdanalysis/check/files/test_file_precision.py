@@ -2,6 +2,7 @@
 
 import struct
 
+import MDAnalysis as mda
 import numpy as np
 import pytest
 import water_files as files
@@ -382,3 +383,67 @@ def test_big_endian_dcd_and_fixed_layout(tmp_path, x):
     other.write_bytes(turned[:-4])
     rest = leftover(other, "DCD", 7, 3 * N, None)
     assert rest is not None and rest.frame == 7 and "bytes follow" in rest.reason
+
+
+def written(path, x, number, columns="x y z", low=0.0, side=40.0):
+    """An XYZ file or a dump of LAMMPS; scaled columns are parts of the box."""
+    lines = []
+    for k, positions in enumerate(x):
+        if path.suffix == ".xyz":
+            lines += [str(len(positions)), "frame"]
+            lines += [f"{'OHH'[a % 3]} {number(r[0])} {number(r[1])} {number(r[2])}" for a, r in enumerate(positions)]
+            continue
+        numbers = positions / side if "s" in columns else positions + low
+        lines += ["ITEM: TIMESTEP", str(k), "ITEM: NUMBER OF ATOMS", str(len(positions)), "ITEM: BOX BOUNDS pp pp pp"]
+        lines += [f"{low} {low + side}"] * 3 + [f"ITEM: ATOMS id type {columns}"]
+        lines += [f"{a + 1} 1 {number(r[0])} {number(r[1])} {number(r[2])}" for a, r in enumerate(numbers)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "options"),
+    [
+        ("w.xyz", repr, {}),
+        ("w.xyz", "{:.6g}".format, {}),
+        ("w.xyz", "{:.4f}".format, {}),
+        ("w.lammpsdump", "{:g}".format, {}),
+        ("w.lammpsdump", "{:g}".format, {"low": -20.0}),
+        ("w.lammpsdump", "{:g}".format, {"columns": "xs ys zs"}),
+        ("w.lammpsdump", "{:.6f}".format, {"columns": "xs ys zs"}),
+        ("w.lammpsdump", "{:g}".format, {"columns": "xu yu zu"}),
+    ],
+)
+def test_numbers_of_text_bound_what_they_lost(tmp_path, name, number, options):
+    """Six digits are what LAMMPS writes; what the first number of a file looks like says nothing of the others."""
+    x = files.whole(files.water(N, 4, side=40.0), 40.0)
+    x[0, :3] += [8.5, 7.0, 9.25] - x[0, 0]
+    x = x.round(12)
+    path = written(tmp_path / name, x, lambda v: number(float(v)), **options)
+    result = checked(path, tolerance=0.0)
+    assert result.status == "kept", result.verdict
+    x[2, 4] += 0.1
+    path = written(tmp_path / name, x, lambda v: number(float(v)), **options)
+    assert checked(path, tolerance=0.0).status == "violated"
+    read = mda.Universe(str(path), topology_format="XYZ") if name == "w.xyz" else None
+    if read is not None:
+        lost = np.abs(read.atoms.positions.astype(float) - x[0]).max(axis=1)
+        assert np.all(lost <= precision_of(path, "XYZ").half_step(read.atoms.positions))
+
+
+@pytest.mark.parametrize("how", ["memory", "chain"])
+def test_coordinates_of_xtc_in_memory_and_of_several_files(tmp_path, how):
+    """They were rounded to 0.01 angstrom, whoever gives them now."""
+    x = whole()
+    names = [str(files.write(tmp_path / f"{k}.xtc", x[k : k + 4])) for k in (0, 4)]
+    for broken in (False, True):
+        made = files.universe(N)
+        if how == "chain":
+            made.load_new(names)
+        else:
+            made.load_new(names[0])
+            made.transfer_to_memory()
+            made.trajectory.get_array()[2, 4, 0] += 0.1 * broken
+        result = ConstraintCheck(made, BOND).run().check
+        assert result.precision == "XTC stores coordinates in steps of 0.01 Å (0.001 nm)"
+        assert result.status == ("violated" if broken and how == "memory" else "kept"), result.verdict
