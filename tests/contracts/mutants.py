@@ -1178,8 +1178,8 @@ MUTANTS = [
     ),
     (
         "constraints/target.py",
-        "return difference if period is None else",
-        "return difference if True else",
+        "    return difference - period * np.round(difference / whole)",
+        "    return difference",
         "tests/constraints/functions/test_custom.py::test_differences_where_the_value_jumps_by_its_period"
         " tests/constraints/test_target.py::test_a_target_that_jumps_by_its_period_does_not_move_faster_there",
     ),
