@@ -81,6 +81,7 @@ def test_reasons_of_a_break():
     assert not broken_by(NonFiniteError("a length is no number"), Ended(), 3).ends
 
 
+@pytest.mark.filterwarnings("ignore:DCDReader currently")
 @pytest.mark.parametrize(
     ("name", "said"),
     [("w.dcd", None), ("w.xyz", "frames are taken to be 1 ps apart"), ("w.lammpsdump", "steps are taken to be 1 ps")],
