@@ -45,15 +45,12 @@ CASES = [
     *(pytest.param(name, swap, "CPU") for name, swaps in SCRIPT_SWAPS.items() for swap in swaps),
     *(pytest.param(name, SCRIPT_SWAPS[name][0], "Reference") for name in ("simulate_implicit", "simulate_tip4pew")),
 ]
-#: In single precision without a box, and, in a long run, in mixed precision with sites and with a barostat: of these
-#: there are cases on GPUs in test_openmm_site_motion and test_openmm_barostats.
+#: Always in single precision without a box; in a long run each script in each precision.
 ON_GPUS = [
-    pytest.param(
-        name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, *([LONG] if name != "simulate_implicit" else [])]
-    )
+    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, *([] if quick else [LONG])])
     for p in GPUS
-    for name in ("simulate_implicit", "simulate_tip4pew", "simulate_npt")
-    if "none" in p.id or ("single" if name == "simulate_implicit" else "mixed") in p.id
+    for name in SCRIPT_SWAPS
+    for quick in ["none" in p.id or (name == "simulate_implicit" and "single" in p.id)]
 ]
 
 

@@ -257,17 +257,23 @@ def test_velocities_straight_against_a_strong_force():
 def test_of_velocities_set_between_calls_only_the_direction_counts(platform):
     """K is brought back before the kick that follows, not by it."""
     system, x, v = waters()
-    ends = []
-    for factor in (1.0, 3.0, 0.2):
+
+    def end(factor, start=x):
         integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0))
         context = started(system, integrator, x, v, platform)
         integrator.step(1)
-        context.setPositions(x)
+        context.setPositions(start)
         context.setVelocities(factor * v)
         integrator.step(20)
-        ends.append(state_of(context)[0])
-    for end in ends[1:]:
-        assert np.abs(end - ends[0]).max() < (1e-12 if platform == "Reference" else 1e-6)
+        return state_of(context)[0]
+
+    usual, allowed = end(1.0), 1e-12 if platform == "Reference" else 1e-10
+    if "single" in platform:  # a few times what the last digit of the positions does
+        last = np.random.default_rng(0).choice([-1, 1], x.shape) * 2.0**-23
+        allowed = 4 * np.abs(end(1.0, x * (1 + last)) - usual).max()
+        assert allowed < 1e-5
+    for factor in (3.0, 0.2):
+        assert np.abs(end(factor) - usual).max() < allowed
 
 
 @pytest.mark.parametrize("remover", [False, True])
