@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import IO, Any, get_args
+from typing import IO, Any
 
 import numpy as np
 from ase import units
@@ -13,9 +13,8 @@ from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure
-from kcons.thermostats.pressure.measured import Virial
+from kcons.thermostats.pressure.measured import Virial, refuse_virial
 
 
 class PressureReporter:
@@ -32,7 +31,7 @@ class PressureReporter:
     molecules : array_like of int, shape (n, 2), optional
         Bonds, for pieces; by default those of the barostat.
     temperature_K : float, optional
-        For N kT/V instead of the present kinetic energy.
+        For N kT/V instead of the present kinetic energy of pieces.
 
     Attributes
     ----------
@@ -43,7 +42,7 @@ class PressureReporter:
     Raises
     ------
     InputError
-        An unknown virial; dynamics of ASE, which do not know all rows.
+        An unknown virial; `temperature_K` with 'atomic'; dynamics of ASE, which do not know all rows.
     """
 
     def __init__(
@@ -55,8 +54,7 @@ class PressureReporter:
         molecules: ArrayLike | None = None,
         temperature_K: float | None = None,
     ) -> None:
-        if virial not in get_args(Virial):
-            raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
+        refuse_virial(virial, temperature_K)
         refuse_other(dynamics, ConstrainedDynamics, "dynamics", "a dynamics object of kcons.ase")
         self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
         self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -46,6 +46,24 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
     return 0.5 * (virial + virial.T)
 
 
+def refuse_virial(virial: Virial, thermal_energy: float | None) -> None:
+    """Refuse a virial that is unknown, and kT for the momenta of atoms.
+
+    Raises
+    ------
+    InputError
+    """
+    if virial not in get_args(Virial):
+        raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
+    if virial == "atomic" and thermal_energy is not None:
+        # the virial of constraint forces has the present velocities as well, and only both together are right
+        raise InputError(
+            "a temperature takes the place of the momenta of pieces, not of those of atoms, as virial='atomic' takes "
+            "them; leave it out, or take virial='molecular'",
+            item="thermal_energy",
+        )
+
+
 def instantaneous_pressure(
     system: CellSystem,
     state: State,
@@ -73,14 +91,13 @@ def instantaneous_pressure(
     Raises
     ------
     InputError
-        An unknown virial; a cell without a volume.
+        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume.
     UnsupportedError
         There is no stress, or a piece is held in space.
     NonFiniteError
         An energy or a stress is not finite.
     """
-    if virial not in ("molecular", "atomic", "difference"):
-        raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
+    refuse_virial(virial, thermal_energy)
     x, v, _ = system.taken(state)
     cell = system.cell
     volume = system.volume
@@ -139,6 +156,11 @@ class PressureObserver:
     ----------
     values : list of ndarray, shape (3, 3)
     volumes : list of float
+
+    Raises
+    ------
+    InputError
+        An unknown virial; `thermal_energy` with 'atomic'.
     """
 
     def __init__(
@@ -149,6 +171,7 @@ class PressureObserver:
         pieces: Pieces | None = None,
         thermal_energy: float | None = None,
     ) -> None:
+        refuse_virial(virial, thermal_energy)
         self.system, self.virial, self.pieces, self.thermal_energy = system, virial, pieces, thermal_energy
         self.values: list[FloatArray] = []
         self.volumes: list[float] = []
