@@ -85,7 +85,14 @@ TABLE = {
     "error_budget.json": Measurement(CORE, script("18_error_budget"), 1),
     "free_energy.json": Measurement(
         (*BATHS, "openmm", "free_energy"),
-        script("29_free_energy", "--full", "--placement", "--recording", "--alanine alanine-windows"),
+        script(
+            "29_free_energy",
+            "--full",
+            "--placement",
+            "--recording",
+            "--alanine alanine-windows",
+            "--pulls alanine-windows",
+        ),
         95,
     ),
     "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), 11),

@@ -3,6 +3,7 @@
     python examples/29_free_energy.py                   some seconds: a chain under three thermostats
     python examples/29_free_energy.py --full            the same with errors of 1 %, into docs/results/free_energy.json
     python examples/29_free_energy.py --alanine FOLDER  phi of alanine dipeptide: windows against umbrellas and MBAR
+    python examples/29_free_energy.py --pulls FOLDER    the same over its lower barrier by pulls, after --alanine FOLDER
     python examples/29_free_energy.py --placement       how many windows five profiles need
     python examples/29_free_energy.py --recording       what a sample costs beside a step
 
@@ -23,7 +24,7 @@ import numpy as np
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.comparison import environment, json_files
 from kcons.constraints import Dihedral, Distance
-from kcons.free_energy import HeldCoordinates, Recorder, Settings, mean_force
+from kcons.free_energy import FreeEnergy, HeldCoordinates, Recorder, Settings, Windows, mean_force
 from kcons.steppers import Stepper
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 
@@ -216,40 +217,43 @@ def _enough(errors: dict[int, list[float]]) -> int | None:
 # -- alanine dipeptide ----------------------------------------------------------------------------------
 
 
-def alanine(folder: Path, first: int, most: int, production: int, workers: int) -> dict[str, object]:
-    """phi in vacuum: windows of held phi, and umbrellas with as many steps put together by MBAR.
-
-    `first` windows are at equal distances, the others where they are proposed.
-    """
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
+def windows_of_phi(folder: Path) -> tuple[Windows, FreeEnergy]:
+    """Of alanine dipeptide in vacuum: FIRST at equal distances, the others where they are proposed."""
     from openmm import app
-    from pymbar import FES
-    from scipy.interpolate import CubicSpline
 
-    from kcons.free_energy import OpenMMWindows, Windows, weighted_mean
+    from kcons.free_energy import OpenMMWindows
 
     pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
-    system = _system(pdb)
     sampler = OpenMMWindows(
-        pdb.topology, system, pdb.positions, {"phi": Dihedral([[4, 6, 8, 14]])}, platform="Reference"
+        pdb.topology, _system(pdb), pdb.positions, {"phi": Dihedral([[4, 6, 8, 14]])}, platform="Reference"
     )
-    settings = Settings(timestep=STEP, temperature=TEMPERATURE, friction=FRICTION, production=production, every=25)
+    settings = Settings(timestep=STEP, temperature=TEMPERATURE, friction=FRICTION, production=PRODUCTION, every=25)
     held = Windows(sampler, folder / "windows", settings)
-    places = np.linspace(-np.pi, np.pi, first, endpoint=False)
 
     def progress(*n: object) -> None:
         print("windows", *n, flush=True)
 
-    held.run(places, workers=workers, progress=progress)
-    result = held.improve(0.05, most, below=HIGHEST, workers=workers, progress=progress, at_once=8)
-    profile, windows = result.profile, len(result.windows)
-    total = 2 * windows * (settings.pull + settings.equilibration + production)
-    each = total // first
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        series = list(pool.map(umbrella, places, range(first), [each] * first, [str(folder)] * first))
-    kT = 0.00831446261815324 * TEMPERATURE
+    held.run(np.linspace(-np.pi, np.pi, FIRST, endpoint=False), workers=1, progress=progress)
+    return held, held.improve(0.05, MOST, below=HIGHEST, workers=1, progress=progress, at_once=8)
+
+
+def alanine(folder: Path) -> dict[str, object]:
+    """phi: windows where it is held, and umbrellas with as many steps put together by MBAR."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    from pymbar import FES
+    from scipy.interpolate import CubicSpline
+
+    from kcons.free_energy import weighted_mean
+
+    held, result = windows_of_phi(folder)
+    profile, windows, settings = result.profile, len(result.windows), held.settings
+    total = 2 * windows * (settings.pull + settings.equilibration + PRODUCTION)
+    each = total // FIRST
+    places = np.linspace(-np.pi, np.pi, FIRST, endpoint=False)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        series = list(pool.map(umbrella, places, range(FIRST), [each] * FIRST, [str(folder)] * FIRST))
     # MBAR's errors are those of independent samples; the same rule as for the windows says how far apart these are.
     apart = [
         weighted_mean((each - place + np.pi) % (2 * np.pi)).inefficiency[0]
@@ -277,7 +281,7 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
     found = {
         "windows": windows,
         "steps of each method": total,
-        "umbrellas": first,
+        "umbrellas": FIRST,
         "seconds of the windows": sum(w.seconds for w in result.windows),
         "largest difference below 30 kJ/mol": float(np.abs(difference[low]).max()),
         "root mean square difference": float(np.sqrt(np.mean(difference[low] ** 2))),
@@ -290,21 +294,28 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
         "MBAR": (kT * known["f_i"]).tolist(),
         "MBAR error": (kT * known["df_i"]).tolist(),
     }
-    found["pulls"] = pulls(sampler, replace(settings, pull=5000), folder / "pulls", profile, workers)
     print({k: v for k, v in found.items() if not isinstance(v, list)})
     return found
 
 
-def pulls(sampler: object, settings: Settings, folder: Path, profile: object, workers: int) -> dict[str, object]:
+def pulls(folder: Path, count: int = 64) -> dict[str, object]:
     """From the lowest minimum over the lower barrier, 20 ps each, both ways; and the windows between the same ends."""
-    from kcons.free_energy import Windows
+    from kcons.free_energy import Series, pull_free_energy, thermal_multipliers
 
     start, end = -1.3, 0.0
-    found = Windows(sampler, folder, settings).pull(start, end, 8, workers=workers)
-    windows = profile.difference(start, end)
-    return {
+    held, result = windows_of_phi(folder)
+    windows = result.profile.difference(start, end)
+    settings = replace(held.settings, pull=5000)
+    found = Windows(held.sampler, folder / "pulls", settings).pull(start, end, count, workers=1)
+    assert found.bar is not None and found.jarzynski_backward is not None
+    ways = [f"{a:g}-to-{b:g}" for a, b in ((start, end), (end, start))]
+    series = [[Series.load(file) for file in sorted((folder / "pulls").glob(f"pull-{way}-*.npz"))] for way in ways]
+    works = [[each.work[-1] for each in way] for way in series]
+    thermal = [[each.work_of(thermal_multipliers(each, kT))[-1] for each in way] for way in series]
+    fast, slow = (pull_free_energy(*each, thermal_energy=kT).best.value for each in (works, thermal))
+    told = {
         "from, to": [start, end],
-        "pulls each way": 8,
+        "pulls each way": count,
         "steps": settings.pull,
         "BAR": [found.bar.value, found.bar.error],
         "Jarzynski": [found.jarzynski.value, found.jarzynski.error],
@@ -313,10 +324,15 @@ def pulls(sampler: object, settings: Settings, folder: Path, profile: object, wo
         "overlap": found.overlap,
         "windows": [windows.value, windows.error],
         "standard errors off": (found.bar.value - windows.value) / float(np.hypot(found.bar.error, windows.error)),
+        "with the velocities of the run": fast - slow,
     }
+    print(told)
+    return told
 
 
 TEMPERATURE, STIFFNESS = 300.0, 150.0  # K, kJ/mol/rad^2
+kT = 0.00831446261815324 * TEMPERATURE
+FIRST, MOST, PRODUCTION = 24, 36, 480_000  # windows at equal distances, windows in all, steps of each side
 HIGHEST = 30.0  # kJ/mol: what is compared, and where windows are added for
 STEP, FRICTION = 4.0, 1.0  # fs with heavy hydrogens, 1/ps: psi, which is slow, turns fastest
 
@@ -411,7 +427,9 @@ def main(arguments: list[str]) -> None:
     if "--alanine" in arguments:
         folder = Path(arguments[arguments.index("--alanine") + 1])
         folder.mkdir(parents=True, exist_ok=True)
-        found = {"alanine dipeptide": alanine(folder, 24, 36, 480_000, 1)}
+        found = {"alanine dipeptide": alanine(folder)}
+    elif "--pulls" in arguments:
+        found = {"pulls": pulls(Path(arguments[arguments.index("--pulls") + 1]))}
     elif "--placement" in arguments:
         found = {"placement": placement()}
     elif "--recording" in arguments:

@@ -19,7 +19,7 @@ from kcons.errors import with_extra
 _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
     "series": ("Recorder", "Series"),
-    "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
+    "mean_forces": ("MeanForce", "local_mean_force", "mean_force", "thermal_multipliers"),
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
     "windows.window": ("Settings", "Window"),

@@ -54,8 +54,8 @@ class MeanForce:
         )
 
 
-def local_mean_force(series: Series, kT: float) -> FloatArray:
-    """What is averaged with the weights of the series to give dF/dq, shape (n, d): lambda + kT G.
+def thermal_multipliers(series: Series, kT: float) -> FloatArray:
+    """Multipliers as canonical velocities would give them, shape (n, d).
 
     The part of lambda that is quadratic in the velocities is replaced by its mean over canonical velocities where that
     is known: those of a run have a wrong temperature in fast modes, to second order in the step. Where it is not known,
@@ -72,7 +72,7 @@ def local_mean_force(series: Series, kT: float) -> FloatArray:
     InputError
         `kT` that is not positive, or g = 1.
     """
-    force = series.multiplier + positive(kT, "kT") * series.gradient
+    positive(kT, "kT")
     known, g = np.isfinite(series.mean_kinetic), series.isokinetic_degrees_of_freedom
     if g == 1:
         raise InputError(
@@ -80,7 +80,15 @@ def local_mean_force(series: Series, kT: float) -> FloatArray:
             item="isokinetic_degrees_of_freedom",
         )
     of_run = series.kinetic / (g - 1) if g else 0.0
-    return force + np.where(known, kT * series.mean_kinetic - series.kinetic, of_run)
+    return series.multiplier + np.where(known, kT * series.mean_kinetic - series.kinetic, of_run)
+
+
+def local_mean_force(series: Series, kT: float) -> FloatArray:
+    """What is averaged with the weights of the series to give dF/dq, shape (n, d): lambda + kT G.
+
+    Lambda is that of `thermal_multipliers`, whose parameters and errors these are.
+    """
+    return thermal_multipliers(series, kT) + kT * series.gradient
 
 
 def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:

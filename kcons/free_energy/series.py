@@ -155,10 +155,13 @@ class Series:
 
         Second order in the interval from one sample to the next; record every step where it matters.
         """
+        return self.work_of(self.multiplier)
+
+    def work_of(self, force: FloatArray) -> FloatArray:
+        """The work of any force along the coordinates, shape (n, d), up to each sample, shape (n,)."""
         if not self._samples:
             return np.zeros(0)
-        value, force = self.value, self.multiplier
-        moved = nearest_image(np.diff(value, axis=0), self.periods)
+        moved = nearest_image(np.diff(self.value, axis=0), self.periods)
         return np.concatenate([[0.0], np.cumsum(np.sum((force[1:] + force[:-1]) / 2 * moved, axis=1))])
 
     # -- files ----------------------------------------------------------------------------------

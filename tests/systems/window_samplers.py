@@ -25,7 +25,8 @@ def slope(q):
 class Fake:
     """Multipliers of a torsion with noise; notes in `diary` that a window was begun.
 
-    `fails` lists windows that raise, `kills` those whose process is killed the first time.
+    `fails` lists windows that raise, `kills` those whose process is killed the first time. `hot` is by how much the part
+    of the multipliers that velocities have is too large in pulls.
     """
 
     diary: str
@@ -34,6 +35,7 @@ class Fake:
     wait: float = 0.0
     noise: float = 2.0
     shift: float = 0.0
+    hot: float = 0.0
     names: tuple[str, ...] = ("torsion",)
     digest: str = "one system"
     angles: tuple[bool, ...] = (True,)
@@ -71,6 +73,7 @@ class Fake:
         work = np.random.default_rng(window.seed).normal((4.0 if up else -4.0) + 4 / (2 * KT), 2.0)
         series = Series(self.names)
         for q in (window.start[0], window.target[0]):
-            force, log_z = work / (window.target[0] - window.start[0]), np.log(4.0) if q > 0 else 0.0
-            series.append(Sample(q, np.array([q]), np.array([force]), np.zeros(1), log_z, np.zeros(1), 0.0, NONE, NONE))
+            force, log_z = work / self.kJ / (window.target[0] - window.start[0]), np.log(4.0) if q > 0 else 0.0
+            at, force, kinetic, mean = np.array([[q], [force + self.hot], [1.0 + self.hot], [self.kJ / KT]])
+            series.append(Sample(q, at, force, kinetic, log_z, np.zeros(1), 0.0, NONE, mean))
         series.save(file)

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import seed_number, whole_number
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
-from kcons.free_energy.mean_forces import MeanForce, mean_force
+from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
@@ -375,7 +375,9 @@ def _sampled(sampler: Sampler, window: Window, settings: Settings, file: Path) -
 
 def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
     """What the pulls of one or both directions say, with kT in kJ/mol."""
-    works = [np.array([series.work[-1] * kJ for series in each]) for each in pulls]
+    works = [
+        np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each]) for each in pulls
+    ]
     log_weights = [np.array([-0.5 * series.log_det_z[[0, -1]] for series in each]).reshape(-1, 2) for each in pulls]
     # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
     if len(pulls) == 2:

@@ -208,6 +208,16 @@ def test_pulls_give_the_free_energy_of_the_coordinate(tmp_path, both_ways):
         Windows(Fake(str(tmp_path / "diary")), tmp_path / "no", Settings(pull=0)).pull(0, 1)
 
 
+def test_pulls_by_long_steps(tmp_path):
+    """Velocities of fast modes are too hot or too cold there: work has the part of canonical ones."""
+    found = []
+    with ThreadPoolExecutor(1) as executor:
+        for hot, kJ in ((0.0, 1.0), (1.5, 2.0)):
+            fake = Fake(str(tmp_path / "diary"), hot=hot, kJ=kJ)
+            found.append(Windows(fake, tmp_path / str(hot), SETTINGS).pull(-0.5, 0.5, 20, executor=executor))
+    assert found[1].best.value == pytest.approx(found[0].best.value, rel=1e-10)
+
+
 def test_pulls_that_fail_are_told_of(tmp_path):
     names = [f"pull--0.5-to-0.5-{k:04d}" for k in range(3)]
     one, many = (Fake(str(tmp_path / "diary"), fails=tuple(names[:n])) for n in (1, 3))
