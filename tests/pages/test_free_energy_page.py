@@ -42,10 +42,13 @@ def test_alanine_dipeptide_against_mbar():
 
 
 def test_pulls_against_windows():
-    found = FOUND["alanine dipeptide"]["pulls"]
-    for name in ("BAR", "Jarzynski", "windows"):
-        assert "{:.1f} ± {:.1f}".format(*found[name]) in TEXT
+    found = FOUND["pulls"]
+    assert f"{found['pulls each way']} pulls of {found['steps'] * 4 // 1000} ps each way" in TEXT
+    assert "{:.1f} ± {:.1f} kJ/mol by BAR, {:.1f} ± {:.1f} by".format(*found["BAR"], *found["Jarzynski"]) in TEXT
+    assert "{:.1f} ± {:.1f} by the windows".format(*found["windows"]) in TEXT
+    assert f"{found['lost']:.1f} are lost" in TEXT
     assert f"{found['standard errors off']:+.1f} standard errors" in TEXT
+    assert f"BAR would be {-found['with the velocities of the run']:.1f} lower" in TEXT
     assert abs(found["standard errors off"]) < 3
 
 
