@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -66,11 +66,13 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
     Raises
     ------
     InputError
-        Fewer than 32 samples, or not as many of one as of the other.
+        Fewer than 32 samples, or not as many of one as of the other; curvatures that are all 0.
     """
     above, below = numbers(squares, "squares"), numbers(curvatures, "curvatures")
     if above.shape != below.shape:
         raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
+    if not below.any():
+        raise InputError("the forces do not change with the positions: they tell no temperature", item="curvatures")
     scale = float(below.mean())
     ratio = float(above.mean()) / scale
     return Estimate(ratio, mean((above - ratio * below) / scale).error)
@@ -97,6 +99,8 @@ def configurational_sample(
     ------
     UnsupportedError
         Targets move, or forces depend on the velocities.
+    InputError
+        Fewer than one direction.
     """
     if system.motion.plan.driven or system.velocity_dependent:
         raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
@@ -105,7 +109,7 @@ def configurational_sample(
     assert forces is not None
     square = float((forces * paced(system, x, forces, time)).sum())
     total = 0.0
-    for _ in range(directions):
+    for _ in range(whole_number(directions, "directions")):
         v = thermal_velocities(system, x, 1.0, rng, time=time)
         ends = [_slope(system, x, v, time, h) for h in (flight, -flight)]
         total += (ends[0] - ends[1]) / (2 * flight)

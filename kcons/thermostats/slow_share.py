@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import generator_of, numbers, positive, refuse_other
+from kcons.constraints.arguments import generator_of, numbers, refuse_other
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import Point, check_finite
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.multistep import ForceGroups
-from kcons.thermostats.temperature_split import configuration, spacing
+from kcons.thermostats.temperature_split import configuration, flight_of
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Typical move for a difference, as a share of the distance to the next atom.
@@ -49,7 +49,7 @@ def slow_share(
         Targets move, rows hold velocities, or forces come in no groups.
     InputError
         No such group; no frames, or of another shape, or off the constraints; a displacement that is not positive;
-        forces that do not change with the positions.
+        forces that do not change with the positions; all atoms fixed.
     NonFiniteError
         Forces that are not finite.
     """
@@ -68,9 +68,7 @@ def slow_share(
     slow, whole, flight = 0.0, 0.0, 0.0
     for number, frame in enumerate(x):
         here = configuration(system, frame)
-        if not flight:
-            move = REACH * spacing(here) if displacement is None else positive(displacement, "displacement")
-            flight = move / math.sqrt(3.0 * float(system.inverse_masses.mean()))
+        flight = flight or flight_of(system, here, displacement, REACH)
         v = thermal_velocities(system, here, 1.0, rng)
         changes = np.zeros((2, *here.shape))
         for way in (flight, -flight):

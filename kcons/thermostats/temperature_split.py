@@ -323,10 +323,7 @@ class TemperatureSplit:
     def _begin(self, x: FloatArray) -> None:
         system = self._system
         moving = system.inverse_masses[:, 0] > 0
-        if not moving.any():
-            raise InputError("all atoms are fixed: nothing has a temperature", item="atoms")
-        move = self._displacement or MOVE * spacing(x)
-        self._flight = move / math.sqrt(3.0 * float(system.inverse_masses[moving].mean()))
+        self._flight = flight_of(system, x, self._displacement, MOVE)
         clusters = Clusters(system.motion, x, moving)
         first = np.full(clusters.count, system.n_atoms)
         atoms = np.flatnonzero(moving)
@@ -451,6 +448,23 @@ def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:
     versed = 0.5 * (h * np.sinc(0.5 * angle / np.pi)) ** 2
     across = np.cross(spin, arms)
     return np.asarray(arms + sine * across + versed * np.cross(spin, across))
+
+
+def flight_of(system: System, x: FloatArray, displacement: float | None, share: float) -> float:
+    """How long atoms that move fly at unit thermal energy until they have typically moved so far.
+
+    By default that is a share of the distance to the next atom.
+
+    Raises
+    ------
+    InputError
+        All atoms are fixed; a displacement that is not positive; none, and one atom only.
+    """
+    moving = system.inverse_masses > 0
+    if not moving.any():
+        raise InputError("all atoms are fixed: nothing has a temperature, or a stiffness", item="atoms")
+    move = share * spacing(x) if displacement is None else positive(displacement, "displacement")
+    return move / math.sqrt(3.0 * float(system.inverse_masses[moving].mean()))
 
 
 def spacing(x: FloatArray) -> float:

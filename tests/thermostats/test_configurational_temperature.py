@@ -61,6 +61,11 @@ def test_samples_that_do_not_go_together():
         configurational_temperature(np.ones(100), np.ones(99))
 
 
+def test_forces_that_are_the_same_everywhere_tell_no_temperature():
+    with pytest.raises(InputError, match="do not change with the positions"):
+        configurational_temperature(np.ones(100), np.zeros(100))
+
+
 def test_on_a_sphere():
     """U = m g z: |grad U|^2/m = m g^2 (1 - z^2/R^2), and the laplacian is -2 g z/R^2."""
     radius, m, g = 1.3, 2.0, 0.7
@@ -85,6 +90,8 @@ def test_free_atoms_see_the_plain_laplacian():
     square, curvature = configurational_sample(held, State(x, x), np.random.default_rng(0), directions=4000)
     assert square == pytest.approx(float((x**6 / m[:, None]).sum()), rel=1e-13)
     assert curvature == pytest.approx(float((3 * x**2 / m[:, None]).sum()), rel=0.08)
+    with pytest.raises(InputError, match="directions is 0"):
+        configurational_sample(held, State(x, x), np.random.default_rng(0), directions=0)
 
 
 def test_where_targets_move_there_is_none():

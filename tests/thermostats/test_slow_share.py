@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from thermostat_systems import dumbbells, system
 
-from kcons.constraints import Distance
+from kcons.constraints import Distance, FixedAtoms
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import System
 from kcons.thermostats import ForceGroups, slow_share
@@ -51,6 +51,29 @@ def test_a_rigid_pair_turns_freely_in_a_trap():
     frames = np.tile(x, (20, 1, 1))
     assert slow_share(held(slow=along), frames, displacement=1e-3) < 1e-6
     assert slow_share(held(slow=lambda x, t: -2 * K * x), frames) == pytest.approx(2 / 3, rel=1e-6)
+
+
+def test_fixed_atoms_make_no_longer_moves():
+    """A pair that repels steeply, alone and beside a slab."""
+    slab = [[i, j, -20.0] for i in range(10) for j in range(10)]
+
+    def fast(x, t):
+        d = x[1] - x[0]
+        push = 12 * d / np.linalg.norm(d) ** 14
+        return np.vstack([-push - x[0], push - x[1], np.zeros((len(x) - 2, 3))])
+
+    def slow(x, t):
+        return np.vstack([-0.5 * x[:2], np.zeros((len(x) - 2, 3))])
+
+    shares = []
+    for fixed in ([], slab):
+        x = np.array([[0.0, 0, 0], [1.0, 0, 0], *fixed])
+        rows = [FixedAtoms(np.arange(2, len(x)))] if fixed else []
+        shares.append(slow_share(grouped(rows, x, np.ones(len(x)), fast=fast, slow=slow), np.tile(x, (200, 1, 1))))
+    assert shares[1] == pytest.approx(shares[0], rel=0.3)
+    held = grouped([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], fast=lambda x, t: -x, slow=lambda x, t: -x)
+    with pytest.raises(InputError, match="all atoms are fixed"):
+        slow_share(held, [[[0.0, 0, 0]]], displacement=0.1)
 
 
 def test_bad_input():

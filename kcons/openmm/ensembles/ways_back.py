@@ -10,8 +10,11 @@ from kcons.openmm.integrator.projected import ProjectedIntegrator
 class WaysBackWriter(LeanStepWriter):
     """As `LeanStepWriter`, with the way back of each drift.
 
-    A kick undoes itself when velocities are turned round; only drifts can fail to, where their projection finds another
-    solution on the way back. So it is enough to take back drifts, which costs projections and no force.
+    A kick undoes itself when velocities are turned round, but for what it does across the constraints; only drifts can
+    fail to, where their projection finds another solution on the way back. So it is enough to take back drifts, which
+    costs projections and no force. Each drift begins with velocities made tangent, which does not change where it has
+    to end: so the way back is that of the step from the end, whatever its kicks do across, to the place where solvers
+    start.
     """
 
     def write(self) -> None:
@@ -31,8 +34,10 @@ class WaysBackWriter(LeanStepWriter):
     def _drift(self, h: str, u: str = "v") -> str:
         p = self.program
         p.each("x_begin", "x", "where the drift begins")
-        impulse = super()._drift(h, u)
-        p.each("v", f"{u}+{impulse}", "the constraint forces act on v as well")
+        if u != "v":
+            p.each("v", u, "the velocities it begins with")
+        p.hold_velocities("the drift begins tangent to the constraints, as its way back does")
+        p.each("v", f"v+{super()._drift(h)}", "the constraint forces act on v as well")
         p.each("v_land", "v", "to come back to")
         p.each("x_land", "x", "to come back to")
         p.hold_velocities("the way back begins tangent to the constraints")
@@ -47,7 +52,7 @@ class WaysBackWriter(LeanStepWriter):
 
 
 class WaysBackIntegrator(ProjectedIntegrator):
-    """As `ProjectedIntegrator` without parts; each drift is taken back, which costs as many solves again and no force.
+    """As `ProjectedIntegrator` without parts; each drift is taken back, which costs solves of constraints and no force.
 
     For `HamiltonianMonteCarlo`, which rejects trajectories with a drift that cannot be taken back.
     """

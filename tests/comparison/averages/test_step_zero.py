@@ -61,6 +61,7 @@ def test_a_model_that_does_not_fit_is_told():
     [
         ([2.0], [(1.0, 0.1)], 2, "at one step cannot be extrapolated"),
         ([2.0, 2.0], [(1.0, 0.1), (1.1, 0.1)], 2, "at one step cannot be extrapolated"),
+        ([0.3, 0.1 + 0.2], [(1.0, 0.1), (1.1, 0.1)], 2, "at one step cannot be extrapolated"),
         ([2.0, 1.0], [(1.0, 0.1)], 2, "do not go together"),
         ([2.0, -1.0], [(1.0, 0.1), (1.0, 0.1)], 2, "give positive numbers"),
         ([2.0, 1.0], [(1.0, 0.1), (1.0, 0.0)], 2, "positive errors"),
