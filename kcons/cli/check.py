@@ -25,9 +25,9 @@ def add(commands: Any) -> None:
     check = commands.add_parser(
         "check",
         help="how well a trajectory of any engine kept its constraints",
-        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift, judged by "
-        "the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file that "
-        "ends too early, or has a NaN.",
+        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift, judged "
+        "by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file "
+        "that ends too early, or has a NaN.",
     )
     check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
     check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
