@@ -25,13 +25,15 @@ def add(commands: Any) -> None:
     check = commands.add_parser(
         "check",
         help="how well a trajectory of any engine kept its constraints",
-        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift; told by "
-        "the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file that "
-        "ends too early, or has a NaN.",
+        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift, judged "
+        "by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file "
+        "that ends too early, or has a NaN.",
     )
     check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
     check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
-    check.add_argument("--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, ...")
+    check.add_argument(
+        "--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, allangles or none"
+    )
     check.add_argument("--select", default="all", help="rows within this selection only (MDAnalysis' language)")
     check.add_argument("--no-rigid-water", action="store_true", help="do not expect water to be rigid")
     check.add_argument("--rigid-residues", nargs="+", default=(), metavar="NAME", help="residues that are held rigid")

@@ -85,7 +85,7 @@ def _parser() -> Parser:
 
     names_help = "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
     common = Parser(add_help=False)
-    common.add_argument("scene", nargs="?", help=names_help)
+    common.add_argument("scene", nargs="?", metavar="SYSTEM", help=names_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
     common.add_argument("--seed", type=int, default=1, help="of the initial velocities (default 1)")
     molecules = common.add_argument_group("molecules in OpenMM: alanine, dhfr, dhfr-water, villin, and files")
@@ -97,10 +97,10 @@ def _parser() -> Parser:
     molecules.add_argument(
         "--forcefield", nargs="+", metavar="XML", help="files of OpenMM (default amber14-all.xml amber14/tip3pfb.xml)"
     )
-    molecules.add_argument("--add-hydrogens", action="store_true", help="that a file lacks, at pH 7")
+    molecules.add_argument("--add-hydrogens", action="store_true", help="add hydrogens that a file lacks, at pH 7")
     molecules.add_argument("--platform", help="of OpenMM (default: Reference up to 200 atoms, CPU above)")
     files = common.add_argument_group("any file that MDAnalysis reads; these options make it read PDB files, too")
-    files.add_argument("--coordinates", type=Path, metavar="FILE", help="coordinates of a topology without")
+    files.add_argument("--coordinates", type=Path, metavar="FILE", help="coordinates, where the topology file has none")
     files.add_argument(
         "--forces",
         help="openmm (default), force fields of OpenMM by name, comma separated (amber14-all,amber14/tip3p), or emt, "
@@ -128,7 +128,7 @@ def _parser() -> Parser:
         type=names,
         help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
     )
-    compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
+    compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SYSTEM)")
     compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
     compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
     compare.add_argument(

@@ -56,7 +56,11 @@ def add(commands: Any) -> None:
     scan.add_argument("--from", dest="begin", help="first value, one for each coordinate (dihedrals: -180)", **value)
     scan.add_argument("--to", dest="end", help="last value, one for each coordinate (dihedrals: 180)", **value)
     scan.add_argument(
-        "--steps", nargs="+", type=int, metavar="N", help="from the first value to the last, one for each (default 24)"
+        "--steps",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="steps from the first value to the last, one for each (default 24)",
     )
     scan.add_argument("--count-from", type=int, choices=(0, 1), default=0, help="number of the first atom (default 0)")
     scan.add_argument("--fix", nargs="+", type=int, default=(), metavar="ATOM", help="atoms that stay where they are")

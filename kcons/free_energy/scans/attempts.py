@@ -181,5 +181,7 @@ def _refuse_another(place: Path, plan: Mapping[str, Any]) -> None:
     wrong = [name for name in plan if before[name] != json.loads(json.dumps(plan[name]))]
     if wrong:
         raise OccupiedError(
-            f"{place.parent} has another scan in it (of other {', '.join(wrong)}); take another folder", item="folder"
+            f"{place.parent} has another scan in it (of other {', '.join(wrong)}); take another folder "
+            "(--out on the command line)",
+            item="folder",
         )

@@ -52,7 +52,7 @@ class _Remote:
 
 
 class ConstraintCheck(AnalysisBase):
-    """Deviations of all constraints along a trajectory, told by the precision of its file.
+    """Deviations of all constraints along a trajectory, judged by the precision of its file.
 
     Parameters
     ----------

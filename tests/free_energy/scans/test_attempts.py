@@ -52,7 +52,7 @@ def test_an_attempt_of_another_scan_is_refused(tmp_path):
 
 def test_the_plan_has_to_be_the_same(tmp_path):
     made(tmp_path)
-    with pytest.raises(OccupiedError, match=r"another scan in it \(of other settings\)"):
+    with pytest.raises(OccupiedError, match=r"another scan in it \(of other settings\); take another folder \(--out"):
         made(tmp_path, {"fmax": 0.02})
     plan = json.loads((tmp_path / PLAN).read_text())
     (tmp_path / PLAN).write_text(json.dumps({**plan, "colour": 1}))
