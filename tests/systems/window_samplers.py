@@ -25,8 +25,8 @@ def slope(q):
 class Fake:
     """Multipliers of a torsion with noise; notes in `diary` that a window was begun.
 
-    `fails` lists windows that raise, `kills` those whose process is killed the first time. `hot` is by how much the part
-    of the multipliers that velocities have is too large in pulls.
+    `fails` lists windows that raise, `kills` those whose process is killed the first time. `hot` is by how much
+    velocities make the multipliers of pulls too large.
     """
 
     diary: str

@@ -93,7 +93,7 @@ class Settings:
         if self.production // self.every < 32:
             raise InputError(
                 f"production of {self.production} steps with a sample every {self.every} gives fewer than 32 samples; "
-                "an error needs more: a longer production, or a smaller every",
+                "an error needs more; take a longer production, or a smaller `every`",
                 item="production",
             )
 

@@ -97,7 +97,7 @@ def test_beside_fixed_atoms_the_pressure_is_the_atomic_one():
 def test_what_is_no_way_to_the_pressure():
     with pytest.raises(InputError, match="virial is 'mol'; choose 'molecular', 'atomic' or 'difference'"):
         PressureReporter(None, virial="mol")
-    with pytest.raises(InputError, match="not of those of atoms.*leave it out, or take virial='molecular'"):
+    with pytest.raises(InputError, match=r"not of those of atoms.*leave it out, or take virial='molecular'"):
         PressureReporter(None, virial="atomic", temperature_K=300)
 
 

@@ -104,7 +104,7 @@ def test_means_agree():
     pairs = np.arange(0, 36, 6)
     pieces = find_pieces(system, state.positions, np.ones(3, bool), np.stack([pairs, pairs + 3], axis=1))
     assert len(pieces) == 6
-    with pytest.raises(InputError, match="not of those of atoms.*leave it out, or take virial='molecular'"):
+    with pytest.raises(InputError, match=r"not of those of atoms.*leave it out, or take virial='molecular'"):
         PressureObserver(system, "atomic", thermal_energy=1.0)
     seen = [PressureObserver(system, pieces=pieces), PressureObserver(system, "atomic")]
     state = run(system, state, 0.05, 200, stepper=Langevin(1.0, 1.0, seed=1))
