@@ -11,10 +11,11 @@ from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics
 from kcons.ase.binding import applied_forces
 from kcons.ase.topology import bonds_of, velocities_of
 from kcons.constraints import Constraint, Dihedral
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, Sample, named
 from kcons.free_energy.series import Series
 from kcons.motion.motion import Motion
+from kcons.thermostats import IsokineticSpheres
 
 
 class AseRecorder:
@@ -41,6 +42,8 @@ class AseRecorder:
     ------
     InputError
         The atoms carry no constraints of kcons, or do not hold a coordinate.
+    UnsupportedError
+        At a sample: velocities on isokinetic spheres, where the multipliers need thermal ones.
 
     Examples
     --------
@@ -95,12 +98,20 @@ class AseRecorder:
         if isinstance(self.dynamics, IsokineticDynamics):  # known once it runs
             self.series.isokinetic_degrees_of_freedom = self.dynamics.thermostat_degrees_of_freedom
         x, v = atoms.positions, velocities_of(atoms)
-        self.last = self._held.sample(x, v, forces, time)
-        self.series.append(self.last)
+        sample = self._held.sample(x, v, forces, time)
+        spheres = isinstance(getattr(self.dynamics, "stepper", None), IsokineticSpheres)
+        if spheres and not np.isfinite(sample.mean_kinetic).all():
+            raise UnsupportedError(
+                f"velocities on isokinetic spheres are not thermal, and multipliers of {', '.join(self._held.names)} "
+                "need them: their mean is known without only where all that is held on these atoms are distances, "
+                "angles and torsions. Take bath='langevin'"
+            )
+        self.last = sample
+        self.series.append(sample)
         for k, name in enumerate(self._held.names):
-            atoms.info[name] = float(self.last.value[k])
-            atoms.info[f"multiplier of {name}"] = float(self.last.multiplier[k])
-        atoms.info["ln det Z"] = self.last.log_det_z
+            atoms.info[name] = float(sample.value[k])
+            atoms.info[f"multiplier of {name}"] = float(sample.multiplier[k])
+        atoms.info["ln det Z"] = sample.log_det_z
         if self.constraint_forces:
             atoms.set_array("constraint_forces", motion.constraint_force(x, v, np.asarray(forces), time))
 

@@ -125,8 +125,9 @@ def weighted_mean(
     _refuse_one_sample(factors)
     n = len(series)
     fluctuation = _linearised(series, factors)
-    scale = np.maximum(np.abs(series).max(axis=0), np.finfo(float).tiny)
-    constant = np.abs(series - series[0]).max(axis=0) <= 1e-13 * scale
+    counted = series[factors > 0]
+    scale = np.maximum(np.abs(counted).max(axis=0), np.finfo(float).tiny)
+    constant = np.abs(counted - counted[0]).max(axis=0) <= 1e-13 * scale
     if constant.any():
         warnings.warn(
             f"all values of column {np.flatnonzero(constant).tolist()} are the same: their error is given as 0. "
@@ -179,7 +180,7 @@ def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_cov
     one, other : array_like, shape (d,) or ()
     covariance, other_covariance : array_like, shape (d, d) or ()
         Of the means. Where the sum of both is singular, only what has an error counts; a difference in what has none
-        has the probability 0.
+        has the probability 0. Differences of rounding, 1e-9 of the largest mean, are none.
 
     Raises
     ------
@@ -201,7 +202,8 @@ def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_cov
     sizes, directions = np.linalg.eigh(sum(c.reshape(d, d) for c in spreads))
     known = sizes > 1e-12 * max(float(sizes[-1]), 0.0)
     parts = directions.T @ away
-    if (np.abs(parts[~known]) > 1e-9 * np.abs(np.concatenate(arrays, axis=None)).max()).any():
+    parts[np.abs(parts) <= 1e-9 * np.abs(np.concatenate(arrays, axis=None)).max()] = 0.0
+    if parts[~known].any():
         return Agreement(math.inf, d, 0.0)
     square = float((parts[known] ** 2 / sizes[known]).sum())
     count = int(known.sum())

@@ -231,7 +231,8 @@ class Recorder:
         Whose constraints hold the coordinates.
     coordinates : HeldCoordinates
     series : Series, optional
-        Where to go on.
+        Where to go on; for an isokinetic stepper a new one with its `isokinetic_degrees_of_freedom`, which are not seen
+        from here. Velocities on isokinetic spheres are not thermal.
 
     Attributes
     ----------

@@ -11,10 +11,17 @@ from ase.constraints import Hookean
 from ase.io import read, write
 from ase.md.verlet import VelocityVerlet
 
-from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, Constraints, constrain
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    Constraints,
+    MultipleTimeSteps,
+    constrain,
+    draw_velocities,
+)
 from kcons.ase.binding import applied_forces
-from kcons.constraints import Dihedral, Distance, MovingTarget
-from kcons.errors import InputError
+from kcons.constraints import Dihedral, Distance, FixedAtoms, MovingTarget
+from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import AseRecorder
 
 
@@ -130,3 +137,24 @@ def test_forces_that_ase_constraints_add_count():
         atoms.positions, atoms.get_velocities(), atoms.get_forces(apply_constraint=False)
     )
     assert abs(without[0] - direct[0]) > 0.01
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_velocities_on_spheres_are_refused_where_multipliers_need_thermal_ones(fixed):
+    """They have about three quarters of the variance; where all rows are known to the kernel, none are needed."""
+    atoms = methanol()
+    turn, held = rows()
+    held = [turn, *held, *([FixedAtoms([0])] if fixed else [])]
+    draw_velocities(atoms, 300, 1, constraints=held)
+    fast, slow = (LennardJones(sigma=1.0, epsilon=e, rc=6.0) for e in (0.02, 0.01))
+    how = {"fast": fast, "slow": slow, "fast_steps": 2, "bath": "spheres", "seed": 1, "constraints": held}
+    dynamics = MultipleTimeSteps(atoms, 0.5 * units.fs, temperature_K=300, friction=0.02, **how)
+    recorder = AseRecorder(dynamics, {"turn": turn})
+    dynamics.attach(recorder, interval=1)
+    if fixed:
+        with pytest.raises(UnsupportedError, match=r"multipliers of turn need them.*bath='langevin'"):
+            dynamics.run(1)
+        assert not len(recorder.series) and recorder.last is None
+    else:
+        dynamics.run(1)
+        assert np.isfinite(recorder.series.mean_kinetic).all()

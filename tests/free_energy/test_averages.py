@@ -167,3 +167,16 @@ def test_agreement_of_single_numbers_and_of_exact_ones():
     ):
         with pytest.raises(InputError):
             agreement(*wrong)
+
+
+def test_what_changes_without_any_weight_is_constant():
+    values, weights = np.repeat([3.0, 5.0], 50), np.repeat([1.0, 0.0], 50)
+    with pytest.warns(UserWarning, match=r"all values of column \[0\] are the same"):
+        found = weighted_mean(values, weights)
+    assert found.value == 3.0 and found.error == 0.0
+
+
+def test_differences_of_rounding_are_none():
+    """The multiplier of two atoms alone is known exactly, and each side has another rounding."""
+    assert agreement(-7.75, 1e-28, -7.75 * (1 + 1e-13), 1e-28).p_value == 1.0
+    assert agreement(-7.75, 1e-28, -7.75 * (1 + 1e-6), 1e-28).p_value == 0.0

@@ -36,6 +36,8 @@ _MANY, _COEFFICIENTS = 7, 6
 _CLOSES = 4.0
 #: Part of the largest variance of a mean force that is rounding.
 _KNOWN = 1e-9
+#: Part of the range of the windows below which places are the same.
+_SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +136,8 @@ class Profile:
     def __str__(self) -> str:
         """A line for each window, and how far the free energy reaches."""
         low, high = (int(f(self.F)) for f in (np.argmin, np.argmax))
-        own = np.array([int(np.argmin(np.abs(self.x - x))) for x in self.windows])
-        columns = (self.windows, self.mean_forces, self.mean_force_errors, self.F[own], self.error[own])
+        own = np.array([self.difference(self.zero, x) for x in self.windows])
+        columns = (self.windows, self.mean_forces, self.mean_force_errors, *own.T)
         rows = [
             f"{x:10.4f} {f:11.4f} +- {e:<9.4f} {F:10.4f} +- {dF:.4f}" for x, f, e, F, dF in zip(*columns, strict=True)
         ]
@@ -212,7 +214,8 @@ class Profile:
         """What `without_jacobian` added to dF/dx, shape of `at`; 0 where it was not asked for."""
         if self._added is None:
             return np.zeros_like(at)
-        return np.asarray(np.interp(at, self.x, np.gradient(self._added(self.x), self.x)))
+        step = 1e-6 * np.ptp(self.windows)
+        return (self._added(at + step) - self._added(at - step)) / (2 * step)
 
     def next_window(self, *, between: tuple[float, float] | None = None, below: float | None = None) -> float:
         """Where one more window would tell most; see `next_windows`."""
@@ -350,14 +353,18 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
         raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
     if period is not None:
         positive(period, "period")
-        if len(place) and np.ptp(place) > period * (1 + 1e-9):
+        if len(place) and np.ptp(place) > period * (1 + _SAME):
             raise InputError(
                 f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
                 item="period",
             )
         place = place.min() + (place - place.min()) % period if len(place) else place
-        place = np.where(place - place.min() > period * (1 - 1e-9), place.min(), place) if len(place) else place
-    places, which = np.unique(place, return_inverse=True)
+        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place) if len(place) else place
+    # Places that differ by rounding are one: a spline through both would have any slope.
+    order = np.argsort(place, kind="stable")
+    new = np.diff(place[order], prepend=-np.inf) > _SAME * np.ptp(place) if len(place) else np.zeros(0, dtype=bool)
+    places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
+    which[order] = np.cumsum(new) - 1
     if len(places) < 3:
         raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
     for k in np.flatnonzero(np.bincount(which[error == 0], minlength=len(places)) > 1):
@@ -386,7 +393,7 @@ def _places(at: ArrayLike, known: _Windows, item: str) -> FloatArray:
     if points.ndim != 1 or not np.isfinite(points).all():
         raise InputError(f"{item} must be a list of finite numbers", item=item)
     low, high = float(known.x[0]), known.end
-    slack = 1e-9 * (high - low)
+    slack = _SAME * (high - low)
     if known.period is not None:
         outside = (points < low - slack) | (points > high + slack)
         points = np.where(outside, low + (points - low) % known.period, points)

@@ -27,6 +27,8 @@ from kcons.thermostats import Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
 FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03
+#: Standard errors by which pulls both ways may gain work before that is warned of.
+_GAIN = 4.0
 #: Works over kT that differ by less are the same, but for rounding.
 _NO_SPREAD = 1e-9
 
@@ -105,7 +107,8 @@ def pull_free_energy(
     Warns
     -----
     UserWarning
-        Fewer than 10 forward pulls count and there are none back, or pulls both ways overlap by less than 3 percent.
+        Fewer than 10 forward pulls count and there are none back, or pulls both ways overlap by less than 3 percent,
+        or gain work, as those of the wrong sign do.
     """
     kT = positive(thermal_energy, "thermal_energy")
     ahead = _works(forward, "forward", kT)
@@ -138,6 +141,15 @@ def pull_free_energy(
         warnings.warn(
             f"forward and backward pulls have an overlap of {overlap:.1%}; below {_OVERLAP:.0%} errors are not to be "
             "relied on: pull more slowly, or over a shorter way",
+            UserWarning,
+            stacklevel=2,
+        )
+    lost = float(ahead.mean() + back.mean())
+    off = math.sqrt(ahead.var(ddof=1) / len(ahead) + back.var(ddof=1) / len(back))
+    if lost < -max(_NO_SPREAD, _GAIN * off):
+        warnings.warn(
+            f"forward and backward pulls together gain {-kT * lost:.3g} where some work must be lost: give the work "
+            "done on the system, of backward pulls too, not by it",
             UserWarning,
             stacklevel=2,
         )

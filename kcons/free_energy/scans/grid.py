@@ -28,8 +28,8 @@ class Grid:
     coordinates : sequence of Constraint
         One row each.
     values : sequence of array_like
-        For each of them, in angstrom or radian; put into ascending order. Of dihedrals over a whole turn the last
-        value, which is the first one again, is left out.
+        For each of them, in angstrom or radian, up or down. Of dihedrals over a whole turn the last value, which is the
+        first one again, is left out.
 
     Attributes
     ----------
@@ -121,20 +121,20 @@ class Grid:
 
 def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:
     name = item.row_name(0)
-    axis = np.sort(np.atleast_1d(np.array(numbers(given, f"values of {name}"))))
+    axis = np.atleast_1d(np.array(numbers(given, f"values of {name}")))
     if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
         raise InputError(f"the values of {name} are not a list of finite numbers", item="values")
-    ring = False
+    ring, span = False, float(np.ptp(axis))
+    if np.diff(np.sort(axis)).min(initial=np.inf) <= SAME * span:
+        raise InputError(f"two values of {name} are the same; give each once", item="values")
+    if len(set(np.sign(np.diff(axis)).tolist())) > 1:
+        raise InputError(f"the values of {name} go up and down; give them in order", item="values")
     if item.period is not None and len(axis) > 1:
-        limit = item.period * (1 + SAME)
-        if axis[-1] - axis[0] > limit:
+        if span > item.period * (1 + SAME):
             raise InputError(
                 f"the values of {name} span more than its period, {item.period:.6g}; give one turn", item="values"
             )
-        if axis[-1] - axis[0] > item.period * (1 - SAME):
+        if span > item.period * (1 - SAME):
             axis = axis[:-1]
-        gaps = np.diff(axis)
-        ring = len(axis) > 2 and item.period - (axis[-1] - axis[0]) <= 1.5 * float(gaps.max())
-    if len(axis) > 1 and np.diff(axis).min() <= SAME * (axis[-1] - axis[0]):
-        raise InputError(f"two values of {name} are the same; give each once", item="values")
+        ring = len(axis) > 2 and item.period - float(np.ptp(axis)) <= 1.5 * float(np.abs(np.diff(axis)).max())
     return axis, ring

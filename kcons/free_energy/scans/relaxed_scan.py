@@ -169,7 +169,7 @@ def scan(
     coordinates : Constraint, or sequence of one or two
         What is scanned, one row each: ``Dihedral([0, 1, 2, 3])``, or any other that depends on positions.
     values : array_like, or one for each coordinate
-        Where they are held, in angstrom or radian.
+        Where they are held, in angstrom or radian, up or down; `Scan.energies` is in this order.
     held : sequence of Constraint
         What else is held, at its targets or as it is in `atoms`.
     folder : path, optional

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from ase import Atoms, units
 from ase.calculators.calculator import Calculator, all_changes
 from openmm import unit
 
-from kcons.constraints import Distance
+from kcons.constraints import Constraint, Distance, FixedAtoms
 from kcons.errors import InputError, UnsupportedError
 
 #: kJ/mol in eV.
@@ -30,9 +31,9 @@ class SystemCalculator(Calculator):
 
     Attributes
     ----------
-    held : list of Distance
-        What the System constrains, in angstrom; OpenMM has no forces for it, so a scan is to hold it:
-        ``scan(atoms, ..., held=atoms.calc.held)``.
+    held : list of Constraint
+        What the System constrains, in angstrom, and particles without mass, which OpenMM does not move. There are no
+        forces for it, so a scan is to hold it: ``scan(atoms, ..., held=atoms.calc.held)``.
 
     Raises
     ------
@@ -50,7 +51,12 @@ class SystemCalculator(Calculator):
             raise UnsupportedError(f"particle {sites[0]} is a virtual site; relax a System without such sites")
         rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
         lengths = [length.value_in_unit(unit.angstrom) for _, _, length in rows]
-        self.held = [Distance([[i, j] for i, j, _ in rows], lengths)] if rows else []
+        self.held: list[Constraint] = [Distance([[i, j] for i, j, _ in rows], lengths)] if rows else []
+        still = [k for k in range(count) if not system.getParticleMass(k)._value]
+        if still:
+            self.held.append(FixedAtoms(still))
+        # What a folder of a scan or of windows belongs to.
+        self.parameters["system"] = sha256(openmm.XmlSerializer.serialize(system).encode()).hexdigest()
         self._count, self._periodic = count, system.usesPeriodicBoundaryConditions()
         chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform)]
         self._context = openmm.Context(system, openmm.VerletIntegrator(0.001), *chosen)

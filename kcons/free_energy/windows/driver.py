@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import seed_number, whole_number
+from kcons.constraints.arguments import positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
@@ -167,6 +167,8 @@ class Windows:
         at_once : int
             How many are added before the profile is looked at again: as many as there are workers.
         """
+        positive(error, "error")
+        whole_number(most, "most")
         result = self.result()
         while len(self._targets) < most:
             profile = result.profile

@@ -354,3 +354,30 @@ def test_a_profile_prints_its_windows_and_not_its_arrays():
     assert first.split() == ["window", "dF/dx", "F"] and len(lines) == 5
     assert [float(word) for word in lines[-1].replace("+-", "").split()[:3]] == [2.0, 4.0, 0.01]
     assert last.startswith("from 1 to 2 F rises by 3")
+
+
+@pytest.mark.parametrize("method", ["gp", "spline"])
+@pytest.mark.parametrize("off", [2e-16, 1e-12])
+def test_windows_that_rounding_moves_apart_are_at_one_place(method, off):
+    """A spline through both would have a slope of the difference over the rounding."""
+    x, f, e = np.array([0.0, 0.3, 0.6, 1.0]), np.array([1.0, 2.0, 3.0, 4.0]), np.full(4, 0.1)
+    moved = integrate(np.append(x, 0.3 + off), np.append(f, 2.2), np.full(5, 0.1), method=method).difference(0, 1)
+    same = integrate(np.append(x, 0.3), np.append(f, 2.2), np.full(5, 0.1), method=method).difference(0, 1)
+    assert moved == pytest.approx(same, rel=1e-6)
+    assert abs(moved.value - integrate(x, f, e, method=method).difference(0, 1).value) < 0.1
+
+
+@pytest.mark.parametrize("at", [None, [1.0, 3.0]])
+def test_a_printed_profile_has_the_free_energy_of_each_window(at):
+    case = CASES["Lennard-Jones"]
+    x = case.grid(12)
+    found = integrate(x, case.f(x), np.full(12, 1e-3), at=at)
+    shown = [float(line.split()[4]) for line in str(found).splitlines()[1:-1]]
+    np.testing.assert_allclose(shown, [found.difference(found.zero, place).value for place in x], atol=1e-4)
+
+
+def test_slopes_without_the_jacobian_do_not_depend_on_where_the_profile_is_given():
+    x = np.linspace(1.0, 3.0, 8)
+    for at in (None, np.linspace(3.0, 1.0, 50), [2.0]):
+        flat = integrate(x, 1 / x, np.full(8, 1e-3), at=at).without_jacobian("distance", 2.5)
+        np.testing.assert_allclose(flat.added_slope(x[1:-1]), 5 / x[1:-1], rtol=1e-6)

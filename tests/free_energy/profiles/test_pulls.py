@@ -179,3 +179,10 @@ def test_one_direction_needs_no_package(monkeypatch):
     assert pull_free_energy(works, thermal_energy=KT).best.value == pytest.approx(F, abs=0.1)
     with pytest.raises(UnsupportedError, match="free-energy"):
         pull_free_energy(works, -works, thermal_energy=KT)
+
+
+def test_works_of_the_wrong_sign_are_warned_of():
+    """By the system in place of on it: pulls there and back would gain work."""
+    forward, backward = normal(np.random.default_rng(6), 50, KT)
+    with pytest.warns(UserWarning, match="together gain .*give the work done on the system"):
+        pull_free_energy(-forward, -backward, thermal_energy=KT)

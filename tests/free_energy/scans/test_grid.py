@@ -22,13 +22,23 @@ def test_a_whole_turn_is_a_ring():
     assert part.rings == [False] and part.neighbours((2,)) == [(1,)]
 
 
+def test_values_that_descend_stay_in_their_order():
+    """Energies of a scan belong to the values as they were given."""
+    values = np.radians(np.arange(180, -181, -30))
+    grid = Grid([TURN], [values])
+    np.testing.assert_array_equal(grid.values[0], values[:-1])
+    assert grid.rings == [True] and grid.neighbours((0,)) == [(1,), (11,)]
+    assert grid.apart((0,), [np.radians(150)]) == pytest.approx(1)
+    assert Grid([TURN], [values[2:5]]).rings == [False]
+
+
 def test_two_coordinates():
     grid = Grid([TURN, LENGTH], [np.radians(np.arange(0, 360, 120)), [1.4, 1.2]])
     assert grid.shape == (3, 2) and len(grid.points) == 6 and grid.rings == [True, False]
     assert grid.neighbours((0, 0)) == [(1, 0), (2, 0), (0, 1)]
-    assert grid.at((0, 0)) == [0.0, 1.2]  # in ascending order
+    assert grid.at((0, 0)) == [0.0, 1.4]  # in the order given
     held = grid.held_at((2, 1))
-    assert held[0].target == pytest.approx([np.radians(240)]) and held[1].target == pytest.approx([1.4])
+    assert held[0].target == pytest.approx([np.radians(240)]) and held[1].target == pytest.approx([1.2])
     assert grid.names == ["Dihedral(0, 1, 2, 3)", "Distance(0, 1)"] and grid.in_degrees == [True, False]
     assert grid.units == ["degrees", "angstrom"]
     assert Grid([Formula("x1 * x2", [[0, 1]]), TURN], [[0.1], [0.2]]).units == ["own unit", "degrees"]
@@ -46,6 +56,7 @@ def test_two_coordinates():
         ([LENGTH], [[[1, 2]]], "not a list of finite numbers"),
         ([LENGTH], [["far"]], "values of Distance"),
         ([LENGTH], [[1, 2, 1]], "two values of .* are the same"),
+        ([LENGTH], [[1, 3, 2]], "go up and down; give them in order"),
         ([TURN], [np.radians([-180, 0, 200])], "span more than its period"),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 from ase import Atoms
 
 from kcons.constraints import Dihedral
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, OccupiedError, UnsupportedError
 from kcons.free_energy import SystemCalculator, scan
 
 openmm = pytest.importorskip("openmm")
@@ -70,3 +70,25 @@ def test_bad_systems():
     system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
     with pytest.raises(UnsupportedError, match="particle 4 is a virtual site"):
         SystemCalculator(system)
+
+
+def test_a_folder_belongs_to_one_system(tmp_path):
+    """Energies of another System would be those of the first one."""
+    for count in range(2):
+        system, atoms = four_atoms()
+        system.getForce(2).setTorsionParameters(0, 0, 1, 2, 3, 3, 0.0, 2.0 + count)
+        atoms.calc = SystemCalculator(system, "Reference")
+        how = {"held": atoms.calc.held, "folder": tmp_path}
+        if count:
+            with pytest.raises(OccupiedError, match="other calculator"):
+                scan(atoms, Dihedral([[0, 1, 2, 3]]), [1.0], **how)
+        else:
+            scan(atoms, Dihedral([[0, 1, 2, 3]]), [1.0], **how)
+
+
+def test_particles_without_mass_stay_where_they_are():
+    system, atoms = four_atoms(constrained=False)
+    system.setParticleMass(0, 0.0)
+    atoms.calc = SystemCalculator(system, "Reference")
+    found = scan(atoms, Dihedral([[0, 1, 2, 3]]), [2.0], held=atoms.calc.held)
+    np.testing.assert_array_equal(found.structure((0,)).positions[0], atoms.positions[0])
