@@ -459,7 +459,8 @@ def compare(
 def best(runs: Iterable[Stepped]) -> list[Stepped]:
     """Of runs of each method and step the one with the friction that comes out best.
 
-    That is the one of least bias of any temperature; of those without a visible one the one whose samples cost least.
+    That is the one of least bias of any temperature; of those without a visible one the one whose samples cost least,
+    for the average that takes most.
     """
     kept: dict[tuple[str, float], Stepped] = {}
     for run in runs:
@@ -470,4 +471,6 @@ def best(runs: Iterable[Stepped]) -> list[Stepped]:
 
 
 def _merit(run: Stepped) -> tuple[float, float]:
-    return (max(run.bias, 0.0), run.correlation) if run.status == "ok" else (math.inf, math.inf)
+    if run.status != "ok":
+        return math.inf, math.inf
+    return max(run.bias, 0.0), max(run.correlation, *(calls for _, _, calls in run.observed.values()), 0.0)

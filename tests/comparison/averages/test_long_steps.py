@@ -92,6 +92,8 @@ def test_the_best_friction():
     assert best([warmer, warm, failed, found]) == [warm, found]
     slow, quick = run_of(kinds={"turn": (0.01, 0.01)}), run_of(kinds={"turn": (0.02, 0.01)}, correlation=5.0)
     assert best([slow, quick]) == [quick]
+    lame = run_of(kinds={"turn": (0.02, 0.01)}, correlation=1.0, observed={"length": (1.0, 0.1, 60.0)})
+    assert best([lame, slow]) == [slow]
 
 
 def test_comparison(layers):
