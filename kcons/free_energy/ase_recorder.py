@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from ase.calculators.calculator import all_properties
 from ase.md.md import MolecularDynamics
 
 from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics
@@ -16,6 +17,9 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, Sample, named
 from kcons.free_energy.series import Series
 from kcons.motion.motion import Motion
 from kcons.thermostats import IsokineticSpheres
+
+#: Names in `Atoms.info` that files have for something else.
+_TAKEN = {*all_properties, "Lattice", "Properties", "pbc"}
 
 
 class AseRecorder:
@@ -41,7 +45,7 @@ class AseRecorder:
     Raises
     ------
     InputError
-        The atoms carry no constraints of kcons, or do not hold a coordinate.
+        The atoms carry no constraints of kcons, or do not hold a coordinate; a name that files cannot keep.
     UnsupportedError
         At a sample: velocities on isokinetic spheres, where the multipliers need thermal ones.
 
@@ -59,6 +63,12 @@ class AseRecorder:
     ) -> None:
         self.dynamics = dynamics
         self.coordinates = named(coordinates)
+        for name in self.coordinates:
+            if "=" in name or name in _TAKEN:
+                raise InputError(
+                    f"a coordinate is called {name!r}, which extended XYZ files cannot keep; give it another name",
+                    item=name,
+                )
         self.constraint_forces = constraint_forces
         self._motion = self._engine()
         self._held = self._coordinates_of(self._motion)

@@ -121,6 +121,9 @@ def test_bad_input():
     atoms.set_constraint(Constraints(rows()[1]))
     with pytest.raises(InputError, match=r"turn, Dihedral\(2, 0, 1, 3\), is not among"):
         AseRecorder(VelocityVerlet(atoms, units.fs), {"turn": rows()[0]})
+    for name in ("energy", "pbc", "a=b"):  # extended XYZ: an error of ASE, nothing, and a = "b=1.5"
+        with pytest.raises(InputError, match=f"called '{name}', which extended XYZ files cannot keep"):
+            AseRecorder(VelocityVerlet(atoms, units.fs), {name: rows()[0]})
 
 
 def test_forces_that_ase_constraints_add_count():
