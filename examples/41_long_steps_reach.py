@@ -3,6 +3,7 @@
     python examples/41_long_steps_reach.py                   seconds: some steps of 27 waters
     python examples/41_long_steps_reach.py --full FOLDER     runs with several splittings, hours; goes on
     python examples/41_long_steps_reach.py --collect FOLDER  what its runs have shown so far, into docs/results
+    python examples/41_long_steps_reach.py --beyond FOLDER   steps beyond 64 fs, after that, into docs/results; goes on
     python examples/41_long_steps_reach.py --show FILE       the table of a file of results
 
 Methods, forces and averages are those of 39_long_steps_water.py.
@@ -145,6 +146,21 @@ METHODS = {
 }
 
 
+#: Beyond 64 fs, with the splitting that leaves least to the slow forces: bath, friction, step, seeds.
+FAR_STEPS = (
+    ("langevin", 5, 96, (1, 2)),
+    ("langevin", 5, 128, (1, 2)),
+    ("langevin", 5, 192, (1, 2)),
+    ("langevin", 10, 192, (1,)),
+    ("langevin", 10, 384, (1,)),
+    ("langevin", 20, 384, (1,)),
+    ("split", 5, 96, (1,)),
+    ("split", 5, 192, (1, 2)),
+    ("split", 5, 384, (1, 2, 3)),
+)
+FAR = "pairs to 9 A, long waves"
+
+
 def short_name(method: Method) -> str:
     """Without what the splitting says."""
     bare = water.Method(method.bath, method.friction, method.outer, auxiliary=method.auxiliary, seed=method.seed)
@@ -163,6 +179,26 @@ def collect(folder: Path, samples: int) -> dict[str, Any]:
         found = [rows[m.name] | {"name": short_name(m)} for m in methods if m.name in rows]
         result["splittings"].append({"name": label, **SPLITTINGS[label], "share": share, "water": found})
     return result | {"environment": environment()}
+
+
+def beyond(folder: Path, samples: int) -> dict[str, Any]:
+    """Runs with still longer steps, beside the reference that is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    known, doubt = json_files.read(water.RESULT)["reach"]["reference"]["energy"]
+    rows = []
+    for bath, friction, step, seeds in FAR_STEPS:
+        for seed in seeds:
+            method = Method(bath, friction, step, halfway=True, inner=2, seed=seed, **SPLITTINGS[FAR])
+            if not (folder / f"{method.file}.frames.npz").exists():
+                water.advance(method, folder)
+            row = water.summary(method, folder, samples)
+            if row is None:
+                print(f"{short_name(method)}: no result, see {folder}")
+                continue
+            value, error = row["energy"]
+            row["bias"] = [100 * (value - known) / abs(known), 100 * math.hypot(error, doubt) / abs(known)]
+            rows.append(row | {"name": short_name(method)})
+    return {"splitting": FAR, "water": rows, "environment": environment()}
 
 
 def mean(values: list[list[float]]) -> tuple[float, float]:
@@ -187,6 +223,22 @@ def over_seeds(rows: list[dict[str, Any]], reference: dict[str, Any]) -> list[di
     return found
 
 
+def show_beyond(result: dict[str, Any], reference: dict[str, Any]) -> str:
+    """Averages at steps beyond 64 fs, and the means of several seeds."""
+    rows = [row | {"name": row["name"].removesuffix(", halfway")} for row in result["water"]]
+    lines = [f"fast: {result['splitting']}; beyond 64 fs", *water.show_water({"water": rows}).split("\n")]
+    lines += ["", MEANS, *(mean_line(row) for row in over_seeds(rows, reference))]
+    return "\n".join(lines)
+
+
+MEANS = f"{'means over seeds':52s}{'seeds':>6s}{'U off, %':>14s}{'T shift, K':>14s}{'T turn, K':>14s}"
+
+
+def mean_line(row: dict[str, Any]) -> str:
+    cells = f"{row['name'].removesuffix(', halfway'):52s}{row['seeds']:6d}{row['bias'][0]:+8.2f}({row['bias'][1]:.2f})"
+    return cells + "".join(f"{300 * row[k][0]:9.1f}({300 * row[k][1]:.1f})" for k in ("shift", "turn"))
+
+
 def show(result: dict[str, Any]) -> str:
     """Averages by splitting, all but the reference looked at halfway; then the means of several seeds."""
     head, first = water.show_water({"water": [result["reference"]]}).split("\n")
@@ -195,14 +247,11 @@ def show(result: dict[str, Any]) -> str:
         rows = [row | {"name": row["name"].removesuffix(", halfway")} for row in part["water"]]
         lines += [f"fast: {part['name']}; slow forces have {part['share']:.3f} of the stiffness"]
         lines += water.show_water({"water": rows}).split("\n")[1:]
-    lines += ["", f"{'means over seeds':52s}{'seeds':>6s}{'U off, %':>14s}{'T shift, K':>14s}{'T turn, K':>14s}"]
+    lines += ["", MEANS]
     for part in result["splittings"]:
         means = over_seeds(part["water"], result["reference"])
         lines += [f"fast: {part['name']}"] * bool(means)
-        for row in means:
-            cells = f"{row['name'].removesuffix(', halfway'):52s}{row['seeds']:6d}"
-            cells += f"{row['bias'][0]:+8.2f}({row['bias'][1]:.2f})"
-            lines.append(cells + "".join(f"{300 * row[k][0]:9.1f}({300 * row[k][1]:.1f})" for k in ("shift", "turn")))
+        lines += [mean_line(row) for row in means]
     return "\n".join(lines)
 
 
@@ -218,18 +267,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", type=Path, metavar="FOLDER")
     parser.add_argument("--collect", type=Path, metavar="FOLDER")
+    parser.add_argument("--beyond", type=Path, metavar="FOLDER")
     parser.add_argument("--show", type=Path, metavar="FILE")
     parser.add_argument("--hours", type=float, default=2.0, help="with --full: when to stop")
     parser.add_argument("--samples", type=int, default=250, help="with --collect: frames for temperatures")
     given = parser.parse_args()
     if given.show:
-        print(show(json_files.read(given.show)["reach"]))
+        result = json_files.read(given.show)
+        print(show(result["reach"]))
+        print(show_beyond(result["beyond"], result["reach"]["reference"]))
     elif given.full:
         water.full(given.full, (REFERENCE, *(m for methods in METHODS.values() for m in methods)), given.hours)
     elif given.collect:
         result = json_files.read(water.RESULT) | {"reach": collect(given.collect, given.samples)}
         json_files.write(water.RESULT, result)
         print(show(result["reach"]))
+    elif given.beyond:
+        result = json_files.read(water.RESULT) | {"beyond": beyond(given.beyond, given.samples)}
+        json_files.write(water.RESULT, result)
+        print(show_beyond(result["beyond"], result["reach"]["reference"]))
     else:
         quick()
 
