@@ -377,7 +377,7 @@ class System:
         kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
         size = float(np.ptp(x, axis=0).max(initial=0.0))
         # Or one by which no atom has moved by more than its rounding since time 0.
-        still = float(np.finfo(float).eps) * size / abs(time) if time else 0.0
+        still = float(np.finfo(float).eps) * size / max(abs(time), abs(dt)) if time else 0.0
         return max(KICK_ROUNDING * math.sqrt(kick * size), KICK_ROUNDING * kick * abs(dt), still)
 
     def forces(
