@@ -341,7 +341,7 @@ class CustomVelocity(VelocityRows):
             return np.zeros_like(r)
         step = 1e-3 * self.length / speed
         if self.time_dependent:
-            step = min(step, self.time_step)
+            step = (time + min(step, self.time_step)) - time  # does not round where it is added
         return first_derivative_4(
             lambda s: self._call(self.coefficients, "coefficients", k, r + s * v, time + s), 0.0, step
         )

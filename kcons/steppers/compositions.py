@@ -77,6 +77,13 @@ class Composition(Splitting):
                 raise InputError(
                     f"fractions {g} do not have order {order}: their powers of {power} do not cancel", item="fractions"
                 )
+        # The other condition of order 6, which is not the same for the same fractions in another order.
+        middles = (sum(g[:k]) + 0.5 * x for k, x in enumerate(g))
+        if order > 5 and abs(math.fsum(x**3 * c**2 for x, c in zip(g, middles, strict=True))) > 1e-14:
+            raise InputError(
+                f"fractions {g} do not have order {order}: their powers cancel, but not in this sequence",
+                item="fractions",
+            )
         halves = [0.5 * x for x in g]
         merged = [a + b for a, b in itertools.pairwise(halves)]
         super().__init__(kicks=(halves[0], *merged, halves[-1]), drifts=g)

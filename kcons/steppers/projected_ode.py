@@ -88,7 +88,7 @@ class ProjectedOde:
                     system.motion.project_velocities(x, v, time=time, out=v)
         except ConvergenceError as error:
             raise explained(error, system, state, dt, number) from error
-        more = None, state.barostat, (ref(system), x)
+        more = None, state.barostat, (ref(system), x, v, time)
         return State(x, v, time, forces, number, None, time_remainder, *more)
 
     def _with_forces(self, system: System, state: State) -> State:

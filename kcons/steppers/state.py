@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -37,6 +38,7 @@ START_TOLERANCE = 1e-9
 KICK_ROUNDING = 64 * float(np.finfo(float).eps)
 
 _FLOAT = np.dtype(np.float64)
+Origin: TypeAlias = tuple[ReferenceType[Any] | None, FloatArray, FloatArray, float]
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -61,9 +63,9 @@ class State:
         What rounding took from the time, so that a million steps of dt are a million dt.
     thermostat, barostat : ndarray or None
         Their variables, if there are such; those of a barostat begin with the cell, alone before its first step.
-    origin : tuple of a weak reference to System, or None, and of positions; or None
-        Whose forces these are, and where: those of another System or of other positions are evaluated anew. Without a
-        System (of a state that was loaded or made by hand) they are taken by any.
+    origin : tuple of a weak reference to System, or None, of positions, velocities and time; or None
+        Whose forces these are, and where: those of another System, other positions, times, or velocities (if forces
+        depend on these) are evaluated anew. Without a System (loaded, or made by hand) they are taken by any.
     """
 
     positions: FloatArray
@@ -75,7 +77,7 @@ class State:
     time_remainder: float = 0.0
     thermostat: FloatArray | None = None
     barostat: FloatArray | None = None
-    origin: tuple[ReferenceType[Any] | None, FloatArray] | None = None
+    origin: Origin | None = None
 
     def __init__(
         self,
@@ -88,7 +90,7 @@ class State:
         time_remainder: float = 0.0,
         thermostat: FloatArray | None = None,
         barostat: FloatArray | None = None,
-        origin: tuple[ReferenceType[Any] | None, FloatArray] | None = None,
+        origin: Origin | None = None,
     ) -> None:
         # Written out, since a step makes one: what dataclass writes takes three times as long.
         own = vars(self)
@@ -101,11 +103,14 @@ class State:
         own["time_remainder"] = time_remainder
         own["thermostat"] = thermostat
         own["barostat"] = barostat
-        own["origin"] = (None, positions) if origin is None and forces is not None else origin
+        own["origin"] = (None, positions, velocities, time) if origin is None and forces is not None else origin
 
     def __getstate__(self) -> dict[str, Any]:
         """All that means something to another process."""
         return {name: value for name, value in vars(self).items() if name != "origin"}
+
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        vars(self).update(vars(State(**own)))
 
     @property
     def cell(self) -> FloatArray | None:
@@ -123,11 +128,13 @@ class State:
         """Whether the state is of this System, as far as one can tell."""
         return self.origin is None or self.origin[0] is None or self.origin[0]() is system
 
-    def has_forces_of(self, system: object) -> bool:
-        """Whether it carries forces of this System, at its positions, as far as one can tell."""
+    def has_forces_of(self, system: System) -> bool:
+        """Whether it carries forces of this System, of its positions, velocities and time, as far as one can tell."""
         if self.origin is None or self.forces is None:
             return self.forces is not None
-        there, here = self.origin[1], self.positions
+        (_, there, v, time), here = self.origin, self.positions
+        if time != self.time or (system.velocity_dependent and not np.array_equal(v, self.velocities)):
+            return False
         return self.is_of(system) and (there is here or np.array_equal(there, here))
 
     def reversed(self) -> State:
@@ -144,10 +151,7 @@ class State:
             A path is replaced in one piece, so that an interrupted write leaves the older file.
         """
         present = {name: value for name, value in self.__getstate__().items() if value is not None}
-        if not isinstance(file, str | PathLike):
-            np.savez(file, **present)
-            return
-        with in_one_piece(file) as opened:
+        with in_one_piece(file) if isinstance(file, str | PathLike) else nullcontext(file) as opened:
             np.savez(opened, **present)
 
     @classmethod
@@ -373,7 +377,7 @@ class System:
         kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
         size = float(np.ptp(x, axis=0).max(initial=0.0))
         # Or one by which no atom has moved by more than its rounding since time 0.
-        still = float(np.finfo(float).eps) * size / abs(time) if time else 0.0
+        still = float(np.finfo(float).eps) * size / max(abs(time), abs(dt)) if time else 0.0
         return max(KICK_ROUNDING * math.sqrt(kick * size), KICK_ROUNDING * kick * abs(dt), still)
 
     def forces(
@@ -431,7 +435,8 @@ class System:
         if state.has_forces_of(self):
             return state
         x, v, _ = self.taken(state)
-        return replace(state, forces=self.forces(x, v, state.time, state.step), origin=(ref(self), state.positions))
+        origin = ref(self), state.positions, state.velocities, state.time
+        return replace(state, forces=self.forces(x, v, state.time, state.step), origin=origin)
 
     # -- energies -------------------------------------------------------------------------------
 
@@ -444,10 +449,8 @@ class System:
         """Kinetic plus potential energy; needs `potential` unless there are no forces."""
         if self.potential is None and self.force is not None:
             raise InputError("this System has no potential; pass potential=... to follow the energy", item="potential")
-        energy = self.kinetic_energy(state.velocities)
-        if self.potential is not None:
-            energy += float(self.potential(lent(state.positions), state.time))
-        return energy
+        potential = 0.0 if self.potential is None else float(self.potential(lent(state.positions), state.time))
+        return self.kinetic_energy(state.velocities) + potential
 
     # -- inner ----------------------------------------------------------------------------------
 

@@ -78,9 +78,10 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     hydrogen = topology.hydrogen
     near &= ~(hydrogen[i] & hydrogen[j]) | (away < 0.9)
     pairs, away = pairs[near], away[near]
+    kept = _nearest_of_hydrogens(pairs, away, hydrogen)
     if atoms is not None:
-        wanted = atoms[pairs].any(axis=1)
-        pairs, away = pairs[wanted], away[wanted]
+        kept &= atoms[pairs].any(axis=1)
+    pairs, away = pairs[kept], away[kept]
     if len(away) and away.min() < COINCIDENT:
         i, j = (int(k) for k in pairs[np.argmin(away)])
         raise InputError(
@@ -89,7 +90,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
             item="positions",
             atoms=[i, j],
         )
-    return sorted_pairs(pairs[_nearest_of_hydrogens(pairs, away, hydrogen)])
+    return sorted_pairs(pairs)
 
 
 def reaches(snapshot: Snapshot, bonds: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -27,6 +27,14 @@ def test_derivatives_given_or_differenced(given):
         assert target.acceleration_at(time, 2) == pytest.approx([-np.sin(time)] * 2, abs=1e-11)
 
 
+@pytest.mark.parametrize("time", [1e3, 1e6, 1e9])
+def test_differences_at_late_times_are_as_good(time):
+    """Times are rounded there, and steps of differences made for it."""
+    target = MovingTarget(np.sin)
+    assert target.rate_at(time, 1)[0] == pytest.approx(np.cos(time), abs=1e-13)
+    assert target.acceleration_at(time, 1)[0] == pytest.approx(-np.sin(time), abs=1e-11)
+
+
 def test_differences_are_of_eighth_order():
     steps = np.array([0.4, 0.2, 0.1])
     errors = [

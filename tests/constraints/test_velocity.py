@@ -73,6 +73,19 @@ def test_a_driven_speed():
     assert held.acceleration_target(x, x, 0.3) == pytest.approx([2 * np.cos(0.6)], rel=1e-11)
 
 
+def test_coefficients_are_differenced_at_late_times_as_well():
+    """a = (cos t, sin t, 0): b = -v . da/dt."""
+
+    def turning(r, t):
+        return [[np.cos(t), np.sin(t), 0.0]]
+
+    x, v = np.zeros((1, 3)), np.array([[0.6, 0.8, 0.0]])
+    held = ConstraintSet(CustomVelocity(0, turning, time_dependent=True), x, [1.0])
+    for time in (1.0, 1e6, 1e9):
+        expected = 0.6 * np.sin(time) - 0.8 * np.cos(time)
+        np.testing.assert_allclose(held.acceleration_target(x, v, time), [expected], rtol=0, atol=1e-11)
+
+
 def test_velocity_rows_fix_no_position():
     x = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0]])
     held = ConstraintSet([KnifeEdge(0, 1, [0.0, 0.0, 1.0])], x, np.ones(2))

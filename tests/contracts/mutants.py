@@ -799,6 +799,12 @@ MUTANTS = [
         "tests/steppers/test_state.py::test_forces_are_kept_at_their_positions_only",
     ),
     (
+        "steppers/state.py",
+        "if time != self.time or (",
+        "if (",
+        "tests/steppers/test_state.py::test_forces_are_kept_at_their_time_and_velocities_only",
+    ),
+    (
         "thermostats/nose_hoover.py",
         "if not state.is_of(system):",
         "if False:",

@@ -123,5 +123,8 @@ def test_states_at_rest_are_certified(friction: bool) -> None:
     along[1] = [0.0, 0.0, 1e-12]
     with pytest.raises(CertificateError, match="A v - c"):
         system.schedule._certify(end.positions, end.velocities + along, end.time, 0.1)
+    # A run that goes back to time 0 ends at what rounding leaves of it.
+    with pytest.raises(CertificateError, match="A v - c"):
+        system.schedule._certify(end.positions, end.velocities + along, 1e-17, -0.1)
     with pytest.raises(CertificateError, match="sigma"):
         system.schedule._certify(end.positions + 1e6 * along, end.velocities, end.time, 0.1)

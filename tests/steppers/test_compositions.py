@@ -127,6 +127,7 @@ def test_friction_is_taken_back(stepper) -> None:
         ([0.5, 0.4, 0.5], 2, "add up to 1.4"),
         ([0.25, 0.5, 0.25], 4, "powers of 3 do not cancel"),
         (SUZUKI_4, 6, "powers of 5 do not cancel"),
+        ([KAHAN_LI_6[k] for k in (1, 0, 2, 3, 4, 5, 6, 8, 7)], 6, "not in this sequence"),
     ],
 )
 def test_bad_fractions(fractions, order, match) -> None:

@@ -311,6 +311,21 @@ def test_forces_are_kept_at_their_positions_only(stepper) -> None:
     assert len(asked) == once + first
 
 
+@pytest.mark.parametrize("change", [{"time": 5.0}, {"velocities": np.array([[0.0, 0, 0], [0, 1, 0], [0, 1, 0]])}])
+def test_forces_are_kept_at_their_time_and_velocities_only(change) -> None:
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    moving = "velocities" in change
+
+    def pull(x, *more):
+        return np.array(x) * (1 + more[-1] + (more[0] if moving else 0.0))
+
+    rows = [FixedAtoms([0]), Distance([[0, 1], [1, 2]])]
+    system = System(Motion(ConstraintSet(rows, x, np.ones(3)), x), pull, velocity_dependent=moving)
+    start = system.initial_state(x)
+    later = Rattle().step(system, replace(system.with_forces(start), **change), 0.05)
+    assert_same(later, Rattle().step(system, replace(start, **change), 0.05))
+
+
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
 def test_another_system_begins_a_thermostat_anew() -> None:
     here, start, _ = pendulum(1.0)
@@ -335,7 +350,8 @@ def test_copies_know_whose_forces_they_carry() -> None:
     assert not replace(hand, positions=start.positions).has_forces_of(here)
     # Nothing else can be known of what another process or a file says.
     again = pickle.loads(pickle.dumps(end))
-    assert again.origin is None and again.has_forces_of(here) and again.has_forces_of(there)
+    assert again.origin[0] is None and again.has_forces_of(here) and again.has_forces_of(there)
+    assert not replace(again, positions=start.positions).has_forces_of(here)
     assert_same(again, end)
     asked.clear()
     assert_same(Rattle().step(here, own, 0.05), Rattle().step(here, again, 0.05))

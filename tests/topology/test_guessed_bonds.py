@@ -22,6 +22,8 @@ def test_a_hydrogen_keeps_its_nearest_neighbour():
     # A short hydrogen bond: 1.05 and 1.15 angstrom to two oxygens.
     x = [[0, 0, 0], [1.05, 0, 0], [2.2, 0, 0]]
     assert guess_bonds(snapshot(["O", "H", "O"], x)).tolist() == [[0, 1]]
+    # Also where only the farther one is asked about: the nearest neighbour may have its bonds already.
+    assert guess_bonds(snapshot(["O", "H", "O"], x), np.array([False, False, True])).tolist() == []
 
 
 def test_hydrogen_molecule_and_neighbouring_hydrogens():

@@ -62,7 +62,7 @@ class Frame:
             positions = x + self.shift
             remainder = x - (positions - self.shift)
         system, number = self.system, self.number
-        origin = ref(system), positions
+        origin = ref(system), positions, v, self.time
         more = thermostat, self.start.barostat
         last = State(positions, v, self.time, forces, number, remainder, self.left_over, *more, origin=origin)
         system.last = last

@@ -116,8 +116,8 @@ def fused_steps(
         flights.took = found
         flights.motion.took(found)
     x, remainder = _relative(x, shift, work) if shift is not None or far else (x, None)
-    forces = start.forces if force is None else f.copy()
-    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, None, cells, (ref(system), x))
+    forces, origin = start.forces if force is None else f.copy(), (ref(system), x, v, time)
+    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over, None, cells, origin)
     return state, steps
 
 

@@ -267,7 +267,7 @@ class HamiltonianMonteCarlo(Portable):
         else:
             held[POTENTIAL] = potential
         time, left_over = state.later(length)
-        number, origin = state.step + 1, (ref(system), end.positions)
+        number, origin = state.step + 1, (ref(system), end.positions, end.velocities, time)
         self._left = held
         return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 

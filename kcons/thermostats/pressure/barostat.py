@@ -249,7 +249,7 @@ class Barostat:
         variables[:WORK] = after.cell.ravel()
         variables[WORK] += after.energy - before.energy
         moved = replace(state, positions=positions, remainder=remainder, barostat=variables)
-        return replace(moved, forces=after.forces, origin=(ref(system), positions))
+        return replace(moved, forces=after.forces, origin=(ref(system), positions, state.velocities, state.time))
 
     def _enter(self, system: CellSystem, cell: FloatArray, positions: FloatArray) -> None:
         self._check_width(system, cell)
