@@ -9,7 +9,7 @@ from kcons.comparison.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
 from kcons.comparison.hard_cases.contract import Frame, Program, together, wrapped
-from kcons.comparison.hard_cases.motions import worst_residual
+from kcons.comparison.hard_cases.motions import Seen, energy_off
 from kcons.comparison.hard_cases.problem import Array, Problem
 from kcons.comparison.hard_cases.programs import Core, KconsInAse
 
@@ -72,12 +72,12 @@ def _scaled(program: Program, factor: float) -> Outcome:
     lengths = np.array([np.linalg.norm(shape[i] - shape[j]) for i, j in pairs])
     v = 0.1 * np.random.default_rng(4).standard_normal((8, 3))
     problem = Problem(factor * shape, masses, pairs, lengths, velocities=v)
-    residual = worst_residual(problem)
-    seen: list[Frame] = []
-    program.run(problem, 1e-3, 50, together(residual, seen.append), project=True)
+    seen = Seen(problem)
+    frames: list[Frame] = []
+    program.run(problem, 1e-3, 50, together(seen, frames.append), project=True)
     return outcome(
-        ("residual", residual.value, 1e-10),
-        ("kinetic energy after 50 steps, off by (relative)", abs(seen[-1].kinetic / seen[1].kinetic - 1), 1e-3),
+        ("residual", seen.residual, 1e-10),
+        ("kinetic energy after 50 steps, off by (relative)", abs(frames[-1].kinetic / frames[1].kinetic - 1), 1e-3),
     )
 
 
@@ -146,8 +146,7 @@ def _far(program: Program, offset: float, quick: bool) -> tuple[float, float]:
     energies: list[float] = []
     end = program.run(rotor(offset), 0.01, 1000, lambda frame: energies.append(frame.energy))
     length = float(np.linalg.norm(end.x[0] - end.x[1]))
-    off = float(np.max(np.abs(np.array(energies[1:]) / energies[1] - 1)))
-    return abs(length - 1.2), off
+    return abs(length - 1.2), energy_off(energies)
 
 
 @case("H12", "1e6 and 1e9 from the origin", "length to 4 ulp; energy 1e-10 over 1000 steps")
