@@ -14,10 +14,10 @@ from kcons.comparison.hard_cases.problem import Array, Problem
 from kcons.comparison.hard_cases.programs import Core, KconsInAse
 
 
-def _first(program: Program, problem: Problem, steps: int = 0, dt: float = 1e-3) -> tuple[Frame, Frame]:
+def _first(program: Program, problem: Problem, steps: int = 0) -> tuple[Frame, Frame]:
     """The start after the program has brought it onto the constraints, and the end of a short run."""
     seen: list[Frame] = []
-    end = program.run(problem, dt, steps, seen.append, project=True)
+    end = program.run(problem, 1e-3, steps, seen.append, project=True)
     return seen[0], end
 
 
@@ -142,7 +142,7 @@ def rotor(offset: float = 0.0) -> Problem:
     return Problem(x, [1.5, 2.5], [(0, 1)], [1.2], velocities=v)
 
 
-def _far(program: Program, offset: float, quick: bool) -> tuple[float, float]:
+def _far(program: Program, offset: float) -> tuple[float, float]:
     energies: list[float] = []
     end = program.run(rotor(offset), 0.01, 1000, lambda frame: energies.append(frame.energy))
     length = float(np.linalg.norm(end.x[0] - end.x[1]))
@@ -154,10 +154,10 @@ def far_away(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     remark = ""
     if isinstance(program, KconsInAse):
-        energy = _far(KconsInAse(own_dynamics=False), 1e6, quick)[1]
+        energy = _far(KconsInAse(own_dynamics=False), 1e6)[1]
         remark = f"under VelocityVerlet of ASE, which takes velocities from positions, energy {energy:.1e} at 1e6"
     for offset in (1e6, 1e9):
-        length, energy = _far(program, offset, quick)
+        length, energy = _far(program, offset)
         found += [
             (f"{offset:g}: energy", energy, 1e-10),
             (f"{offset:g}: length", length, 4 * float(np.spacing(offset)) * 1.2),
