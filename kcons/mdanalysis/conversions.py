@@ -104,7 +104,7 @@ def to_ase(universe: Any, constraints: Iterable[Constraint] = ()) -> ase.Atoms:
     """
     snapshot = _with_bonds_of(_snapshot(universe), constraints)
     _warn_of_cut(snapshot)
-    return _held_atoms(snapshot, _rows(constraints, 1.0))
+    return _held_atoms(snapshot, _rows(constraints))
 
 
 def _held_atoms(snapshot: Snapshot, rows: Sequence[Constraint]) -> ase.Atoms:
@@ -170,7 +170,7 @@ def to_openmm(
         The force field does not know a residue; a cell that OpenMM does not take; atoms of a residue scattered; rows
         that were made for another group.
     """
-    return _openmm(_snapshot(universe), constraints, 1.0, force_field, options)
+    return _openmm(_snapshot(universe), constraints, force_field, options)
 
 
 def from_openmm(
@@ -216,7 +216,7 @@ def ase_to_openmm(atoms: ase.Atoms, *, force_field: Sequence[str] = (), **option
     """Topology, positions and System of `Atoms`, with what is held on them; see `to_openmm`."""
     from kcons.ase.topology import snapshot_of as snapshot_of_atoms
 
-    return _openmm(snapshot_of_atoms(atoms), _constraints_on(atoms), 1.0, force_field, options)
+    return _openmm(snapshot_of_atoms(atoms), _constraints_on(atoms), force_field, options)
 
 
 def openmm_to_ase(
@@ -294,10 +294,10 @@ def _dimensions(snapshot: Snapshot) -> Any:
     return triclinic_box(*snapshot.cell)
 
 
-def _rows(constraints: Iterable[Constraint], angstrom: float) -> list[Constraint]:
-    """Constraints in the given unit."""
+def _rows(constraints: Iterable[Constraint]) -> list[Constraint]:
+    """Constraints in angstrom."""
     if isinstance(constraints, HeldRows):
-        return all_rescaled(constraints, angstrom / constraints.snapshot.angstrom)
+        return all_rescaled(constraints, 1.0 / constraints.snapshot.angstrom)
     return list(constraints)
 
 
@@ -341,14 +341,14 @@ def _with_bonds_of(snapshot: Snapshot, constraints: Iterable[Constraint]) -> Sna
 
 
 def _openmm(
-    snapshot: Snapshot, constraints: Iterable[Constraint], angstrom: float, force_field: Sequence[str], options: Any
+    snapshot: Snapshot, constraints: Iterable[Constraint], force_field: Sequence[str], options: Any
 ) -> ToOpenMM:
     from openmm import unit
 
     from kcons.openmm import hold
     from kcons.openmm.topology import openmm_topology
 
-    rows = all_rescaled(_rows(constraints, angstrom), NM / angstrom)
+    rows = all_rescaled(_rows(constraints), NM)
     sites = constraints.virtual_sites if isinstance(constraints, HeldRows) else None
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
     _warn_of_cut(snapshot)

@@ -9,8 +9,8 @@ import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
-from kcons.comparison.hard_cases.contract import Frame, Program
-from kcons.comparison.hard_cases.motions import move, worst_residual
+from kcons.comparison.hard_cases.contract import Program, together
+from kcons.comparison.hard_cases.motions import Seen, energy_off, move
 from kcons.comparison.hard_cases.problem import Array, Problem
 from kcons.comparison.hard_cases.programs import Core
 
@@ -37,21 +37,15 @@ def _mass_ratio(program: Program, ratio: float, quick: bool) -> Outcome:
     v -= masses @ v / masses.sum()
     problem = Problem(x, masses, bonds(n))
     problem = problem.but(velocities=problem.tangent(v))
-    residual = worst_residual(problem)
-    energies: list[float] = []
+    seen = Seen(problem)
     centres: list[Array] = []
-
-    def watch(frame: Frame) -> None:
-        residual(frame)
-        energies.append(frame.energy)
-        centres.append(masses @ frame.x / masses.sum())
-
     steps = program.length(quick, 500, 10_000)
+    watch = together(seen, lambda frame: centres.append(masses @ frame.x / masses.sum()))
     program.run(problem, 0.01, steps, watch, every=5)
     return outcome(
-        ("residual", residual.value, 1e-10),
+        ("residual", seen.residual, 1e-10),
         ("centre of mass", np.abs(np.array(centres) - centres[0]).max(), 1e-12),
-        ("energy", np.max(np.abs(np.array(energies[1:]) / energies[1] - 1)), 1e-3),
+        ("energy", energy_off(seen.energies), 1e-3),
         remark=f"{steps} steps",
     )
 
@@ -138,9 +132,9 @@ def long_chain(program: Program, quick: bool) -> Outcome:
             ]
             worst = problem.residual(y)
         else:
-            watcher = worst_residual(problem)
-            program.run(problem, 0.02, 1, lambda frame, w=watcher: w(frame), project=True)  # type: ignore[misc]
-            worst = watcher.value
+            seen = Seen(problem)
+            program.run(problem, 0.02, 1, seen, project=True)
+            worst = seen.residual
         found.append((f"{shape}: residual", worst, limit))
     return outcome(*found, remark=f"{n - 1} bonds")
 
@@ -158,16 +152,10 @@ def near_straight(program: Program, quick: bool) -> Outcome:
         masses = np.full(101, 12.0)
         problem = Problem(x, masses, bonds(101))
         problem = problem.but(velocities=problem.tangent(0.1 * np.random.default_rng(4).standard_normal(x.shape)))
-        residual = worst_residual(problem)
-        energies: list[float] = []
-        program.run(
-            problem,
-            0.005,
-            steps,
-            lambda frame, r=residual, e=energies: (r(frame), e.append(frame.energy)),  # type: ignore[misc]
-        )
-        off = np.max(np.abs(np.array(energies[1:]) / energies[1] - 1))
-        found += [(f"{degrees:g}: residual", residual.value, 1e-10), (f"{degrees:g}: energy", off, 1e-3)]
+        seen = Seen(problem)
+        program.run(problem, 0.005, steps, seen)
+        off = energy_off(seen.energies)
+        found += [(f"{degrees:g}: residual", seen.residual, 1e-10), (f"{degrees:g}: energy", off, 1e-3)]
     return outcome(*found, remark=f"{steps} steps each")
 
 

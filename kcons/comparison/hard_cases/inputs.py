@@ -16,9 +16,9 @@ from kcons.comparison.hard_cases.steps import each_refused
 from kcons.constraints import LinearCombination, Plane
 
 
-def _off(program: Program, problem: Problem, steps: int = 20, dt: float = 0.01) -> float:
+def _off(program: Program, problem: Problem, steps: int = 20) -> float:
     """Run, and the residual at the end; NaN if anything is."""
-    return problem.residual(program.run(problem, dt, steps).x)
+    return problem.residual(program.run(problem, 0.01, steps).x)
 
 
 def moving_chain(n: int = 5, **changes: Any) -> Problem:

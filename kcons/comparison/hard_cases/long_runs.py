@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
-from kcons.comparison.hard_cases.contract import Frame, Program
-from kcons.comparison.hard_cases.motions import worst_residual
+from kcons.comparison.hard_cases.contract import Program
+from kcons.comparison.hard_cases.motions import Seen
 from kcons.comparison.hard_cases.problem import Array, Problem
 from kcons.comparison.hard_cases.programs import Core
 from kcons.errors import KconsError
@@ -38,22 +38,15 @@ def secular_drift(energies: Array) -> float:
 def long_pendulum(program: Program, quick: bool) -> Outcome:
     steps = STEPS[program.name][0 if quick else 1]
     problem = pendulum(2.0)
-    residual = worst_residual(problem)
-    energies: list[float] = []
-
-    def watch(frame: Frame) -> None:
-        residual(frame)
-        energies.append(frame.energy)
-
-    every = 5
-    program.run(problem, 0.01, steps, watch, every=every)
-    drift = 2 * abs(secular_drift(np.array(energies)))
+    seen = Seen(problem)
+    program.run(problem, 0.01, steps, seen, every=5)
+    drift = 2 * abs(secular_drift(np.array(seen.energies)))
     # The windowed mean of few periods knows the drift no better than the oscillation allows.
     limit = 1e-6 if steps >= 1_000_000 else 1e-6 + 2.1e-5 * 10_000 / steps
     return outcome(
         ("secular drift of the energy", drift, limit),
-        ("residual", residual.value, 1e-14 if isinstance(program, Core) else 1e-12),
-        remark=f"{steps:g} steps, rms {np.std(energies):.2g}",
+        ("residual", seen.residual, 1e-14 if isinstance(program, Core) else 1e-12),
+        remark=f"{steps:g} steps, rms {np.std(seen.energies):.2g}",
     )
 
 
@@ -67,17 +60,17 @@ def no_projection(program: Program, quick: bool) -> Outcome:
     problem = pendulum(2.0)
     horizon = program.pace * (20.0 if quick else 200.0)
     for dt in (0.005, 0.04):
-        residual = worst_residual(problem)
-        program.run(problem, dt, round(horizon / dt), residual, every=20)
-        found.append((f"dt {dt:g}: residual", residual.value, 1e-12))
+        seen = Seen(problem)
+        program.run(problem, dt, round(horizon / dt), seen, every=20)
+        found.append((f"dt {dt:g}: residual", seen.residual, 1e-12))
     remark = f"t = {horizon:g}"
     if isinstance(program, Core):
         from kcons.steppers import ProjectedVerlet
 
-        watcher = worst_residual(problem)
+        seen = Seen(problem)
         try:
-            program.run(problem, 0.04, round(horizon / 0.04), watcher, stepper=ProjectedVerlet(project=False))
-            remark += f"; on request, without projection: residual {watcher.value:.2g}"
+            program.run(problem, 0.04, round(horizon / 0.04), seen, stepper=ProjectedVerlet(project=False))
+            remark += f"; on request, without projection: residual {seen.residual:.2g}"
         except KconsError as error:
-            remark += f"; on request, without projection: {type(error).__name__} at residual {watcher.value:.2g}"
+            remark += f"; on request, without projection: {type(error).__name__} at residual {seen.residual:.2g}"
     return outcome(*found, remark=remark)

@@ -6,8 +6,8 @@ import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
-from kcons.comparison.hard_cases.contract import Frame, Program
-from kcons.comparison.hard_cases.motions import OMEGA, every, flat_body, move, worst_residual
+from kcons.comparison.hard_cases.contract import Program, together
+from kcons.comparison.hard_cases.motions import OMEGA, Seen, energy_off, every, flat_body, move
 from kcons.comparison.hard_cases.problem import Array, Pairs, Problem
 
 SINGULAR = "right to 10 x the error of RATTLE and flat to 1e-8, or refused with the count of degrees of freedom"
@@ -143,22 +143,15 @@ def _flexible(program: Program, shape: Array, pairs: Pairs, quick: bool, remark:
         0.02 * np.random.default_rng(7).standard_normal(x.shape) + truths.spinning(x, masses, 0.05 * OMEGA)
     )
     problem = problem.but(velocities=v)
-    residual = worst_residual(problem)
-    energies: list[float] = []
+    seen = Seen(problem)
     turns: list[Array] = []
-
-    def watch(frame: Frame) -> None:
-        residual(frame)
-        energies.append(frame.energy)
-        turns.append(np.cross(frame.x, masses[:, None] * frame.v).sum(axis=0))
-
+    watch = together(seen, lambda frame: turns.append(np.cross(frame.x, masses[:, None] * frame.v).sum(axis=0)))
     steps = program.length(quick, 100, 1000)
     program.run(problem, 0.005, steps, watch, project=True)
     turned = np.abs(np.array(turns) - turns[1]).max() / np.abs(turns[1]).max()
-    off = np.max(np.abs(np.array(energies[1:]) / energies[1] - 1))
     return outcome(
-        ("residual", residual.value, 1e-10),
+        ("residual", seen.residual, 1e-10),
         ("angular momentum", turned, 1e-10),
-        ("energy", off, 1e-5),
+        ("energy", energy_off(seen.energies), 1e-5),
         remark=f"{remark}, {len(pairs)} rows, {steps} steps",
     )

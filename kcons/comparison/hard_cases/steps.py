@@ -12,8 +12,8 @@ from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.bodies import TRIANGLE
 from kcons.comparison.hard_cases.case import Check, Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
-from kcons.comparison.hard_cases.contract import CannotExpressError, Frame, Program, together
-from kcons.comparison.hard_cases.motions import worst_residual
+from kcons.comparison.hard_cases.contract import CannotExpressError, Frame, Program
+from kcons.comparison.hard_cases.motions import Seen, energy_off
 from kcons.comparison.hard_cases.problem import Problem
 from kcons.comparison.hard_cases.programs import Core, PlainAse
 from kcons.comparison.hard_cases.starts import rotor
@@ -118,16 +118,16 @@ def raised_step(program: Program, quick: bool) -> Outcome:
             dt, largest, error = 0.05 / omega, 0.0, ""
             worst = 0.0
             while not error and dt < 1e3 / omega:
-                residual = worst_residual(problem)
+                seen = Seen(problem)
                 stepper = make() if isinstance(program, Core) else None
                 try:
-                    program.run(problem, dt, steps, residual, stepper=stepper)
+                    program.run(problem, dt, steps, seen, stepper=stepper)
                 except CannotExpressError:
                     raise
                 except Exception as failure:
                     error = type(failure).__name__
                     break
-                worst = max(worst, residual.value) if np.isfinite(residual.value) else float("nan")
+                worst = max(worst, seen.residual) if np.isfinite(seen.residual) else float("nan")
                 if not worst <= SILENT:
                     break
                 largest = dt
@@ -147,9 +147,9 @@ def force_along_bond(program: Program, quick: bool) -> Outcome:
     # A spring that pushes with 1e12 whatever way the bond points.
     problem = Problem(x, [1.5, 2.5], [(0, 1)], [1.2], springs=[(0, 1, 1e6, 1.2 + 1e6)])
     problem = problem.but(velocities=problem.tangent([[0.1, 0.3, -0.2], [0, 0.2, 0.1]]))
-    residual = worst_residual(problem)
-    end = program.run(problem, 1e-3, 3, residual)
-    found = [("residual", residual.value, 1e-10)]
+    seen = Seen(problem)
+    end = program.run(problem, 1e-3, 3, seen)
+    found = [("residual", seen.residual, 1e-10)]
     if isinstance(program, Core):
         a = program.system(problem).motion.acceleration(x, 0 * x, pull)
         found.append(("acceleration along the bond", abs(float(along @ (a[0] - a[1]))), 1e-15 * size / 1.5 + 1e-14))
@@ -176,13 +176,11 @@ def _stiff() -> tuple[Problem, float]:
 )
 def stiff_and_rigid(program: Program, quick: bool) -> Outcome:
     problem, omega = _stiff()
-    energies: list[float] = []
-    residual = worst_residual(problem)
+    seen = Seen(problem)
     steps = program.length(quick, 1000, 10_000)
-    program.run(problem, 1.0 / omega, steps, together(residual, lambda frame: energies.append(frame.energy)))
-    e = np.array(energies[1:])
+    program.run(problem, 1.0 / omega, steps, seen)
     return outcome(
-        ("energy", np.max(np.abs(e / e[0] - 1)), 0.5), ("residual", residual.value, 1e-10), remark=f"{steps} steps"
+        ("energy", energy_off(seen.energies), 0.5), ("residual", seen.residual, 1e-10), remark=f"{steps} steps"
     )
 
 

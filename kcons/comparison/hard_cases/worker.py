@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -29,19 +28,14 @@ def run_cell(case: Case, program: str, quick: bool) -> Cell:
 
 #: Wall time, in parts of the limit, after which even an idle process is given up.
 PATIENCE = 10.0
+#: What the child finds as 1 in its environment.
+THREADS = "OPENMM_CPU_THREADS"
 
 
 class Worker:
-    """Runs cells one after another in a child process, which is replaced when it hangs or dies.
+    """Runs cells one after another in a child process, which is replaced when it hangs or dies."""
 
-    Parameters
-    ----------
-    environment : mapping
-        Variables of the environment of the child.
-    """
-
-    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        self._environment = {"OPENMM_CPU_THREADS": "1", **(environment or {})}
+    def __init__(self) -> None:
         self._process: Any = None
         self._pipe: Connection | None = None
 
@@ -83,8 +77,8 @@ class Worker:
         return True
 
     def _start(self) -> None:
-        before = {name: os.environ.get(name) for name in self._environment}
-        os.environ.update(self._environment)
+        before = os.environ.get(THREADS)
+        os.environ[THREADS] = "1"
         try:
             context = multiprocessing.get_context("spawn")
             self._pipe, there = context.Pipe()
@@ -92,11 +86,10 @@ class Worker:
             self._process.start()
             there.close()
         finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
+            if before is None:
+                del os.environ[THREADS]
+            else:
+                os.environ[THREADS] = before
         # Importing the programs is no part of any case.
         self._pipe.recv()
 

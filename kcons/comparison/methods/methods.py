@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -125,31 +124,23 @@ class CoreVerlet(Method):
         return _CoreRun(test_system, nothing, Rattle(), setting)
 
 
-def of_steppers(found: Any) -> list[CoreStepper]:
-    """A method for each stepper of a registry, RATTLE first.
-
-    Parameters
-    ----------
-    found : mapping of name to stepper, or iterable of steppers
-        Objects, or classes that can do without arguments; the `rate` of a feedback is filled in. Without a name,
-        that of the class is taken: KahanLi6 is `kahan-li6`.
-    """
-    named = found.items() if isinstance(found, Mapping) else ((None, item) for item in found)
-    methods = {"rattle": CoreStepper("rattle", "kcons RATTLE")}
-    for given, item in named:
-        kind = item.__name__ if isinstance(item, type) else type(item).__name__
-        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", str(given or kind)).lower()
-        if name not in methods:
-            methods[name] = CoreStepper(name, f"kcons {kind}", usual=name in USUAL_STEPPERS, make=_maker(item))
-    return list(methods.values())
+def of_steppers(found: Mapping[str, Any]) -> list[CoreStepper]:
+    """A method for each stepper by name: classes that can do without arguments but the `rate` of a feedback."""
+    return [
+        CoreStepper(
+            name,
+            f"kcons {'RATTLE' if kind is Rattle else kind.__name__}",
+            usual=name in USUAL_STEPPERS,
+            make=_maker(kind),
+        )
+        for name, kind in found.items()
+    ]
 
 
-def _maker(item: Any) -> Callable[[float], Stepper]:
-    if not isinstance(item, type):
-        return lambda dt: item  # type: ignore[no-any-return]
-    if "rate" in inspect.signature(item).parameters:
-        return lambda dt: item(rate=FEEDBACK / dt)  # type: ignore[no-any-return]
-    return lambda dt: item()  # type: ignore[no-any-return]
+def _maker(kind: Any) -> Callable[[float], Stepper]:
+    if "rate" in inspect.signature(kind).parameters:
+        return lambda dt: kind(rate=FEEDBACK / dt)  # type: ignore[no-any-return]
+    return lambda dt: kind()  # type: ignore[no-any-return]
 
 
 class _AdaptiveRun(OfStates):

@@ -24,6 +24,7 @@ from kcons.comparison.methods.engines import seen
 from kcons.comparison.methods.peers import lammps_shake
 from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel
 from kcons.comparison.solvers_alone.bare_systems import STEP, BareSystem
+from kcons.comparison.test_systems.openmm_engine import system_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 
@@ -172,11 +173,6 @@ def openmm_system(system: BareSystem) -> Any:
     """OpenMM's System of the same masses and distances; without forces but for angles that CCMA looks at."""
     import openmm
 
-    found = openmm.System()
-    for mass in system.masses:
-        found.addParticle(float(mass))
-    for (i, j), length in zip(system.pairs.tolist(), system.lengths.tolist(), strict=True):
-        found.addConstraint(i, j, 0.1 * length)
     bends = openmm.HarmonicAngleForce()
     if system.system is not None:
         for force in system.system().getForces():
@@ -189,8 +185,7 @@ def openmm_system(system: BareSystem) -> Any:
             a, b = x[i] - x[vertex], x[j] - x[vertex]
             cosine = a @ b / np.sqrt((a @ a) * (b @ b))
             bends.addAngle(i, vertex, j, float(np.arccos(np.clip(cosine, -1.0, 1.0))), 1.0)
-    found.addForce(bends)
-    return found
+    return system_of(system.masses, bends, pairs=system.pairs, lengths=0.1 * system.lengths)
 
 
 class LammpsSolver(BareSolver):

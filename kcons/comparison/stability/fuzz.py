@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from kcons.comparison.hard_cases.motions import every
 from kcons.comparison.hard_cases.problem import Array
-from kcons.comparison.stability.small_systems import every_pair, separated
+from kcons.comparison.stability.small_systems import separated
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
@@ -95,13 +96,13 @@ def molecule(rng: np.random.Generator) -> tuple[str, Array, Array, list[Constrai
     tree = [(int(rng.integers(0, k)), k) for k in range(1, n)]
     rows: list[Constraint] = []
     if shape in ("braced", "flat"):
-        pairs = every_pair(n)
+        pairs = every(n)
         keep = rng.random(len(pairs)) < (1.0 if rng.random() < 0.5 else 0.7)
         pairs = [p for p, k in zip(pairs, keep, strict=True) if k] or pairs[:1]
         rows.append(Distance(pairs))
     elif shape == "two bodies":
         half = n // 2
-        rows.append(Distance([*every_pair(half), *[(half + i, half + j) for i, j in every_pair(n - half)], (0, n - 1)]))
+        rows.append(Distance([*every(half), *[(half + i, half + j) for i, j in every(n - half)], (0, n - 1)]))
     else:
         pairs = [*tree, (0, n - 1)] if shape == "ring" and n > 2 and (0, n - 1) not in tree else tree
         rows.append(Distance(pairs))

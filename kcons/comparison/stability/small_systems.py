@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import combinations
 
 import numpy as np
 
@@ -84,8 +83,3 @@ def separated(rng: np.random.Generator, n: int, nearest: float) -> Array:
         if all(np.linalg.norm(p - q) >= nearest for q in points):
             points.append(p)
     return np.array(points)
-
-
-def every_pair(n: int) -> list[tuple[int, int]]:
-    """All pairs of n atoms."""
-    return list(combinations(range(n), 2))

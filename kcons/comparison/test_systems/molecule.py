@@ -12,6 +12,7 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.neighborlist import natural_cutoffs, neighbor_list
 
+from kcons.comparison.test_systems.minimal import single
 from kcons.comparison.test_systems.potential import Potential, of_calculator
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Angle, Distance
@@ -41,8 +42,7 @@ def build(size: int = 1, seed: int = 1, *, forces: str = "") -> TestSystem:
     InputError
         Another size; unknown `forces`.
     """
-    if size != 1:
-        raise InputError(f"ethanol is one molecule; it cannot be built at size {size}", item="size")
+    single(size, "ethanol is one molecule")
     atoms = molecule("CH3CH2OH")
     bonds, angles = topology(atoms)
     x, masses = atoms.positions.copy(), atoms.get_masses()

@@ -11,11 +11,10 @@ import numpy as np
 from ase import Atoms, units
 from ase.calculators.tip3p import TIP3P
 
-from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine
+from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential, of_calculator
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -64,7 +63,8 @@ def build(size: int = 64, seed: int = 1, *, forces: str = "") -> TestSystem:
     held = ConstraintSet(Distance(pairs, lengths), x, masses, cell=cell)
     motion = Motion(held, x)
     x = motion.restore_positions(x)
-    potential = _potential(forces, x, box, masses)
+    cutoff = min(CUTOFF, 0.49 * box)
+    potential = _potential(forces, x, box, cutoff, masses)
     if not equilibrated:
         x = _relaxed(motion, potential, x, seed)
     v = thermal_velocities(motion, x, TEMPERATURE, seed)
@@ -83,7 +83,9 @@ def build(size: int = 64, seed: int = 1, *, forces: str = "") -> TestSystem:
         tolerances=(1e-3, 1e-4, 1e-5),
         bonds=pairs,
         cell=cell,
-        openmm=None if forces == "ase" else OpenMMEngine(lambda: _held(box, masses, pairs, lengths), platform="CPU"),
+        openmm=None
+        if forces == "ase"
+        else OpenMMEngine(lambda: _system(box, cutoff, masses, pairs, lengths), platform="CPU"),
     )
 
 
@@ -124,30 +126,24 @@ def _relaxed(motion: Motion, potential: Potential, x: FloatArray, seed: int) -> 
     return x
 
 
-def _potential(forces: str, x: FloatArray, box: float, masses: FloatArray) -> Potential:
-    cutoff = _cutoff(box)
+def _potential(forces: str, x: FloatArray, box: float, cutoff: float, masses: FloatArray) -> Potential:
     if forces == "ase":
         atoms = Atoms(["O", "H", "H"] * (len(x) // 3), positions=x, cell=[box] * 3, pbc=True, masses=masses)
         return of_calculator(atoms, TIP3P(rc=cutoff, width=min(1.0, cutoff / 3)), "ASE's TIP3P, cut off")
     if forces != "openmm":
         raise InputError(f"no forces {forces!r} for water; there are 'openmm' and 'ase'", item="forces")
-    return _particle_mesh_ewald(box, cutoff, masses)
-
-
-def _particle_mesh_ewald(box: float, cutoff: float, masses: FloatArray) -> Potential:
     potential = OpenMMEngine(lambda: _system(box, cutoff, masses), platform="CPU").potential()
     potential.name = f"PME, {potential.name}"
     return potential
 
 
-def _system(box: float, cutoff: float, masses: FloatArray) -> Any:
+def _system(box: float, cutoff: float, masses: FloatArray, pairs: Any = (), lengths: Any = ()) -> Any:
+    """OpenMM's System, with its distances (in Å) held by OpenMM if they are given."""
     import openmm
 
-    system = openmm.System()
     force = openmm.NonbondedForce()
     sigma, epsilon = 0.315061, 0.1521 * 4.184
-    for k, mass in enumerate(masses):
-        system.addParticle(mass)
+    for k in range(len(masses)):
         force.addParticle(*((-0.834, sigma, epsilon) if k % 3 == 0 else (0.417, 1.0, 0.0)))
     for first in range(0, len(masses), 3):
         for i, j in ((0, 1), (0, 2), (1, 2)):
@@ -159,18 +155,6 @@ def _system(box: float, cutoff: float, masses: FloatArray) -> Any:
     force.setUseSwitchingFunction(True)
     force.setSwitchingDistance(0.9 * cutoff / 10)
     force.setUseDispersionCorrection(False)
-    system.addForce(force)
+    system = system_of(masses, force, pairs=pairs, lengths=np.asarray(lengths) * ASE_LENGTH)
     system.setDefaultPeriodicBoxVectors(*(np.eye(3) * box / 10))
     return system
-
-
-def _held(box: float, masses: FloatArray, pairs: IntArray, lengths: FloatArray) -> Any:
-    """The same with its distances held by OpenMM."""
-    system = _system(box, _cutoff(box), masses)
-    for (i, j), length in zip(pairs.tolist(), lengths.tolist(), strict=True):
-        system.addConstraint(i, j, length * ASE_LENGTH)
-    return system
-
-
-def _cutoff(box: float) -> float:
-    return min(CUTOFF, 0.49 * box)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -28,6 +28,9 @@ USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-rattle", 
 USUAL_STEP = 2.0
 #: Of a temperature that is right enough, as a fraction.
 USUAL_TEMPERATURE = 0.01
+#: What thermostats are judged by, and what they cost.
+DEVIATION = "a deviation of the temperature of the configurations"
+UNTIL_KNOWN = "wall time until that temperature is known to 1 %"
 #: Columns of a terminal that the ranking fits into, and of these the most that a title takes.
 WIDTH, TITLE = 80, 33
 
@@ -177,28 +180,32 @@ def answer_of_averages(comparison: SamplingComparison, limit: float | None = Non
     found = _ranked(pointed, USUAL_TEMPERATURE if limit is None else limit, 1 / 3)
     return replace(
         found,
-        what="a deviation of the temperature of the configurations",
+        what=DEVIATION,
         unit="of it",
         limit_is=is_usual,
-        cost="wall time until that temperature is known to 1 %",
+        cost=UNTIL_KNOWN,
         seconds=True,
     )
 
 
 def _at_one_step(points: Sequence[Point], errors: Mapping[str, float]) -> Answer:
     """Thermostats by the deviation of the temperature: between the value of a point and four standard errors less."""
+    ranked = _placed(points, lambda p: p.value, lambda p, leader: p.value - 4 * errors[p.method] <= leader)
+    return Answer(DEVIATION, "of it", math.inf, "", UNTIL_KNOWN, True, 0.0, ranked, [])
+
+
+def _placed(
+    points: Iterable[Point], worth: Callable[[Point], float], ties: Callable[[Point, float], bool]
+) -> list[Ranked]:
+    """In the order of what they are worth; those that tie with the first of a place share it."""
     ranked: list[Ranked] = []
     leader = 0.0
-    for number, point in enumerate(sorted(points, key=lambda p: p.value), 1):
-        tied = bool(ranked) and point.value - 4 * errors[point.method] <= leader
-        leader = leader if tied else point.value
+    for number, point in enumerate(sorted(points, key=worth), 1):
+        tied = bool(ranked) and ties(point, leader)
+        leader = leader if tied else worth(point)
         place = ranked[-1].place if tied else number
-        ranked.append(Ranked(place, point, point.value / (ranked[0].point.value if ranked else point.value)))
-    what, cost = (
-        "a deviation of the temperature of the configurations",
-        "wall time until that temperature is known to 1 %",
-    )
-    return Answer(what, "of it", math.inf, "", cost, True, 0.0, ranked, [])
+        ranked.append(Ranked(place, point, worth(point) / worth(ranked[0].point if ranked else point)))
+    return ranked
 
 
 def _value(m: Measurement, criterion: Criterion) -> float | None:
@@ -235,13 +242,7 @@ def _ranked(
         elif point.method not in other or point.value < other[point.method].value:
             other[point.method] = point
     margin = max(margin, SAME_EVALUATIONS)
-    ranked: list[Ranked] = []
-    leader = 0.0
-    for number, point in enumerate(sorted(good.values(), key=lambda p: p.cost), 1):
-        tied = bool(ranked) and point.cost <= leader * (1 + margin)
-        leader = leader if tied else point.cost
-        place = ranked[-1].place if tied else number
-        ranked.append(Ranked(place, point, point.cost / (ranked[0].point.cost if ranked else point.cost)))
+    ranked = _placed(good.values(), lambda p: p.cost, lambda p, leader: p.cost <= leader * (1 + margin))
     beyond = sorted((point for name, point in other.items() if name not in good), key=lambda p: p.value)
     return Answer("", "", limit, "", "", True, margin, ranked, beyond)
 

@@ -12,6 +12,7 @@ from kcons.comparison.work_precision.fronts import (
     SAME_ERROR,
     SAME_EVALUATIONS,
     Verdict,
+    by_method,
     is_ours,
     points,
     verdict,
@@ -54,12 +55,8 @@ def chosen(comparison: Comparison, most: int = MOST) -> list[Chosen]:
     then those that are first in the ranking.
     """
     judged = verdict(comparison)
-    curves: dict[str, list[Measurement]] = {}
-    for m in points(comparison, "evaluations"):
-        if m.error:
-            curves.setdefault(m.method, []).append(m)
     merged: list[Chosen] = []
-    for name, curve in curves.items():
+    for name, curve in by_method(m for m in points(comparison, "evaluations") if m.error).items():
         like = next((k for k, other in enumerate(merged) if _alike(other.points, curve, judged)), None)
         if like is None:
             merged.append(Chosen(name, curve[0].title, curve))

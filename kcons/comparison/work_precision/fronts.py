@@ -171,6 +171,14 @@ def points(comparison: Comparison, cost: Cost, md_engine: str | None = None) -> 
     ]
 
 
+def by_method(measurements: Iterable[Measurement]) -> dict[str, list[Measurement]]:
+    """Curves: measurements of each method, in their order."""
+    found: dict[str, list[Measurement]] = {}
+    for m in measurements:
+        found.setdefault(m.method, []).append(m)
+    return found
+
+
 def front(measurements: Iterable[Measurement], cost: Cost, resolution: float = 0.0) -> list[Measurement]:
     """Those that no other dominates, cheapest first: none costs as little and errs less, beyond `SAME_ERROR`.
 
@@ -243,11 +251,9 @@ def _md_engines_without_forces(comparison: Comparison) -> frozenset[str]:
 def _standing(comparison: Comparison, md_engine: str, cost: Cost, margin: float) -> Standing:
     resolution = resolution_of(comparison)
     here = points(comparison, cost, None if md_engine == EVERY_MD_ENGINE else md_engine)
-    curves: dict[str, list[Measurement]] = {}
-    for m in here:
-        curves.setdefault(m.method, []).append(m)
-    ours = [curve for curve in curves.values() if is_ours(curve[0])]
-    theirs = [curve for curve in curves.values() if not is_ours(curve[0])]
+    curves = by_method(here).values()
+    ours = [curve for curve in curves if is_ours(curve[0])]
+    theirs = [curve for curve in curves if not is_ours(curve[0])]
     on_front = front(here, cost, resolution)
     if not ours or not theirs:
         return Standing(md_engine, cost, on_front, False, [])

@@ -22,9 +22,11 @@ from kcons.comparison.work_precision.fronts import (
     COSTS,
     EVERY_MD_ENGINE,
     Cost,
+    by_method,
     cost_of,
     is_ours,
     md_engine_of,
+    points,
     resolution_of,
     verdict,
 )
@@ -158,7 +160,7 @@ def recommend(
     bench = Bench(test_system, reference, budget, watcher or Watcher(), rounds)
     decides = verdict(comparison).decides
     resolution = resolution_of(comparison)
-    curves = _curves(comparison)
+    curves = by_method(points(comparison, "wall"))
     found: list[Measurement] = []
     if target >= resolution:
         warm_up(test_system, [METHODS[name] for name in curves])
@@ -184,7 +186,7 @@ def recommend(
         if default is not None and "needs" in default:
             default["gain"] = {cost: default["needs"][COSTS[cost][0]] / cost_of(best, cost) for cost in COSTS}
     else:
-        entry["why"] = _why_not(test_system, comparison, target, resolution, everything)
+        entry["why"] = _why_not(comparison, target, resolution)
         usable = [m for m in everything if m.error]
         if usable:
             entry["best"] = _facts(min(usable, key=lambda m: max(float(m.error or 0.0), resolution)))
@@ -205,7 +207,7 @@ def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
     comparison : Comparison
     """
     resolution = resolution_of(comparison)
-    curves = _curves(comparison)
+    curves = by_method(points(comparison, "wall"))
     judged = verdict(comparison)
     found: list[Measurement] = []
     tried: set[tuple[str, float]] = set()
@@ -285,15 +287,6 @@ def _divided(test_system: TestSystem, method: Method, setting: float, bad: float
     return horizon / count
 
 
-def _curves(comparison: Comparison) -> dict[str, list[Measurement]]:
-    """Points of each method that has any, in the order of settings."""
-    found: dict[str, list[Measurement]] = {}
-    for m in comparison.measurements:
-        if m.status == "ok" and m.error is not None and math.isfinite(m.error) and cost_of(m, "wall") > 0:
-            found.setdefault(m.method, []).append(m)
-    return found
-
-
 def _reaches(m: Measurement, target: float) -> bool:
     return m.status == "ok" and m.error is not None and m.error <= target and cost_of(m, "wall") > 0
 
@@ -320,7 +313,7 @@ def _default(
     molecular = test_system.units.energy == "eV"
     usual = DEFAULT_STEP if molecular else comparison.scene["horizon"] / 20
     setting = DEFAULT_RTOL if method.adaptive else horizon / max(1, round(horizon / usual))
-    curve = _curves(comparison).get(name, [])
+    curve = by_method(points(comparison, "wall")).get(name, [])
     found: list[Measurement] = []
     first = next((m for m in curve if abs(m.setting - setting) < 1e-9 * setting), None)
     if first is None:
@@ -332,16 +325,16 @@ def _default(
             another = setting / 10 if method.adaptive else horizon / max(1, first.steps // 2)
             found += bench.timed_again([bench.measure(method, another * unit)])[0]
     entry: dict[str, Any] = {**_facts(first), "status": first.status, "note": first.note}
-    points = _sorted([*curve, *(m for m in found if m.status == "ok" and m.error)])
-    reached = [m for m in points if _reaches(m, target)]
-    prediction = predicted(points, SAFETY * target, resolution_of(comparison))
+    known = _sorted([*curve, *(m for m in found if m.status == "ok" and m.error)])
+    reached = [m for m in known if _reaches(m, target)]
+    prediction = predicted(known, SAFETY * target, resolution_of(comparison))
     if prediction is not None:
         more, _ = bench.timed_again(reach(bench, prediction, target))
         found += more
         reached += [m for m in more if _reaches(m, target)]
     if reached:
         entry["needs"] = {**_facts(_cheapest(reached, "wall")), "measured": True}
-    elif (far := predicted(points, target, resolution_of(comparison))) is not None:
+    elif (far := predicted(known, target, resolution_of(comparison))) is not None:
         entry["needs"] = {
             "setting": far.setting,
             "seconds_per_time": far.wall,
@@ -357,9 +350,7 @@ def default_method(test_system: TestSystem, md_engine: str) -> str | None:
     return next((name for name in names if METHODS[name].refuses(test_system) is None), None)
 
 
-def _why_not(
-    test_system: TestSystem, comparison: Comparison, target: float, resolution: float, everything: Sequence[Measurement]
-) -> str:
+def _why_not(comparison: Comparison, target: float, resolution: float) -> str:
     unit = comparison.error_unit
     good = float(comparison.reference["error"])
     if target < resolution:

@@ -27,7 +27,6 @@ class AtomNames:
         self.names: NDArray[np.str_] = _column(atoms, "names", n)
         self.residues: NDArray[np.str_] = _column(atoms, "resnames", n)
         self._numbers = _column(atoms, "resids", n)
-        self._segments = _column(atoms, "segids", n)
         elements = _column(atoms, "elements", n)
         if not np.all(elements != ""):
             known = topology_of(universe).elements

@@ -7,7 +7,7 @@ import pytest
 from hard_case_runs import Careless
 
 from kcons.comparison.hard_cases.contract import Frame
-from kcons.comparison.hard_cases.motions import every, flat_body, move, tumble, worst_residual
+from kcons.comparison.hard_cases.motions import Seen, energy_off, every, flat_body, move, tumble
 from kcons.comparison.hard_cases.problem import Problem
 from kcons.comparison.hard_cases.programs import Core
 
@@ -21,13 +21,21 @@ def test_every_pair_is_there_once():
 
 def test_the_largest_residual_is_kept_and_so_is_nan():
     problem = Problem([[0.0, 0, 0], [1.0, 0, 0]], [1.0, 1.0], [(0, 1)])
-    worst = worst_residual(problem)
+    seen = Seen(problem)
     for length in (1.0, 1.1, 1.01):
-        worst(Frame(x=np.array([[0.0, 0, 0], [length, 0, 0]]), v=np.zeros((2, 3)), kinetic=0.0, potential=0.0))
-    assert worst.value == problem.residual(np.array([[0.0, 0, 0], [1.1, 0, 0]])) > 0.09
+        seen(Frame(x=np.array([[0.0, 0, 0], [length, 0, 0]]), v=np.zeros((2, 3)), kinetic=0.0, potential=0.0))
+    assert seen.residual == problem.residual(np.array([[0.0, 0, 0], [1.1, 0, 0]])) > 0.09
     for length in (np.nan, 1.0):
-        worst(Frame(x=np.array([[0.0, 0, 0], [length, 0, 0]]), v=np.zeros((2, 3)), kinetic=0.0, potential=0.0))
-    assert np.isnan(worst.value)
+        seen(Frame(x=np.array([[0.0, 0, 0], [length, 0, 0]]), v=np.zeros((2, 3)), kinetic=0.0, potential=0.0))
+    assert np.isnan(seen.residual)
+
+
+def test_energies_are_kept_and_the_first_does_not_count():
+    seen = Seen(Problem([[0.0, 0, 0], [1.0, 0, 0]], [1.0, 1.0], [(0, 1)]))
+    for kinetic in (7.0, 1.0, 1.5, 0.25):
+        seen(Frame(x=np.eye(3)[:2], v=np.zeros((2, 3)), kinetic=kinetic, potential=1.0))
+    assert seen.energies == [8.0, 2.0, 2.5, 1.25]
+    assert energy_off(seen.energies) == 0.375
 
 
 @pytest.mark.parametrize(("program", "held"), [(Core(), True), (Careless(), False)])

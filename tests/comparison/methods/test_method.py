@@ -55,7 +55,7 @@ def pendulum():
 
 
 def registered(monkeypatch, *kinds):
-    found = {m.name: m for m in methods.of_steppers(kinds)}
+    found = {m.name: m for m in methods.of_steppers({kind.__name__.lower(): kind for kind in kinds})}
     monkeypatch.setattr(methods, "METHODS", {**methods.METHODS, **found})
 
 

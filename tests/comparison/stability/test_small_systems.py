@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons.comparison.stability import SYSTEMS
-from kcons.comparison.stability.small_systems import every_pair, separated
+from kcons.comparison.stability.small_systems import separated
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -32,11 +32,6 @@ def test_seeds_give_different_starts(name):
     one, same, other = (SYSTEMS[name](seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.v, same.v)
     assert not np.array_equal(one.v, other.v) or not np.array_equal(one.x, other.x)
-
-
-def test_every_pair_is_listed_once():
-    pairs = every_pair(5)
-    assert len(pairs) == 10 and len({tuple(sorted(pair)) for pair in np.asarray(pairs).tolist()}) == 10
 
 
 def test_points_that_are_not_too_near():
