@@ -109,7 +109,10 @@ TABLE = {
         (
             *script("31_long_steps", "--small", "--cost"),
             *script("39_long_steps_water", "--full long-steps", "--collect long-steps", "--fresh"),
-            *script("41_long_steps_reach", "--full long-steps-reach", "--collect long-steps-reach"),
+            *script(
+                "41_long_steps_reach",
+                *("--full long-steps-reach", "--collect long-steps-reach", "--beyond long-steps-beyond"),
+            ),
         ),
         620,
     ),

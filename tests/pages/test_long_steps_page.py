@@ -218,3 +218,18 @@ def test_spheres_against_metropolis(kind):
         found = example.small_run(kind, 1, 64, wrong, 6000)
         worst = max(abs(a.value - b.value) / math.hypot(a.error, b.error) for a, b in zip(found, known, strict=True))
         assert (worst > 10) if wrong else (worst <= 3.5)
+
+
+def test_beyond_64_fs():
+    """At 384 fs nothing is off by three standard errors; Langevin dynamics at 5/ps has hot turns at 192 fs."""
+    rows = {row["name"].removesuffix(", halfway"): row for row in RESULT["beyond"]["water"]}
+    for name, row in rows.items():
+        if row["outer"] == 384:
+            assert all(abs(row[kind][0] - 1) <= 3 * row[kind][1] for kind in ("shift", "turn")), name
+            assert abs(row["bias"][0]) <= 0.5 and row["slow_per_turning"] < 13
+    hot = [rows[f"langevin 5/ps, 192 fs, inner 2{seed}"]["turn"] for seed in ("", ", seed 2")]
+    cool = [rows[f"split 5/ps, 384 fs, inner 2{seed}"]["turn"] for seed in ("", ", seed 2", ", seed 3")]
+    (value, error), (best, doubt) = (
+        (sum(t for t, _ in seen) / len(seen) - 1, math.hypot(*(e for _, e in seen)) / len(seen)) for seen in (hot, cool)
+    )
+    assert value > 3 * error and best <= 0.01 and doubt < 0.007
