@@ -36,7 +36,7 @@ def test_settings_say_what_is_wrong():
     )
     with pytest.raises(InputError, match="no thermostat 'andersen'"):
         Settings(thermostat="andersen")
-    with pytest.raises(InputError, match=r"fewer than 32 samples; .* a smaller every"):
+    with pytest.raises(InputError, match=r"fewer than 32 samples; .* a smaller `every`"):
         Settings(production=300, every=10)
 
 
