@@ -217,7 +217,7 @@ def first_derivative(function: Function, at: Any, step: Any, period: float | Non
 
 def second_derivative(function: Function, at: Any, step: Any, period: float | None = None) -> FloatArray:
     """d2f/ds2, error of order step^8; best at a step of about 1/50 of the scale of f (11 digits)."""
-    centre, step = function(at), _exact(step, at)
+    centre, step = function(at), exact_step(step, at)
     total = np.zeros_like(centre)
     for k, c in enumerate(_SECOND_8, start=1):
         later, earlier = (nearest_image(function(at + sign * k * step) - centre, period) for sign in (1, -1))
@@ -225,14 +225,14 @@ def second_derivative(function: Function, at: Any, step: Any, period: float | No
     return total / step**2
 
 
-def _exact(step: Any, at: Any) -> Any:
+def exact_step(step: Any, at: Any) -> Any:
     """A step that does not round where it is added: at late times that would be most of the difference."""
     return (at + step) - at
 
 
 def _first(function: Function, at: Any, step: Any, weights: tuple[float, ...], period: float | None) -> FloatArray:
     total: FloatArray | float = 0.0
-    step = _exact(step, at)
+    step = exact_step(step, at)
     for k, c in enumerate(weights, start=1):
         total = total + c * nearest_image(function(at + k * step) - function(at - k * step), period)
     return np.asarray(total / step)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANY, SPEED, TAKES_TIME, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.target import FloatArray, Target, contradiction, first_derivative_4
+from kcons.constraints.target import FloatArray, Target, contradiction, exact_step, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
 from kcons.errors import InputError
 
@@ -341,7 +341,7 @@ class CustomVelocity(VelocityRows):
             return np.zeros_like(r)
         step = 1e-3 * self.length / speed
         if self.time_dependent:
-            step = (time + min(step, self.time_step)) - time  # does not round where it is added
+            step = exact_step(min(step, self.time_step), time)
         return first_derivative_4(
             lambda s: self._call(self.coefficients, "coefficients", k, r + s * v, time + s), 0.0, step
         )

@@ -473,4 +473,4 @@ def best(runs: Iterable[Stepped]) -> list[Stepped]:
 def _merit(run: Stepped) -> tuple[float, float]:
     if run.status != "ok":
         return math.inf, math.inf
-    return max(run.bias, 0.0), max(run.correlation, *(calls for _, _, calls in run.observed.values()), 0.0)
+    return max(run.bias, 0.0), max([run.correlation, *(calls for _, _, calls in run.observed.values())])

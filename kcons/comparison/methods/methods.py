@@ -137,10 +137,10 @@ def of_steppers(found: Mapping[str, Any]) -> list[CoreStepper]:
     ]
 
 
-def _maker(kind: Any) -> Callable[[float], Stepper]:
+def _maker(kind: Callable[..., Stepper]) -> Callable[[float], Stepper]:
     if "rate" in inspect.signature(kind).parameters:
-        return lambda dt: kind(rate=FEEDBACK / dt)  # type: ignore[no-any-return]
-    return lambda dt: kind()  # type: ignore[no-any-return]
+        return lambda dt: kind(rate=FEEDBACK / dt)
+    return lambda dt: kind()
 
 
 class _AdaptiveRun(OfStates):
