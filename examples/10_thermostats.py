@@ -49,7 +49,7 @@ NAMES = ("Lennard-Jones, 16 atoms", "8 dumbbells", "8 rigid triatomics")
 #: Errors that come from the step are a tenth of a percent then.
 STEP = 0.003
 #: Steps of full isokinetic runs: standard errors of the temperature are 0.2 %.
-STEPS = (2_500_000, 3_500_000, 4_000_000)
+STEPS = (2_500_000, 3_500_000, 6_000_000)
 
 
 def sampled(which: int, thermostat: str, steps: int) -> dict[str, Any]:
