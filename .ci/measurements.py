@@ -123,7 +123,7 @@ TABLE = {
             "32_hamiltonian_monte_carlo",
             *(f"--full {part} --out F" for part in ("small", "water", "precision", "dhfr", "judge", "chain")),
         ),
-        None,
+        15,
     ),
     "more_free_energies.json": Measurement(
         (*BATHS, "ase", "openmm", "free_energy"), script("35_more_free_energies", "--full more-free-energies"), 11

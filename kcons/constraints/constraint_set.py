@@ -20,6 +20,7 @@ from kcons.constraints.contradictions import found_as_given, refuse_contradictio
 from kcons.constraints.periodic.images import find_images
 from kcons.constraints.periodic.in_cell import InCell, contiguous, joined, whole_bodies
 from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError
 
 
@@ -133,8 +134,8 @@ class ConstraintSet(InCell):
         if not np.all(scale > 0):
             y = self.whole(x)
             size = self._rows(lambda c: self._reach(c, x, y, time))
-            extent = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
-            size = np.where(size > 0, size, extent if extent > 0 else 1.0)
+            length = extent(x)
+            size = np.where(size > 0, size, length if length > 0 else 1.0)
             scale = np.where(scale > 0, scale, size)
         self.scale: FloatArray = scale
 

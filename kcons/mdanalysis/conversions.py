@@ -18,6 +18,7 @@ from MDAnalysis.lib.mdamath import triclinic_box
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis.loading import format_of
 from kcons.mdanalysis.topology import check_box, snapshot_of, velocities_known
@@ -320,7 +321,7 @@ def _warn_of_cut(snapshot: Snapshot) -> None:
     if len(bonds) == 0 or (snapshot.cell is not None and snapshot.pbc.any()):
         return
     length = np.linalg.norm(x[bonds[:, 0]] - x[bonds[:, 1]], axis=1)
-    cut = (length > CUT * np.median(length)) & (length > 0.5 * np.ptp(x, axis=0).max())
+    cut = (length > CUT * np.median(length)) & (length > 0.5 * extent(x))
     if cut.any():
         k = int(np.argmax(length))
         warnings.warn(

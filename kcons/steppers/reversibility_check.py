@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
@@ -107,7 +108,7 @@ def missed(state: State, after: State, back: State, dt: float, acceleration: flo
         The largest that forces cause.
     """
     speed = max(_largest(state.velocities), _largest(after.velocities))
-    length = max(_largest(np.ptp(state.positions, axis=0)), speed * abs(dt))
+    length = max(extent(state.positions), speed * abs(dt))
     rounding = 8 * float(np.spacing(_largest(state.positions)))
     kick = abs(dt) * acceleration
     moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)

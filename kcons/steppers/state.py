@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import as_array, check_call, finite_array, finite_number, lent, numbers, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
@@ -375,7 +376,7 @@ class System:
     def rest(self, x: FloatArray, v: FloatArray, time: float, dt: float = 0.0) -> float:
         """Speed below which velocities are rounding: of a kick by which atoms cross the system, or of one for `dt`."""
         kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
-        size = float(np.ptp(x, axis=0).max(initial=0.0))
+        size = extent(x)
         # Or one by which no atom has moved by more than its rounding since time 0.
         still = float(np.finfo(float).eps) * size / max(abs(time), abs(dt)) if time else 0.0
         return max(KICK_ROUNDING * math.sqrt(kick * size), KICK_ROUNDING * kick * abs(dt), still)

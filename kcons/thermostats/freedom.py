@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, System
@@ -164,7 +165,7 @@ def open_directions(motion: Motion, positions: FloatArray, time: float = 0.0) ->
         return np.eye(3)
     # A shift d changes a row by its gradient summed over the atoms, times d; for all places if for a few at random.
     rng = np.random.default_rng(0)
-    size = float(np.ptp(positions, axis=0).max(initial=0.0)) or 1.0
+    size = extent(positions) or 1.0
     every = np.tile(np.eye(3), (motion.n_atoms, 1))
     sums = []
     for spread in (0.0, TURN * size, TURN * size):
@@ -208,7 +209,7 @@ def _conserved(system: System, state: State, forces: FloatArray) -> tuple[FloatA
 def _places(system: System, state: State, forces: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """The state, then places nearby, with their forces; fixed atoms stay."""
     rng = np.random.default_rng(0)
-    size = float(np.ptp(state.positions, axis=0).max(initial=0.0)) or 1.0
+    size = extent(state.positions) or 1.0
     moving = system.inverse_masses > 0
     yield state.positions, forces
     while True:
@@ -231,7 +232,7 @@ class RigidMotions:
 
     def __init__(self, positions: FloatArray, turn: bool = True) -> None:
         self._middle = positions.mean(axis=0)
-        self._size = float(np.ptp(positions, axis=0).max(initial=0.0)) or 1.0
+        self._size = extent(positions) or 1.0
         self._seen, self._idle = 0, False
         self._motions = np.eye(6) if turn else np.zeros((0, 6))
 

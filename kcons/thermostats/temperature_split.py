@@ -31,6 +31,7 @@ from kcons.constraints.arguments import as_array, generator_of, positive, refuse
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import System
@@ -167,7 +168,7 @@ class Clusters:
         shifts, turns = every.copy(), several.copy()
         rng = np.random.default_rng(0)
         whole = self._whole(positions)
-        size = float(np.ptp(whole, axis=0).max(initial=0.0)) or 1.0
+        size = extent(whole) or 1.0
         size = min(size, float(held.scale.min()))
         for spread in (0.0, _SPREAD, _SPREAD):
             y = whole + spread * size * rng.standard_normal(whole.shape)

@@ -11,6 +11,7 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
 from kcons.openmm.integrator.interface import Integrator
@@ -120,7 +121,7 @@ def _totals(
     for name in context.getParameters():
         context.setParameter(name, given.getParameter(name))
     rng = np.random.default_rng(0)
-    size = float(np.ptp(x, axis=0).max(initial=0.0)) or 1.0
+    size = extent(x) or 1.0
     found: list[FloatArray] = []
     while len(found) < _PLACES or turns.open:
         there = x + (SHIFT * size * rng.standard_normal(3) + SHAKE * size * rng.standard_normal(x.shape)) * bool(found)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.plan.independent_blocks import fixed_atoms
 
 BoolArray = NDArray[np.bool_]
@@ -229,5 +230,5 @@ class LocalRows:
 
 def extent_of(x: FloatArray) -> float:
     """Length scale of a group of points."""
-    size = float(np.max(np.ptp(x, axis=0)))
+    size = extent(x)
     return size if size > 0 else max(float(np.max(np.abs(x))), 1.0)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, ReversibilityError
 from kcons.steppers import State, Stepper, System
 from kcons.steppers.reversibility_check import missed
@@ -54,7 +55,7 @@ class ReversedSteps:
         self._known = [] if state.forces is None else [(state.positions, state.forces)]
         self._back = False
         after = stepper.step(watched, state, dt)
-        size = float(np.ptp(state.positions, axis=0).max(initial=0.0))
+        size = extent(state.positions)
         self._near = self.tolerance * size + 8 * float(np.spacing(np.abs(state.positions).max(initial=0.0)))
         self._back = True
         try:

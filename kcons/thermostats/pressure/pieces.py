@@ -13,6 +13,7 @@ from kcons.constraints.arguments import check_pairs
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import follow_parents, spanning_tree
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.thermostats.pressure.cell_system import CellSystem
@@ -191,7 +192,7 @@ def rows_open(motion: Motion, positions: FloatArray, time: float = 0.0) -> NDArr
         return opened
     # As `open_directions` of the thermostats, for each row and each axis.
     rng = np.random.default_rng(0)
-    size = float(np.ptp(positions, axis=0).max(initial=0.0)) or 1.0
+    size = extent(positions) or 1.0
     every = np.tile(np.eye(3), (motion.n_atoms, 1))
     opened[placed & ~rolling] = True
     for spread in (0.0, TURN * size, TURN * size):
