@@ -127,8 +127,8 @@ def _checked(values: Any, n_atoms: int) -> NDArray[np.float64]:
     forces = np.array(numbers(values, "forces of the calculator"))
     if forces.shape != (n_atoms, 3):
         raise InputError(f"the calculator returned forces of shape {forces.shape}, not ({n_atoms}, 3)", item="forces")
-    bad = ~np.isfinite(forces).all(axis=1)
-    if bad.any():
-        atom = int(np.argmax(bad))
+    finite = np.isfinite(forces)
+    if not finite.all():
+        atom = int(np.argmin(finite.all(axis=1)))
         raise InputError(f"the calculator's force on atom {atom} is not finite: {forces[atom]}", item="forces")
     return forces

@@ -486,9 +486,9 @@ def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.
 
 def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
     for array, item in ((x, "position"), (v, "velocity")):
-        bad = ~np.isfinite(array).all(axis=1)
-        if bad.any():
-            atom = int(np.argmax(bad))
+        finite = np.isfinite(array)
+        if not finite.all():
+            atom = int(np.argmin(finite.all(axis=1)))
             solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
             raise NonFiniteError(
                 f"the {item} of particle {atom} is not finite at step {step}; take a smaller time step, or minimise "
