@@ -55,6 +55,20 @@ def number(value: Any, of: unit.Unit, item: str) -> float:
         ) from None
 
 
+def relative_tolerance(value: Any) -> float:
+    """A tolerance of OpenMM's solvers.
+
+    Raises
+    ------
+    InputError
+        It is no number between 0 and 1.
+    """
+    found = number(value, unit.dimensionless, "tolerance")
+    if not 0 < found < 1:
+        raise InputError(f"the tolerance is {value}; give a positive number, such as 1e-10", item="tolerance")
+    return found
+
+
 def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
     """The same for an array, as a copy.
 

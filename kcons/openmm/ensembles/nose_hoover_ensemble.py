@@ -99,7 +99,7 @@ class NoseHoover(ConstantEnergy):
             temperature=positive(kelvins(temperature), "temperature"),
             frequency=positive(_per_picosecond(frequency), "frequency"),
             length=whole_number(length, "length"),
-            chain_order=chain_order,
+            chain_order=int(chain_order),
             repeats=int(repeats),
             momentum=momentum,
         )

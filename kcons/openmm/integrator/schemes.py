@@ -55,7 +55,7 @@ def to_scheme(scheme: str | Splitting) -> Splitting | None:
         return scheme
     if scheme == LEAPFROG:
         return None
-    if scheme not in SCHEMES:
+    if not isinstance(scheme, str) or scheme not in SCHEMES:
         known = ", ".join((*SCHEMES, LEAPFROG))
         raise InputError(f"no scheme {scheme!r}; known: {known}", item="scheme")
     return SCHEMES[scheme]()

@@ -49,3 +49,8 @@ def test_thermostats_are_those_on_arrays():
     for order, scheme in ((2, "rattle"), (4, "isokinetic4"), (6, "isokinetic6")):
         isokinetic = ProjectedIntegrator(1e-3, scheme, ensemble=Isokinetic(300)).operations()
         assert isokinetic == thermostats.Isokinetic(1.0, order=order).operations()
+
+
+def test_a_list_is_no_scheme():
+    with pytest.raises(InputError, match="no scheme"):
+        ProjectedIntegrator(1e-3, ["rattle"])

@@ -13,6 +13,7 @@ from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.guard import Guard, positions_of, velocities_of
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
+from kcons.openmm.quantities import relative_tolerance
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
@@ -42,7 +43,7 @@ class OutsideOfSteps(StatesOnConstraints, Integrator):
         guard = self._watch(context)
         context = guard.context
         start, velocities = positions_of(context), velocities_of(context)
-        tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
+        tolerance = self._tolerance(tolerance)
         try:
             guard.constraints.hold_positions(tolerance)
             if not all(part.solves_alone for part in self.parts):
@@ -70,11 +71,11 @@ class OutsideOfSteps(StatesOnConstraints, Integrator):
         """
         guard = self._watch(context)
         context = guard.context
-        velocities = velocities_of(context)
+        velocities, tolerance = velocities_of(context), self._tolerance(tolerance)
         by_program = bool(self.parts) and all(part.solves_alone for part in self.parts)
         try:
             if not by_program:
-                context.applyVelocityConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
+                context.applyVelocityConstraints(tolerance)
                 for part in self.parts:
                     part.apply_velocities(context)
                 return
@@ -82,6 +83,9 @@ class OutsideOfSteps(StatesOnConstraints, Integrator):
         except KconsError:
             context.setVelocities(velocities)
             raise
+
+    def _tolerance(self, given: float | None) -> float:
+        return relative_tolerance(self.getConstraintTolerance() if given is None else given)
 
     def _run_alone(self, guard: Guard, first: int, end: int) -> None:
         """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""

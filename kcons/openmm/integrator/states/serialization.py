@@ -140,20 +140,12 @@ def _member(compound: openmm.CompoundIntegrator) -> Any:
     return live(compound.getIntegrator(compound.getCurrentIntegrator()))
 
 
-def _step(original: Callable[..., None], compound: openmm.CompoundIntegrator, steps: int) -> None:
+def _by_member(original: Callable[..., None], compound: openmm.CompoundIntegrator, value: Any) -> None:
     member = _member(compound)
     if member is None:
-        original(compound, steps)
+        original(compound, value)
     else:
-        member.step(steps)
-
-
-def _set_tolerance(original: Callable[..., None], compound: openmm.CompoundIntegrator, tol: float) -> None:
-    member = _member(compound)
-    if member is None:
-        original(compound, tol)
-    else:
-        member.setConstraintTolerance(tol)
+        getattr(member, original.__name__)(value)
 
 
 def _set_state(compound: openmm.CompoundIntegrator, text: str) -> None:
@@ -166,8 +158,9 @@ def _set_state(compound: openmm.CompoundIntegrator, text: str) -> None:
 
 def _wrap_all() -> None:
     compound, serializer = openmm.CompoundIntegrator, openmm.XmlSerializer
-    for name, call in (("addIntegrator", _add), ("step", _step), ("setConstraintTolerance", _set_tolerance)):
-        setattr(compound, name, wrapped(getattr(compound, name), call))
+    compound.addIntegrator = wrapped(compound.addIntegrator, _add)
+    for name in ("step", "setConstraintTolerance", "setStepSize"):
+        setattr(compound, name, wrapped(getattr(compound, name), _by_member))
     compound.__setstate__ = _set_state
     for name, change in (
         ("_serializeIntegrator", _write),

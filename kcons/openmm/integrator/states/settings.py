@@ -9,6 +9,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.isokinetic_ensemble import kelvins
@@ -18,7 +19,7 @@ from kcons.openmm.integrator.guard import Guard, find_context
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import number
+from kcons.openmm.quantities import number, relative_tolerance
 from kcons.steppers.splitting import Splitting
 
 #: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
@@ -146,10 +147,8 @@ class Settings(Integrator):
         InputError
             It is not between 0 and 1.
         """
-        if not 0 < tol < 1:
-            raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
-        self.asked_tolerance = float(tol)
-        super().setConstraintTolerance(tol)
+        self.asked_tolerance = relative_tolerance(tol)
+        super().setConstraintTolerance(self.asked_tolerance)
 
     def take_precision(self, precision: Precision) -> None:
         """The Context is known: tolerances that were left open become those of its platform."""
@@ -187,13 +186,18 @@ class Settings(Integrator):
         Raises
         ------
         InputError
-            Groups that carry rows are among those given.
+            Groups that carry rows are among those given; what is no number of a group.
         UnsupportedError
             The Context exists; it has read the groups and would ignore the change.
         """
         if getattr(self, "_guard", None) is not None or (getattr(self, "program", None) and find_context(self)):
             raise UnsupportedError("the Context has read the force groups already; set them before it is created")
-        wanted = {g for g in range(32) if (groups >> g) & 1} if isinstance(groups, int) else set(groups)
+        if isinstance(groups, int | np.integer):
+            wanted = {g for g in range(32) if (int(groups) >> g) & 1}
+        elif isinstance(groups, Iterable) and not isinstance(groups, str):
+            wanted = {whole_number(group, "force group", 0, 31) for group in groups}
+        else:
+            raise InputError(f"groups is {groups!r}; give numbers of force groups, such as {{0, 1}}", item="groups")
         rows = self.row_groups
         if len(wanted) == 32:
             wanted -= rows

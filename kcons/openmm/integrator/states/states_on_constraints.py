@@ -5,6 +5,8 @@ from __future__ import annotations
 import openmm
 from openmm import unit
 
+from kcons.constraints.arguments import positive, whole_number
+from kcons.openmm.ensembles.isokinetic_ensemble import kelvins
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.states.minimization import descend
@@ -32,10 +34,15 @@ class StatesOnConstraints(openmm.Integrator):
         """Draw velocities for a temperature (K if a float) and make them tangent to all constraints.
 
         Context.setVelocitiesToTemperature does it for the System's own constraints, to 1e-5 only.
+
+        Raises
+        ------
+        InputError
+            A temperature below zero, a seed that is none.
         """
-        temperature = number(temperature, unit.kelvin, "temperature")
+        temperature = kelvins(temperature)
         self._watch(context)  # refuses before velocities are changed
-        arguments = (temperature,) if seed is None else (temperature, int(seed))
+        arguments = (temperature,) if seed is None else (temperature, whole_number(seed, "seed", -(2**31), 2**31 - 1))
         context.setVelocitiesToTemperature(*arguments)
         self.applyVelocityConstraints(context)
 
@@ -56,9 +63,15 @@ class StatesOnConstraints(openmm.Integrator):
             Root mean square of the force components along the constraints, in kJ/mol/nm if a float.
         maxIterations : int
             0 for no limit.
+
+        Raises
+        ------
+        InputError
+            A tolerance that is not above zero, a number of iterations that is none.
         """
         context = self._watch(context).context
-        tolerance = number(tolerance, unit.kilojoule_per_mole / unit.nanometer, "tolerance")
+        tolerance = positive(number(tolerance, unit.kilojoule_per_mole / unit.nanometer, "tolerance"), "tolerance")
+        maxIterations = whole_number(maxIterations, "maxIterations", 0)
         if self.parts:
             descend(self, context, tolerance, maxIterations)
         else:

@@ -13,7 +13,7 @@ from openmm import app, unit
 from openmm_systems import DATA, alanine, started, state_of
 
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
-from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.integrator.states.hearing import live
 from kcons.openmm.integrator.states.serialization import read_plain
 
@@ -214,3 +214,21 @@ def test_a_compound_within_a_compound_is_refused():
     with pytest.raises(UnsupportedError, match="add a ProjectedIntegrator"):
         together.addIntegrator(RattleIntegrator(1e-3))
     assert together.getNumIntegrators() == 0
+
+
+def test_step_sizes_pass_through_a_compound():
+    """As in the integrator itself: OpenMM sets any."""
+    system, x, v = alanine("AllBonds")
+    member, compound = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300, 10)), openmm.CompoundIntegrator()
+    compound.addIntegrator(member)
+    started(system, compound, x, v)
+    with pytest.raises(InputError, match="cannot follow a time step"):
+        compound.setStepSize(0.5)
+    compound.setStepSize(2 * unit.femtoseconds)
+    assert member.getStepSize() == 2 * unit.femtoseconds
+
+
+def test_chain_orders_of_numpy_are_written():
+    made = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300, 1, chain_order=np.int64(4)))
+    read = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(made))
+    assert read.ensemble == made.ensemble

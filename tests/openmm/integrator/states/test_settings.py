@@ -441,3 +441,19 @@ def test_states_into_a_compound_integrator():
     compound.step(1)
     assert ours.getGlobalVariableByName("friction") == 50.0
     assert other.getGlobalVariableByName("friction") == 1.0
+
+
+@pytest.mark.parametrize("groups", [{40}, [0.5], "0", 1.5, None])
+def test_what_is_no_force_group_is_refused(groups):
+    """Without groups that exist, no force would act."""
+    integrator = ProjectedIntegrator(1e-3)
+    with pytest.raises(InputError, match="group"):
+        integrator.setIntegrationForceGroups(groups)
+    integrator.setIntegrationForceGroups(np.int64(3))
+    assert integrator.getIntegrationForceGroups() == 3
+
+
+@pytest.mark.parametrize("tolerance", ["small", None, float("nan"), 1 * unit.nanometer])
+def test_what_is_no_tolerance_is_refused(tolerance):
+    with pytest.raises(InputError, match="tolerance"):
+        ProjectedIntegrator(1e-3).setConstraintTolerance(tolerance)

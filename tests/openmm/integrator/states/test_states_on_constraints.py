@@ -3,7 +3,7 @@
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import context_of, masses_of, state_of, water_box
+from openmm_systems import context_of, dumbbell, masses_of, started, state_of, water_box
 
 from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator, RattleIntegrator
@@ -52,3 +52,27 @@ def test_degrees_of_freedom_are_counted_by_rank(make):
     context = context_of(other, integrator)
     context.setPositions(x)
     assert integrator.degrees_of_freedom(context) == 3 and integrator.independent_momenta(context) == 6
+
+
+@pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator])
+@pytest.mark.parametrize(
+    ("call", "given"),
+    [
+        ("setVelocitiesToTemperature", {"temperature": -5}),
+        ("setVelocitiesToTemperature", {"temperature": float("nan")}),
+        ("setVelocitiesToTemperature", {"temperature": 300, "seed": 2.7}),
+        ("minimizeEnergy", {"tolerance": float("nan")}),
+        ("minimizeEnergy", {"tolerance": -1}),
+        ("minimizeEnergy", {"maxIterations": 2.5}),
+        ("applyConstraints", {"tolerance": -1}),
+        ("applyVelocityConstraints", {"tolerance": "small"}),
+    ],
+)
+def test_what_is_no_number_for_it_is_refused(kind, call, given):
+    """Velocities of a negative temperature were no numbers."""
+    system, x, v = dumbbell()
+    integrator = kind(1e-3)
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError):
+        getattr(integrator, call)(context=context, **given)
+    np.testing.assert_array_equal(state_of(context), (x, v))
