@@ -345,7 +345,6 @@ class Guard:
         context = self.context
         if self._left is not None and self._left != (context.getStepCount(), _box(context)):
             context.setVelocities(velocities_of(context))
-            self.disturbed = False
 
     def leave(self) -> None:
         """A call of `step` ends."""
@@ -422,8 +421,8 @@ class Guard:
 
     def _remember(self, now: openmm.State) -> None:
         self.since_check = self._put_off = 0
-        self._checked = perf_counter()
         self._good, self._memory = now, self.integrator.program.remembered()
+        self._checked = perf_counter()
 
     def put_back(self) -> None:
         """The state that was checked last."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import openmm
@@ -30,7 +31,7 @@ class Program:
     idle : dict of float
         Global variables that control the program, as they are between two calls of `step`.
     memory : set of str
-        Global variables that belong to a state as x and v do.
+        Variables that belong to a state as x and v do.
     """
 
     def __init__(self, integrator: openmm.CustomIntegrator) -> None:
@@ -87,14 +88,15 @@ class Program:
         self.memory.add(name)
         return self.number(name, words)
 
-    def remembered(self) -> dict[str, float]:
+    def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
-        return {name: self.integrator.getGlobalVariableByName(name) for name in sorted(self.memory)}
+        one, each = self.integrator.getGlobalVariableByName, self.integrator.getPerDofVariableByName
+        return {name: (each if name in self.vectors else one)(name) for name in sorted(self.memory)}
 
-    def recall(self, values: Mapping[str, float]) -> None:
+    def recall(self, values: Mapping[str, Any]) -> None:
         """Write what `remembered` gave back into the Context."""
         for name, value in values.items():
-            self.write(name, value)
+            (self.integrator.setPerDofVariableByName if name in self.vectors else self.write)(name, value)
 
     def vector_setting(self, name: str, words: str, values: FloatArray) -> str:
         """Declare a variable that the integrator was made with, values of shape (n_particles, 3); returns its name."""

@@ -23,6 +23,7 @@ from kcons.openmm.integrator.states.hearing import listen, listeners
 from kcons.openmm.integrator.states.outside_of_steps import OutsideOfSteps
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
+from kcons.openmm.integrator.system_checks import require_context
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
@@ -184,6 +185,8 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
 
         Raises
         ------
+        InputError
+            What is set is no Context, or that of another integrator.
         UnsupportedError
             There is none.
         """
@@ -199,6 +202,12 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
     @context.setter
     def context(self, context: openmm.Context) -> None:
         if self._guard is None or self._guard.alive is not context:
+            require_context(context)
+            if not any(one is self for one in listeners(context)):
+                raise InputError(
+                    f"the Context was made with another integrator than {self!r}; give the Context of this one",
+                    item="context",
+                )
             self._guard = Guard(context, self)
 
     def _watch(self, context: openmm.Context | None = None) -> Guard:

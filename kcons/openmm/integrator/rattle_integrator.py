@@ -179,10 +179,10 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         steps, ends = whole_number(steps, "steps", 0), self._ends
         begun = bool(ends._take_owed())
         guard = self._watch()
-        if guard.disturbed:
-            guard.begin()
         if not begun:
             guard.meet_others()
+        if guard.disturbed:
+            guard.begin()
         while steps > 0:
             block = steps
             if ends.check_every and steps > (due := ends.check_every - guard.since_check) + ends.check_every // 2:

@@ -51,7 +51,7 @@ class StepWriter:
             # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
             # impulse of the forces at x is added, and half that of the constraints in the drift to x.
             p.integrator.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
-            use(p, "impulse")
+            p.memory.add(use(p, "impulse"))
         self.ensemble.declare(p)
         if self.parts:
             self._declare_guards()

@@ -21,7 +21,7 @@ from openmm_systems import (
     state_of,
 )
 
-from kcons.constraints import Dihedral, Plane, Sphere
+from kcons.constraints import Dihedral, Distance, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.openmm import (
     CollectiveRows,
@@ -437,3 +437,42 @@ def test_rows_beside_a_motion_remover_know_no_place():
     integrator.step(1)
     assert integrator._guard.undisturbed
     del context
+
+
+def test_the_leapfrog_comes_back_with_its_kinetic_energy():
+    """It takes the last impulse of the constraints, which was that of the step that failed."""
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3, "leapfrog", check_every=10)
+    context = started(system, integrator, x, v)
+    integrator.step(10)
+    kinetic = context.getState(energy=True).getKineticEnergy()
+    integrator.setStepSize(50)
+    with pytest.raises(KconsError):
+        integrator.step(30)
+    integrator.setStepSize(1e-3)
+    assert context.getStepCount() == 10
+    assert context.getState(energy=True).getKineticEnergy() == kinetic
+
+
+def test_rows_that_another_member_has_left_are_looked_at():
+    """They were pulled back by the first drift, and velocities took up the way."""
+    x = np.array([[0.0, 0, 0], [0.15, 0, 0], [0.15, 0.15, 0]])
+    system, springs = openmm.System(), openmm.HarmonicBondForce()
+    for _ in x:
+        system.addParticle(12.0)
+    springs.addBond(0, 1, 0.15, 1e4)
+    springs.addBond(1, 2, 0.15, 1e4)
+    system.addForce(springs)
+    rows = hold(system, Distance([[0, 2]]), x)
+    compound = openmm.CompoundIntegrator()
+    compound.addIntegrator(ProjectedIntegrator(1e-3, parts=[rows]))
+    compound.addIntegrator(openmm.VerletIntegrator(1e-3))
+    context = started(system, compound, x, 0.5 * np.random.default_rng(3).normal(size=(3, 3)))
+    compound.step(5)
+    compound.setCurrentIntegrator(1)
+    compound.step(400)
+    compound.setCurrentIntegrator(0)
+    off = abs(np.linalg.norm(np.subtract(*state_of(context)[0][[0, 2]])) / np.linalg.norm(x[0] - x[2]) - 1)
+    assert off > 0.1
+    with pytest.raises(InputError, match="What moved them does not know the rows"):
+        compound.step(1)

@@ -16,6 +16,7 @@ from openmm_systems import (
     PLATFORMS,
     alanine,
     context_of,
+    dumbbell,
     holding,
     loose_alanine,
     masses_of,
@@ -354,3 +355,19 @@ def test_degrees_of_freedom_count_the_rank():
     context = context_of(system, integrator)
     context.setPositions([*corners, [1, 1, 1]])
     assert integrator.degrees_of_freedom(context) == 6
+
+
+@pytest.mark.parametrize("call", ["check", "applyConstraints", "setVelocitiesToTemperature", "degrees_of_freedom"])
+def test_contexts_of_other_integrators_are_refused(call):
+    """The clock of that Context was moved then, and its state checked in place of this one's."""
+    system, x, v = dumbbell()
+    integrator, other = ProjectedIntegrator(1e-3), ProjectedIntegrator(1e-3)
+    context, foreign = started(system, integrator, x, v), started(system, other, x, v)
+    arguments = (300,) if call == "setVelocitiesToTemperature" else ()
+    for given, words in ((foreign, "another integrator"), ("no Context", "context is a str")):
+        with pytest.raises(InputError, match=words):
+            getattr(integrator, call)(given, *arguments)
+    integrator.step(3)
+    assert (context.getStepCount(), foreign.getStepCount()) == (3, 0)
+    assert foreign.getTime()._value == 0
+    np.testing.assert_array_equal(state_of(foreign)[1], v)

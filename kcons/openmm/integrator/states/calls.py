@@ -100,14 +100,15 @@ class Calls(Integrator):
         """
         steps = whole_number(steps, "steps", 0) + self._take_owed()
         guard = self._watch()
+        guard.meet_others()
         if guard.disturbed:
             guard.begin()
         if self._plan.kept and guard.surroundings_changed():
             self.refresh()
-        guard.meet_others()
         owed = 0
         while steps > 0:
-            block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
+            # At least one: `check_every` may have become less than what was made since the last check.
+            block = min(steps, max(self.check_every - guard.since_check, 1)) if self.check_every else steps
             check_is_due = 0 < self.check_every <= guard.since_check + block
             goes_on = self.unseen and block == steps and not check_is_due
             done = self._run_block(guard, block, to_the_end=not goes_on)

@@ -200,7 +200,7 @@ def _minimize(
 ) -> None:
     holding = next((one for one in listeners(context) if one.parts), None)
     if holding is None:
-        original(context, tolerance, maxIterations, reporter)
+        _moving(original, context, tolerance, maxIterations, reporter)
         return
     if reporter is not None:
         raise UnsupportedError(

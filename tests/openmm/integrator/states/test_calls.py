@@ -320,3 +320,19 @@ def test_a_number_of_steps_that_is_none_is_refused(kind):
     for steps in (0, 2, 3.0, np.int64(4)):
         made.integrator.step(steps)
     assert made.context.getStepCount() == 9
+
+
+@pytest.mark.parametrize("before", [100, 0])
+def test_checks_that_come_more_often_make_no_step_more(before):
+    """Steps since the last check may be more than the new interval."""
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3, check_every=before)
+    context = started(system, integrator, x, v)
+    integrator.step(50)
+    integrator.check_every = 10
+    integrator.step(100)
+    assert context.getStepCount() == 150
+    at_once = ProjectedIntegrator(1e-3)
+    other = started(system, at_once, x, v)
+    at_once.step(150)
+    np.testing.assert_array_equal(state_of(context)[0], state_of(other)[0])

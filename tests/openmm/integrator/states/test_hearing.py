@@ -406,3 +406,20 @@ def test_moving_row_goes_on_through_a_state():
     integrator.step(5)
     assert again.values(there)[0] == pytest.approx(0.32, abs=1e-12)
     np.testing.assert_array_equal(state_of(there), state_of(context))
+
+
+def test_what_the_minimiser_has_moved_is_looked_at():
+    """Velocities are made tangent where it has left the particles."""
+    system, x = water_box(8)
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x)
+    integrator.applyConstraints(context)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(50)
+    before = state_of(context)[0]
+    openmm.LocalEnergyMinimizer.minimize(context, 1, 100)
+    minimised = state_of(context)[0]
+    assert np.abs(minimised - before).max() > 0.01
+    integrator.step(0)
+    np.testing.assert_allclose(state_of(context)[0], minimised, rtol=0, atol=1e-9)
+    integrator.check(context)
