@@ -15,7 +15,13 @@ from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
 from kcons.openmm.integrator.interface import Integrator
-from kcons.openmm.integrator.system_checks import forces_of, knows_a_place, removes_centre_of_mass_motion
+from kcons.openmm.integrator.system_checks import (
+    forces_of,
+    groups_in,
+    groups_of,
+    knows_a_place,
+    removes_centre_of_mass_motion,
+)
 from kcons.openmm.quantities import held_without_mass, masses_of
 from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, RigidMotions, open_directions
 
@@ -82,11 +88,12 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
             open_ones = open_directions(motion, places)
             broken.append(np.eye(3) - open_ones.T @ open_ones)
             turns.keep_rows(motion, places)
+    acting = groups_in(integrator)
     for force in forces_of(system):
         if force.getForceGroup() in integrator.row_groups:
             if not _carries(force):
                 broken.append(_totals(context, force, x, fixed, turns))
-        elif momentum == "auto" and knows_a_place(force):
+        elif momentum == "auto" and groups_of(force) & acting and knows_a_place(force):
             if not removed:
                 broken.append(_totals(context, force, x, fixed, turns))
             elif turns.found and not _carries(force):  # what Python computes is taken for forces between particles

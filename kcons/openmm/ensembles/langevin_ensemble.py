@@ -23,9 +23,9 @@ class Langevin(ConstantEnergy):
 
         v = P (exp(-gamma h) v + sqrt((1 - exp(-2 gamma h)) kT/m) noise),    P = M_par^+ M,
 
-    half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator makes
-    a run reproducible, as far as the platform's forces are. A value: to change temperature or friction of a run, call
-    `setTemperature` and `setFriction` of its integrator.
+    half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator, before
+    its Context is made, makes a run reproducible, as far as the platform's forces are. A value: to change temperature
+    or friction of a run, call `setTemperature` and `setFriction` of its integrator.
 
     Parameters
     ----------

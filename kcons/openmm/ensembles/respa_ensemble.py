@@ -14,7 +14,7 @@ from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.step_variables import use
-from kcons.openmm.integrator.system_checks import groups_of
+from kcons.openmm.integrator.system_checks import groups_in, groups_of
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.multistep.nesting import SlowKicks, levels_of, middle_of, nested
@@ -154,6 +154,14 @@ class LangevinRespa(Langevin):
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
         super().begin(integrator, context)
+        idle = set(self.groups) - groups_in(integrator)
+        if idle:
+            raise InputError(
+                f"force group {min(idle)} is left out by setIntegrationForceGroups, and steps give it "
+                f"{dict(zip(self.groups, self.counts, strict=True))[min(idle)]}: all groups in steps act; take those "
+                "forces out of the System",
+                item="steps",
+            )
         system = context.getSystem()
         for force in system.getForces():
             left = groups_of(force) - set(self.groups)
@@ -228,7 +236,7 @@ class IsokineticCircles(LangevinRespa):
 
     def declare(self, program: Program) -> None:
         super().declare(program)
-        program.vector("w", "auxiliary variables")
+        program.memory.add(program.vector("w", "auxiliary variables"))
         program.vector("keep", "what is left of u in a kick")
 
     def push(self, program: Program, force: str, h: str, name: str) -> None:

@@ -234,6 +234,12 @@ def groups_of(force: openmm.Force) -> set[int]:
     return {force.getForceGroup(), reciprocal} - {-1}
 
 
+def groups_in(integrator: openmm.Integrator) -> set[int]:
+    """The force groups that act on what an integrator moves."""
+    groups = integrator.getIntegrationForceGroups()
+    return {group for group in range(32) if groups >> group & 1}
+
+
 def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
     return (system.getForce(k) for k in range(system.getNumForces()))
 

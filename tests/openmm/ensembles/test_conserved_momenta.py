@@ -222,3 +222,19 @@ def test_a_box_is_not_turned(monkeypatch):
     system.addForce(field)
     system.addForce(openmm.CMMotionRemover())
     assert not said(system, x, Isokinetic(300.0))
+
+
+def test_forces_that_do_not_act_take_no_momentum():
+    """Of the groups that `setIntegrationForceGroups` leaves out."""
+    system = openmm.System()
+    idle = openmm.CustomExternalForce("100*(x-0.1)^2")
+    idle.setForceGroup(3)
+    for _ in range(4):
+        idle.addParticle(system.addParticle(12.0), [])
+    system.addForce(idle)
+    integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300))
+    integrator.setIntegrationForceGroups({0})
+    v = np.random.default_rng(1).normal(size=(4, 3))
+    context = started(system, integrator, np.eye(4)[:, :3], v - v.mean(axis=0))
+    assert integrator.degrees_of_freedom(context) == 12
+    assert integrator.ensemble.count(integrator) == 12 - 3

@@ -254,3 +254,14 @@ def test_forces_in_reciprocal_space_have_a_number_of_steps_too():
     context = started(system, integrator, x)
     integrator.step(1)
     assert np.isfinite(context.getState(energy=True).getPotentialEnergy()._value)
+
+
+def test_groups_that_are_left_out_are_refused():
+    """They acted all the same."""
+    system, x, v = trapped()
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO))
+    integrator.setIntegrationForceGroups({1})
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError, match="group 0 is left out by setIntegrationForceGroups"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), (x, v))
