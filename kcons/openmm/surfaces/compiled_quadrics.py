@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
+from threading import get_ident
 from typing import Any
 
 import numba
@@ -23,8 +24,9 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SURFACE_NAME
 from kcons.openmm.surfaces.quadrics import QuadricRows
 
-#: Where drifts began; both callbacks of a System run in turn within one drift.
-_STARTS: dict[str, FloatArray] = {}
+#: Where drifts began; both callbacks of a System run in turn within one drift. Copies of a System, which have its key,
+#: may make steps at the same time, each in a thread of its own.
+_STARTS: dict[tuple[str, int], FloatArray] = {}
 
 
 class CompiledQuadricRows(QuadricRows):
@@ -110,7 +112,7 @@ class _Note:
 
     def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
         x = _positions(state)
-        _STARTS[self.key] = x
+        _STARTS[self.key, get_ident()] = x
         return 0.0, np.zeros_like(x)
 
 
@@ -122,7 +124,8 @@ class _Land:
 
     def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
         x = _positions(state)
-        start = _STARTS.get(self.key)
+        place = self.key, get_ident()
+        start = _STARTS.get(place)
         if start is None:
             start = x.copy()
         way = np.empty_like(x)
@@ -131,7 +134,7 @@ class _Land:
         if failed:
             np.subtract(start, x, out=way)
         # The same sum as in the program: where the next drift begins if nobody moves x.
-        _STARTS[self.key] = np.add(x, way, out=x)
+        _STARTS[place] = np.add(x, way, out=x)
         return float(failed), way
 
 

@@ -178,9 +178,9 @@ class SurfaceIntegrator(ProjectedIntegrator):
         if len(self.surfaces) < len(self.parts):
             super().applyConstraints(context, tolerance)
             return
-        context = self.context if context is None else context
+        context = self._watch(context).context
         start, _ = positions_and_velocities(context)
-        context.applyConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
+        context.applyConstraints(self._tolerance(tolerance))
         try:
             self.apply_positions(context)
         except KconsError:
@@ -237,8 +237,7 @@ class SurfaceIntegrator(ProjectedIntegrator):
     def _dynamics(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Positions of all particles; velocities and applied forces of those on surfaces."""
         x, v = positions_and_velocities(context)
-        groups = set(range(32)) - self.row_groups
-        f = context.getState(forces=True, groups=groups).getForces(asNumpy=True)
+        f = context.getState(forces=True, groups=self.getIntegrationForceGroups()).getForces(asNumpy=True)
         atoms = self.surface_atoms
         return x, v[atoms], np.array(f.value_in_unit(unit.kilojoule_per_mole / unit.nanometer))[atoms]
 

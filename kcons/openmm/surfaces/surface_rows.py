@@ -17,6 +17,7 @@ from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteErro
 from kcons.motion.motion import Motion
 from kcons.openmm.integrator.part import BOND, NEAR, Miss, Part
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import require_context
 from kcons.openmm.quantities import masses_of
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
@@ -107,6 +108,16 @@ class SurfaceRows(Part):
         """Unit normals, shape (n_rows, 3)."""
         slopes = np.concatenate([item.gradient(x[item.atoms], 0.0)[:, 0] for item in self.rows])
         return np.asarray(slopes / np.sqrt(np.einsum("ij,ij->i", slopes, slopes))[:, None])
+
+    def take_place(self, program: Program, context: openmm.Context) -> None:
+        """Refuse another number of particles than the variables of the program have."""
+        found = context.getSystem().getNumParticles()
+        if found != self.n_particles:
+            raise InputError(
+                f"surfaces were made for {self.n_particles} particles, and the System has {found}; make them again "
+                "with system= or the right n_particles=",
+                item="n_particles",
+            )
 
     def check(self, context: openmm.Context, velocities: bool = True) -> None:
         """Raise `InputError` unless all atoms are on their surfaces with velocities along them.
@@ -228,6 +239,7 @@ def _length(item: Constraint) -> FloatArray:
 
 def positions_and_velocities(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
     """In nm and nm/ps, as they are (not wrapped), shape (n_particles, 3) each."""
+    require_context(context)
     state = context.getState(positions=True, velocities=True)
     x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
     v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from threading import Thread
+
 import numpy as np
 import openmm
 import pytest
@@ -114,3 +117,33 @@ def test_sphere_as_a_bond_of_openmm(compiled):
         both = bonded.getState(positions=True).getPositions(asNumpy=True)._value
         x = state_of(context)[0][0]
         assert np.abs(x - (both[1] - both[0])).max() <= limit
+
+
+def test_copies_of_a_system_make_steps_in_threads():
+    """Each drift begins where the particles of its own Context are."""
+    n = 20
+    system = openmm.System()
+    for _ in range(n):
+        system.addParticle(10.0)
+    parts = surface_parts(Sphere(np.arange(n), [0, 0, 0], 1.0), system=system, compiled=True)
+    ends = {}
+
+    def go(seed, name):
+        integrator = SurfaceIntegrator(2e-3, parts=copy.deepcopy(parts), check_every=0)
+        context = context_of(copy.deepcopy(system), integrator)
+        x, v = np.random.default_rng(seed).normal(size=(2, n, 3))
+        context.setPositions(x / np.linalg.norm(x, axis=1)[:, None])
+        context.setVelocities(v)
+        integrator.apply_velocities(context)
+        integrator.step(1000)
+        ends[name] = np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
+
+    for seed in (0, 1):
+        go(seed, f"{seed} alone")
+    threads = [Thread(target=go, args=(seed, seed)) for seed in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for seed in (0, 1):
+        np.testing.assert_array_equal(ends[seed], ends[f"{seed} alone"])

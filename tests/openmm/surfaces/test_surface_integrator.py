@@ -304,3 +304,41 @@ def test_periodic_boxes_do_not_repeat_surfaces():
     context.setPositions([[2.5, 0, 0], [1, 1, 1], [1, 0, 1]])
     with pytest.raises(InputError, match="not repeated in periodic boxes"):
         integrator.check(context)
+
+
+def test_multipliers_know_which_forces_act():
+    """Forces of a group that was left out entered them."""
+    system = openmm.System()
+    system.addParticle(10.0)
+    idle = openmm.CustomExternalForce("100*x")
+    idle.addParticle(0, [])
+    idle.setForceGroup(3)
+    system.addForce(idle)
+    integrator = SurfaceIntegrator(2e-3, surfaces=Sphere([0], [0, 0, 0], 2.0), system=system)
+    integrator.setIntegrationForceGroups({0})
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[2, 0, 0]])
+    context.setVelocities([[0, 3, 0]])
+    assert integrator.multipliers(context) == pytest.approx([-45])
+    np.testing.assert_allclose(integrator.constraint_forces(context), [[-45, 0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("n_particles", [2, 5])
+def test_another_number_of_particles_is_refused(n_particles):
+    """OpenMM reads beyond what it was given, or passes over the rest."""
+    system = openmm.System()
+    for _ in range(3):
+        system.addParticle(12.0)
+    integrator = SurfaceIntegrator(1e-3, surfaces=Sphere([0], [0, 0, 0], 1.0), n_particles=n_particles)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[1, 0, 0], [2, 0, 0], [0, 3, 0]])
+    with pytest.raises(InputError, match="the System has 3") as caught:
+        integrator.step(1)
+    assert caught.value.item == "n_particles"
+
+
+def test_a_simulation_is_no_context():
+    integrator = SurfaceIntegrator(1e-3, surfaces=Sphere([0], [0, 0, 0], 1.0), n_particles=1)
+    for call in (integrator.apply_positions, integrator.multipliers):
+        with pytest.raises(InputError, match="give the Context"):
+            call("a Simulation")
