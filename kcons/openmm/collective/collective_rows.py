@@ -19,7 +19,7 @@ from kcons.errors import (
 )
 from kcons.openmm.collective.clock import Clock
 from kcons.openmm.collective.formula_rows import as_rows
-from kcons.openmm.collective.measured_rows import TOLERANCE, variables_of
+from kcons.openmm.collective.measured_rows import TOLERANCE, require_holder, variables_of
 from kcons.openmm.collective.reported_rows import ReportedRows
 from kcons.openmm.collective.row_forces import (
     Rigid,
@@ -232,13 +232,13 @@ class CollectiveRows(ReportedRows):
         slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
-        variables = variables_of(integrator)
+        require_holder(integrator)
         if slope is not None:
-            integrator.program.set(self._of("rate", row), slope)
+            integrator.program.set(self._of("rate", row, integrator), slope)
         if self._rates[row] != 0.0:
-            slope = integrator.getGlobalVariableByName(self._of("rate", row))
-            value -= slope * self._clock(variables)
-        integrator.program.set(self._of("target", row), value)
+            slope = integrator.getGlobalVariableByName(self._of("rate", row, integrator))
+            value -= slope * self._clock(integrator)
+        integrator.program.set(self._of("target", row, integrator), value)
 
     # -- restoring and checking -----------------------------------------------------------------
 

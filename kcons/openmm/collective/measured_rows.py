@@ -16,7 +16,7 @@ from kcons.openmm.collective.row_forces import energy
 from kcons.openmm.integrator.guard import positions_of, velocities_of, width
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.states.hearing import listeners
-from kcons.openmm.integrator.system_checks import require_context
+from kcons.openmm.integrator.system_checks import groups_in, require_context
 from kcons.openmm.quantities import masses_of
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class MeasuredRows:
 
     @cached_property
     def _clock(self) -> float:
-        return 0.0 if self._owner is None else self.rows._clock(variables_of(self._owner))
+        return 0.0 if self._owner is None else self.rows._clock(self._owner)
 
     def targets(self) -> FloatArray:
         """Where each target is now, shape (n_rows,)."""
@@ -89,7 +89,7 @@ class MeasuredRows:
                 found.append(self.context.getParameter(target))
             elif self._settings:
                 moved = self.target_rates()[k] * self._clock if rows._rates[k] != 0.0 else 0.0
-                found.append(self._settings[rows._of("target", k)] + moved)
+                found.append(self._settings[rows._of("target", k, self._owner)] + moved)
             else:
                 assert target is not None
                 found.append(target)
@@ -101,7 +101,7 @@ class MeasuredRows:
             if isinstance(rate, str):
                 found.append(self.context.getParameter(rate))
             else:
-                found.append(self._settings.get(rows._of("rate", k), rate))
+                found.append(self._settings.get(rows._of("rate", k, self._owner), rate))
         return np.array(found)
 
     # -- the rows -------------------------------------------------------------------------------
@@ -234,7 +234,7 @@ class MeasuredRows:
 
 def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
-    holding = [ours for ours in listeners(context) if rows._of("push", 0) in ours.program.numbers]
+    holding = [ours for ours in listeners(context) if rows._of("push", 0, ours) in ours.program.numbers]
     if holding:  # of members of a CompoundIntegrator the one that made steps last
         return next((ours for ours in holding if getattr(ours, "identity", None) is rows.serves), holding[0])
     integrator = context.getIntegrator()
@@ -268,6 +268,4 @@ def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
 
 def applied_groups(rows: GroupRows, context: openmm.Context) -> set[int]:
     """The force groups that move the System."""
-    groups = context.getIntegrator().getIntegrationForceGroups()
-    chosen = groups if isinstance(groups, set | frozenset) else {g for g in range(32) if int(groups) >> g & 1}
-    return set(chosen) - rows.groups
+    return groups_in(context.getIntegrator()) - rows.groups

@@ -98,7 +98,7 @@ class ReportedRows(GroupRows):
 
     def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
         require_holder(integrator)
-        return np.array([integrator.getGlobalVariableByName(self._of(name, k)) for k in range(self.n_rows)])
+        return np.array([integrator.getGlobalVariableByName(self._of(name, k, integrator)) for k in range(self.n_rows)])
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         """The error for a step in which the rows failed."""

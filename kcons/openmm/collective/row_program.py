@@ -9,6 +9,7 @@ import openmm
 
 from kcons.openmm.collective.clock import Clock
 from kcons.openmm.collective.forecast import Forecast, Measured
+from kcons.openmm.collective.measured_rows import variables_of
 from kcons.openmm.collective.small_algebra import Block
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
@@ -48,8 +49,8 @@ class GroupRows(Part):
 
     # -- names in the program -------------------------------------------------------------------
 
-    def _of(self, name: str, row: int) -> str:
-        return f"{name}{self.code}_{row}"
+    def _of(self, name: str, row: int, integrator: object = None) -> str:
+        return f"{name}{self.code_in(integrator)}_{row}"
 
     def _target(self, row: int) -> str:
         """Expression of the target now."""
@@ -169,8 +170,8 @@ class GroupRows(Part):
         singular = f"select(singular{self.code}, {self.code}, 0)"
         p.let("failed", f"select(failed, failed, {singular})", "rows must be independent")
 
-    def _clock(self, variables: dict[str, float]) -> float:
-        return Clock(self.code).now(variables) if self._drives else 0.0
+    def _clock(self, integrator: openmm.CustomIntegrator) -> float:
+        return Clock(self.code_in(integrator)).now(variables_of(integrator)) if self._drives else 0.0
 
     @property
     def _pushes(self) -> str:

@@ -135,6 +135,10 @@ class Part(ABC):
     #: The integrator that the part serves, as `object` that no other has.
     serves: object = None
 
+    def code_in(self, integrator: object) -> int:
+        """Its number in an integrator, which need not be the one that it serves now."""
+        return next((k for k, part in enumerate(getattr(integrator, "parts", ()), 1) if part is self), self.code)
+
     def notes(self) -> dict[str, Any]:
         """What the program that was written last has set."""
         return {name: vars(self)[name] for name in self.written if name in vars(self)}

@@ -464,3 +464,44 @@ def test_a_torsion_in_degrees_is_refused():
         with pytest.raises(InputError, match=rf"over three turns, and in radian; give {target:g} \* unit\.degrees"):
             CollectiveRows(chain_system(), Row(dihedral(0, 1, 2, 3), target))
     assert CollectiveRows(chain_system(), Row(dihedral(0, 1, 2, 3), 60 * openmm.unit.degrees)).n_rows == 1
+
+
+def test_rows_are_asked_in_the_integrator_that_is_named():
+    """In another one, which was made later, the same part has another number: that of the other part here."""
+    x = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.5, 0], [0.4, 0.5, 0]])
+    system = openmm.System()
+    for _ in x:
+        system.addParticle(12.0)
+    forces = [openmm.CustomBondForce("r") for _ in range(2)]
+    for k, force in enumerate(forces):
+        force.addBond(2 * k, 2 * k + 1)
+    one, two = (CollectiveRows(system, [Row(force, target)]) for force, target in zip(forces, (0.3, 0.4), strict=True))
+    integrator = ProjectedIntegrator(1e-3, parts=[one, two])
+    context = context_of(system, integrator, x)
+    context.setVelocities([[0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 2, 0]])
+    integrator.step(3)
+    asked = [part.mean_multipliers(integrator) for part in (one, two)]
+    ProjectedIntegrator(1e-3, parts=[two, one])
+    assert [part.mean_multipliers(integrator) for part in (one, two)] == asked
+    one.set_target(integrator, 0, 0.31)
+    assert (one.targets(context), two.targets(context)) == (0.31, 0.4)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_copies_of_an_integrator_have_its_clock(steps):
+    """Also after a single step."""
+    x = np.array([[0, 0, 0], [0.3, 0, 0]])
+    system, force = openmm.System(), openmm.CustomBondForce("r")
+    for _ in x:
+        system.addParticle(12.0)
+    force.addBond(0, 1)
+    part = CollectiveRows(system, [Row(force, 0.3, rate=1.0)])
+    integrator = ProjectedIntegrator(1e-3, parts=[part])
+    context = context_of(system, integrator, x)
+    part.restore(context)
+    integrator.step(steps)
+    again = copy.copy(integrator)
+    other = context_of(system, again, state_of(context)[0])
+    again.parts[0].restore(other)
+    again.step(1)
+    assert again.parts[0].values(other) == pytest.approx(0.3 + 1e-3 * (steps + 1), abs=1e-12)

@@ -18,8 +18,10 @@ from kcons.openmm.integrator.step_variables import VARIABLES
 from kcons.steppers.splitting import Splitting
 
 _Kind = TypeVar("_Kind", bound=Integrator)
-#: Globals that belong to a run, not to the integrator: a copy starts without them.
-RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"lost", "two_k"}
+#: Globals that belong to a run, not to the integrator: a copy starts without them. (Clocks of targets that move, which
+#: it has, go by the number of good steps.)
+_RUN = {name for name, kind in VARIABLES.items() if kind.kind == "number"}
+RUN_STATE = frozenset(_RUN - {"good_steps"} | {"lost", "two_k"})
 
 
 def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:
@@ -179,7 +181,7 @@ class Copies(Integrator):
         return remade, (type(self), self._making(), settings_of(self))
 
     def __copy__(self) -> Self:
-        """Without the Context, and with copies of the parts: an integrator and its parts serve one Context."""
+        """Without the Context, and with copies of the parts; rows of `hold`, which the System has, are shared."""
         return remade(type(self), deepcopy(self._making()), settings_of(self))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
