@@ -19,6 +19,7 @@ rows that are fulfilled need no correction.
 from __future__ import annotations
 
 import pickle
+import uuid
 import weakref
 from collections.abc import Callable
 from typing import Any, Literal, cast
@@ -36,6 +37,7 @@ from kcons.motion.motion import Motion
 from kcons.openmm.carried.passage import Passage
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.schemes import operations_of, stages_of
+from kcons.openmm.integrator.states.hearing import wrapped
 from kcons.openmm.integrator.system_checks import ROW_NAME
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
@@ -50,7 +52,10 @@ LOW_SCALE = 2.0**27
 
 PHASES = ("remember", "land", "project")
 PREFIX = f"{ROW_NAME}s"
+#: Engines by the keys in the names of forces.
 LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
+#: Those read last, by the keys that forces bring along: that of the first System, whose copies' names begin with it.
+_READ: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
 
 
 class Engine:
@@ -101,13 +106,17 @@ class Engine:
         self._within = False
         self._error: BaseException | None = None
         self._between_steps, self._began, self._stage = True, (0.0, 0), 0
+        #: Time and step count where the present run of steps began.
+        self._ran: tuple[float, int] | None = None
+        #: The step size of that run, ps.
+        self._made_with = 0.0
         #: Whether what is lost in carrying v is carried after it, and whether that comes next.
         self.carries_rest, self._rest_to_come = False, False
         #: Whether it is known where the drift begins.
         self._begun = False
         #: Free positions of the drift and what brings them onto the rows.
         self._landing: tuple[FloatArray, FloatArray] | None = None
-        LIVE[key] = self
+        LIVE.setdefault(key, self)
 
     def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
         """Take times and step sizes from this integrator; `lean` as for parts."""
@@ -134,12 +143,15 @@ class Engine:
 
     def begin_run(self) -> None:
         """Whatever was asked between steps, the next call belongs to the beginning of one."""
-        self._between_steps, self._rest_to_come = True, False
+        self._between_steps, self._rest_to_come, self._ran = True, False, None
+        if self._made_with != self._dt:  # impulses of steps of another length are not to be mixed
+            self._made_with = self._dt
+            self._push.fill(np.nan)
 
     # -- callbacks ------------------------------------------------------------------------------
 
     def remember(self, state: openmm.State) -> FloatArray:
-        began = _time(state), state.getStepCount()
+        began = self._time(state), state.getStepCount()
         if self._between_steps or began != self._began:
             self._between_steps, self._began, self._stage, self._error = False, began, -1, None
             if self.cell is not None:
@@ -236,13 +248,24 @@ class Engine:
         self.motion.project_velocities(x, v, time=now, out=v, multipliers=multipliers)
         return v.copy() if self.whole else v[self.atoms]
 
+    def _time(self, state: openmm.State) -> float:
+        """Where a step begins. After setStepSize the clock of Reference and CPU goes on with the first step size."""
+        time, count = _number(state.getTime()), state.getStepCount()
+        self._ran = self._ran or (time, count)
+        dt = self._dt
+        expected = self._ran[0] + (count - self._ran[1]) * dt
+        return expected if abs(time - expected) > 1e-6 * dt else time
+
+    @property
+    def _dt(self) -> float:
+        integrator = self._integrator()
+        return 0.0 if integrator is None else _number(integrator.getStepSize())
+
     def _times(self, stage: int) -> tuple[float, float, float]:
         """Beginning, end and length of a drift."""
         if not self.timed:
             return 0.0, 0.0, 0.0
-        integrator = self._integrator()
-        dt = 0.0 if integrator is None else _number(integrator.getStepSize())
-        start = self._began[0]
+        dt, start = self._dt, self._began[0]
         stage = min(max(stage, 0), len(self._fractions) - 1)
         return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
 
@@ -292,7 +315,7 @@ class Engine:
                 "multipliers(context) gives those of any state",
                 item="scheme",
             )
-        dt = _number(integrator.getStepSize())
+        dt = self._made_with
         return np.asarray(self._impulse / dt**2 - (0.0 if whole else self._push_before / dt))
 
     def explained_error(self, step: int) -> KconsError:
@@ -341,10 +364,32 @@ class Callback:
 
 
 def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
-    engine = LIVE.get(key) if recipe is None else Engine(key, *recipe)
+    engine = _READ.get(key) if recipe is None else Engine(key, *recipe)
     if engine is None:
         raise pickle.UnpicklingError(f"the force '{force_name(PHASES[0], key)}' must be read first")
+    _READ[key] = engine
     return Callback(engine, phase)
+
+
+def _read(original: Callable[..., openmm.System], given: Any) -> openmm.System:
+    """A System from XML, or a copy: its rows get a key of their own, by which no other copy's are found."""
+    system = original(given)
+    keys: dict[str, str] = {}
+    for force in system.getForces():
+        if isinstance(force, openmm.PythonForce) and force.getName().startswith(PREFIX):
+            phase, key = force.getName().split()[-2:]
+            first = key.partition("-")[0]
+            if key not in keys and first in _READ:
+                keys[key] = f"{first}-{uuid.uuid4().hex}"
+                LIVE[keys[key]] = _READ[first]
+                _READ[first].key = keys[key]
+            force.setName(force_name(phase, keys.get(key, key)))
+    return system
+
+
+for _name in ("deserializeSystem", "_cloneSystem"):
+    setattr(openmm.XmlSerializer, _name, staticmethod(wrapped(getattr(openmm.XmlSerializer, _name), _read)))
+openmm.System.__copy__ = wrapped(openmm.System.__copy__, _read)
 
 
 # -- what OpenMM gives ----------------------------------------------------------------------------
@@ -352,10 +397,6 @@ def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
 
 def _number(quantity: unit.Quantity) -> float:
     return float(quantity.value_in_unit(unit.picosecond))
-
-
-def _time(state: openmm.State) -> float:
-    return _number(state.getTime())
 
 
 def cell_of(vectors: Any) -> FloatArray:

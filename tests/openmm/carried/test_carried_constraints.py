@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import openmm
 import pytest
@@ -9,8 +12,9 @@ from carried_systems import PEPTIDE, PEPTIDE_FILE, context_of, free, peptide, pu
 from openmm import app, unit
 
 from kcons.constraints import Distance, FixedAtoms, Sphere
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import hold
 from kcons.steppers import BlanesMoan6, Rattle, System
 
@@ -204,3 +208,112 @@ def test_dumbbell_turns_rigidly():
     angle = steps * np.arcsin(dt)
     x, _ = state_of(context)
     assert np.abs(x[1] - [0.5 * np.cos(angle), 0.5 * np.sin(angle), 0.2 * dt * steps]).max() <= 1e-12
+
+
+def _longer(t):
+    return 0.3 + 0.05 * t
+
+
+def driven():
+    """Two particles, a distance that grows."""
+    x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
+    system = free([12.0, 12.0])
+    return system, hold(system, Distance([[0, 1]], _longer), x), x
+
+
+def begun(system, part, x):
+    integrator = ProjectedIntegrator(0.01, parts=[part])
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.applyVelocityConstraints(context)
+    return integrator, context
+
+
+def off_target(context):
+    x = state_of(context)[0]
+    return abs(np.linalg.norm(x[0] - x[1]) - _longer(context.getTime()._value))
+
+
+@pytest.mark.parametrize("calls", [[40], [1, 2, 3]])
+def test_targets_move_with_the_time_after_a_new_step_size(calls):
+    """On Reference and CPU, OpenMM's clock goes on with the first step size within a call."""
+    integrator, context = begun(*driven())
+    integrator.step(20)
+    integrator.setStepSize(0.005)
+    for steps in calls:
+        integrator.step(steps)
+        assert off_target(context) < 1e-12
+
+
+def test_steps_within_a_call_have_the_time_of_a_new_step_size():
+    """Targets moved with the old one in the middle of a call, and leapt back before its end."""
+    seen = []
+
+    def target(t):
+        seen.append(t)
+        return 0.3 + 0.05 * t
+
+    x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
+    system = free([12.0, 12.0])
+    integrator, _ = begun(system, hold(system, Distance([[0, 1]], target), x), x)
+    integrator.step(20)
+    integrator.setStepSize(0.005)
+    seen.clear()
+    integrator.step(40)
+    np.testing.assert_allclose(seen[:38], 0.2 + 0.005 * np.arange(1, 39), rtol=0, atol=1e-12)
+
+
+def test_copies_of_a_system_have_engines_of_their_own():
+    """All that `of` found was the engine of the copy made last: targets moved with a time of another Context."""
+    system, part, x = driven()
+    first = copy.deepcopy(system)
+    others = [system, first, copy.deepcopy(first), openmm.XmlSerializer.clone(system)]
+    parts = [CarriedConstraints.of(other) for other in others]
+    assert parts[0].motion is part.motion
+    assert len({id(each.motion) for each in parts}) == 4
+    for other, each in zip(others, parts, strict=True):
+        integrator, context = begun(other, each, x)
+        integrator.step(7)
+        assert off_target(context) < 1e-12
+
+
+def test_copies_of_an_integrator_take_turns_with_the_rows_of_the_system():
+    system, part, x = driven()
+    integrator, context = begun(system, part, x)
+    integrator.step(5)
+    other = copy.deepcopy(integrator)
+    again = context_of(system, other)
+    again.setPositions(x)
+    other.applyVelocityConstraints(again)
+    other.setStepSize(0.004)
+    for _ in range(2):
+        for one, place in ((other, again), (integrator, context)):
+            one.step(5)
+            assert off_target(place) < 1e-12
+
+
+def test_rows_are_no_others_in_a_copy_of_the_system():
+    system, part, x = driven()
+    integrator = ProjectedIntegrator(0.01, parts=[part])
+    copied = context_of(copy.deepcopy(system), integrator)
+    copied.setPositions(x)
+    with pytest.raises(InputError, match=r"CarriedConstraints\.of\(copy\)"):
+        integrator.step(1)
+    with pytest.raises(UnsupportedError, match="pickle the System"):
+        pickle.dumps(integrator)
+
+
+def test_multipliers_of_a_step_have_its_length():
+    system = free([12.0, 12.0])
+    x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
+    part = hold(system, Distance([[0, 1]], 0.3), x)
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    context.setVelocities([[0, 1, 0], [0, -1, 0]])
+    integrator.step(10)
+    made = part.step_multipliers
+    integrator.setStepSize(0.001)
+    np.testing.assert_array_equal(part.step_multipliers, made)
+    integrator.step(3)
+    np.testing.assert_allclose(part.step_multipliers, made, rtol=1e-3)
