@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
@@ -91,13 +91,21 @@ def instantaneous_pressure(
     Raises
     ------
     InputError
-        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume.
+        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume; pieces of another system.
     UnsupportedError
         There is no stress, or a piece is held in space.
     NonFiniteError
         An energy or a stress is not finite.
     """
     refuse_virial(virial, thermal_energy)
+    refuse_other(system, CellSystem, "system", "a CellSystem, which knows its cell")
+    if pieces is not None:
+        refuse_other(pieces, Pieces, "pieces", "what find_pieces or barostat.pieces gives")
+        if len(pieces.label) != system.n_atoms:
+            raise InputError(
+                f"pieces are those of {len(pieces.label)} atoms, and the system has {system.n_atoms}; find its own",
+                item="pieces",
+            )
     x, v, _ = system.taken(state)
     cell = system.cell
     volume = system.volume

@@ -10,7 +10,7 @@ from kcons.constraints import Distance, MovingTarget
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
-from kcons.steppers import run
+from kcons.steppers import System, run
 from kcons.thermostats import Langevin, thermal_velocities
 from kcons.thermostats.pressure import (
     CellSystem,
@@ -161,6 +161,15 @@ def test_bonds_make_pieces():
 
 def test_what_is_refused():
     system, state = started()
+    for wrong, match in ((3, "pieces is 3"), (started(n=3)[0], "pieces is <")):
+        with pytest.raises(InputError, match=match):
+            instantaneous_pressure(system, state, pieces=wrong)
+    few, there = started(n=3)
+    with pytest.raises(InputError, match="pieces are those of 9 atoms"):
+        pieces = find_pieces(few, there.positions, np.ones(3, dtype=bool))
+        instantaneous_pressure(system, state, pieces=pieces, thermal_energy=1.0)
+    with pytest.raises(InputError, match="CellSystem"):
+        instantaneous_pressure(System(system.motion), state)
     with pytest.raises(InputError, match="virial"):
         instantaneous_pressure(system, state, "viral")
     x = state.positions
