@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from ase import units
 from ase.build import bulk
+from ase.calculators.calculator import all_changes
 from ase.calculators.emt import EMT
 from ase.constraints import Hookean
 from ase_systems import FS, TEMPERATURE, Field, Free, dumbbells, follow
@@ -155,6 +156,23 @@ def test_the_energy_that_trials_bring_is_accounted_for(which, kind):
     if kind == "flexible":
         assert atoms.cell.array[0, 1] == atoms.cell.array[0, 2] == atoms.cell.array[1, 2] == 0
         assert which == "monte carlo" or abs(atoms.cell.array[2, 0]) > 1e-4
+
+
+class WarmElectrons(Free):
+    """A free energy that fixes the cell, and an energy that knows nothing of it."""
+
+    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        self.results["free_energy"] = 1e3 * (atoms.get_volume() / SIDE**3 - 1) ** 2
+
+
+def test_trials_are_judged_by_the_energy_that_forces_belong_to():
+    """They went by the energy that is extrapolated to cold electrons."""
+    atoms, _ = gas()
+    atoms.calc = WarmElectrons()
+    dyn = MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, every=1, width=0.01, seed=1))
+    volumes = follow(dyn, atoms.get_volume, 100)
+    assert 0 < np.abs(volumes / SIDE**3 - 1).max() < 0.06
 
 
 def test_forces_after_a_trial_are_those_in_the_new_cell():
