@@ -183,3 +183,19 @@ def test_what_is_refused():
     with pytest.raises(NonFiniteError, match="inf and inf"):
         instantaneous_pressure(endless, endless.initial_state(x), "difference", thermal_energy=1.0)
     assert np.array_equal(endless.cell, SIDE * np.eye(3))
+
+
+@pytest.mark.parametrize("kind", ["normal", "lateral", "isotropic"])
+def test_the_mean_is_the_pressure_that_the_barostat_keeps(kind):
+    """Along the axes it changes: differences scaled the others as well, and the mean had a third of each axis."""
+    system, state = started()
+    barostat = MonteCarloBarostat(0.02, kind=kind)
+    pieces, axes = barostat.pieces(system, state.positions), barostat.strains.axes
+    whole = instantaneous_pressure(system, state, pieces=pieces)
+    seen = {}
+    for virial in ("molecular", "difference"):
+        seen[virial] = PressureObserver(system, virial, pieces=pieces)
+        seen[virial](state)
+    assert seen["molecular"].mean == pytest.approx(np.diagonal(whole)[axes].mean(), rel=1e-12)
+    assert seen["difference"].mean == pytest.approx(seen["molecular"].mean, rel=1e-5)
+    assert kind == "isotropic" or seen["molecular"].mean != pytest.approx(np.trace(whole) / 3, rel=1e-3)
