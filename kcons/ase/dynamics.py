@@ -19,6 +19,7 @@ from kcons.ase.binding import (
     FORCES_ONLY,
     Answers,
     Binding,
+    applied_energy,
     applied_forces,
     bind,
     in_step,
@@ -338,15 +339,9 @@ class ConstrainedDynamics(MolecularDynamics):
         return System(motion, self._force, potential=self._energy, friction=self._friction, far=FAR)
 
     def _energy(self, x: FloatArray, time: float) -> float:
-        """Of the calculator, and of Hookean and ExternalForce; the one that forces and stress are derivatives of."""
+        """Of the calculator, and of Hookean and ExternalForce."""
         self.atoms.arrays["positions"][...] = x
-        energy = float(self.atoms.get_potential_energy(apply_constraint=self._only_forces))
-        found = getattr(self.atoms.calc, "results", {})
-        free = found.get("free_energy")
-        # Where electrons have a temperature, "energy" is extrapolated to zero; both may be infinite.
-        if free is not None and "energy" in found and free != found["energy"]:
-            energy += float(free - found["energy"])
-        return energy
+        return applied_energy(self.atoms, self._only_forces)
 
     def _force(self, x: FloatArray, time: float) -> Any:
         self.atoms.arrays["positions"][...] = x
