@@ -193,6 +193,17 @@ def applied_forces(atoms: Atoms) -> FloatArray:
     return forces
 
 
+def applied_energy(atoms: Atoms, only_forces: bool) -> float:
+    """The energy of which forces and stress are derivatives; with that of ASE objects where these add forces."""
+    energy = float(atoms.get_potential_energy(apply_constraint=only_forces))
+    found = getattr(atoms.calc, "results", {})
+    free = found.get("free_energy")
+    # Where electrons have a temperature, "energy" is extrapolated to zero; both may be infinite.
+    if free is not None and "energy" in found and free != found["energy"]:
+        energy += float(free - found["energy"])
+    return energy
+
+
 class Answers:
     """Calculators, their settings, and where each keeps what it found last: another object after other questions.
 

@@ -11,7 +11,7 @@ from ase.calculators.calculator import Calculator, PropertyNotImplementedError, 
 from numpy.typing import NDArray
 
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure.virial import VOIGT
+from kcons.ase.pressure.virial import VOIGT, refuse_filters
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
@@ -109,6 +109,7 @@ class ConstrainedCalculator(Calculator):
                 stress = np.array(numbers(results["stress"], "stress of the calculator"))
                 if stress.shape == (3, 3):
                     stress = stress[VOIGT]
+                refuse_filters(motion, x)
                 virial = constraint_virial(motion, x, np.zeros_like(x), forces)
                 results["stress"] = stress - virial[VOIGT] / work.get_volume()
         if any(value is None for value in results.values()):

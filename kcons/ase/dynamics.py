@@ -19,6 +19,7 @@ from kcons.ase.binding import (
     FORCES_ONLY,
     Answers,
     Binding,
+    applied_energy,
     applied_forces,
     bind,
     in_step,
@@ -340,7 +341,7 @@ class ConstrainedDynamics(MolecularDynamics):
     def _energy(self, x: FloatArray, time: float) -> float:
         """Of the calculator, and of Hookean and ExternalForce."""
         self.atoms.arrays["positions"][...] = x
-        return float(self.atoms.get_potential_energy(apply_constraint=self._only_forces))
+        return applied_energy(self.atoms, self._only_forces)
 
     def _force(self, x: FloatArray, time: float) -> Any:
         self.atoms.arrays["positions"][...] = x

@@ -63,6 +63,8 @@ class ThermostattedDynamics(ConstrainedDynamics):
         before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
         try:
             super().__init__(atoms, timestep, stepper, **kwargs)
+            if self.barostat is not None and self._state is not None:
+                self.barostat.variables_of(self._state)  # before anything is changed by a state of another one
             self._begin()
         except BaseException:
             atoms.set_positions(before[0], apply_constraint=False)

@@ -247,10 +247,10 @@ class Recorder:
         self.last: Sample | None = None
 
     def __call__(self, state: State) -> None:
-        forces = state.forces
+        x, v, forces = self.system.taken(state)  # in the cell of the state
         if forces is None:
-            forces = self.system.forces(state.positions, state.velocities, state.time, state.step)
-        self.last = self.coordinates.sample(state.positions, state.velocities, forces, state.time)
+            forces = self.system.forces(x, v, state.time, state.step)
+        self.last = self.coordinates.sample(x, v, forces, state.time)
         self.series.append(self.last)
 
     @property

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.motion.motion import Motion
+from kcons.steppers import State
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import (
@@ -286,6 +288,26 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
         text = "boxes of MDAnalysis are periodic in all directions; this cell is not"
         warnings.warn(text, UserWarning, stacklevel=stacklevel)
     require_standard_form(cell, "MDAnalysis")
+
+
+def cell_of(state: State, motion: Motion | None) -> FloatArray | None:
+    """The cell that a state is written with, and its residuals are found in; None without one.
+
+    Raises
+    ------
+    InputError
+        A barostat has changed the cell of `motion` since.
+    """
+    cell, lattice = state.cell, None if motion is None else motion.lattice
+    if lattice is None:
+        return cell
+    if cell is not None and not (cell == lattice[0])[lattice[1].any(axis=0)].all():
+        raise InputError(
+            "the state is in another cell than its System is now; write states during the run, or call "
+            "system.enter(state) before",
+            item="state",
+        )
+    return lattice[0]
 
 
 def host_of(whole: Any) -> str:

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
-from kcons.mdanalysis.topology import check_box
+from kcons.mdanalysis.topology import cell_of, check_box
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 
@@ -187,13 +187,13 @@ class TrajectoryWriter:
 
     def __call__(self, state: State) -> None:
         """Write a state; for `kcons.steppers.run(..., observers=[writer])`."""
-        lattice = None if self.motion is None else self.motion.lattice
+        cell = cell_of(state, self.motion)
         self._expects_forces = True  # at the latest after the first step
         self.write(
             state.positions,
             state.velocities,
             time=state.time,
-            cell=None if lattice is None else lattice[0],
+            cell=cell,
             forces=state.forces,
             step=state.step,
         )

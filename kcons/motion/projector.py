@@ -106,18 +106,30 @@ class Projector:
             have to be found anew; nothing was changed.
         ImageError
             Atoms of a row that nothing ties together are half the box apart at `positions`.
+        ContradictionError
+            A row between fixed atoms is off in this cell: it lies across a face that moves, and the atoms stay.
         """
         held = self.constraint_set
         before = held.lattice
         try:
             held.with_cell(cell, pbc)
             held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"), before)
+            self._share(held.lattice)
         except KconsError:
             held.lattice = before
             raise
-        # The solvers take the lattice at each call.
-        self._given.lattice = self._local.lattice = self._lattice = held.lattice
         self._solve.unchecked = before if positions is None else None
+
+    def _share(self, lattice: FloatArray | None) -> None:
+        """Let all sets have this lattice, which the solvers take at each call."""
+        before, self._lattice, self._local.lattice = self._lattice, lattice, lattice
+        try:
+            self.plan.check_cell()
+        except KconsError:
+            self._lattice = before
+            raise
+        finally:
+            self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
 
     @property
     def sources(self) -> tuple[ConstraintSet, ConstraintSet]:
@@ -130,9 +142,9 @@ class Projector:
             return self._lattice
         for source in (self._given, self.constraint_set):
             if source.lattice is not self._lattice:
-                self._solve.unchecked = self._lattice
-                self._lattice = source.lattice
-                self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
+                before = self._lattice
+                self._share(source.lattice)
+                self._solve.unchecked = before
         return self._lattice
 
     # -- positions and velocities ---------------------------------------------------------------

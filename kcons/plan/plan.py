@@ -60,6 +60,8 @@ class Plan:
         Rows of each cluster in which rows may depend on each other.
     loose : ndarray of int or None
         Rows between fixed atoms that motion of these may break.
+    resting : tuple of ndarray of int and of positions, or None
+        Rows between fixed atoms at rest, which another cell may break, and positions of the set-up.
     late : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
@@ -78,6 +80,7 @@ class Plan:
     kinds: list[ClusterKind] = field(default_factory=list)
     dependent: list[IntArray] = field(default_factory=list)
     loose: IntArray | None = None
+    resting: tuple[IntArray, FloatArray] | None = None
     whole: list[bool] = field(default_factory=list)
     late: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     _places: FloatArray | None = None
@@ -104,23 +107,36 @@ class Plan:
         """
         if self.loose is None:
             return
-        whole = self.constraint_set
+        self._require_fulfilled(self.loose, x, time)
+        speed = self.constraint_set.velocity_target(x, time)
+        v = np.zeros_like(x)
+        v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
+        self.check_loose_rates(x, v, speed, time, "velocity")
+
+    def check_cell(self) -> None:
+        """Refuse the present cell where it breaks rows between fixed atoms at rest, which no solver sees.
+
+        Raises
+        ------
+        ContradictionError
+            Such a row is off: the atoms stay, and an image of one of them does not.
+        """
+        if self.resting is not None:
+            self._require_fulfilled(*self.resting, 0.0, " in this cell")
+
+    def _require_fulfilled(self, rows: IntArray, x: FloatArray, time: float, where: str = "") -> None:
         with np.errstate(invalid="ignore"):
-            found = whole.residuals(x, None, time)
+            found = self.constraint_set.residuals(x, None, time)
         miss = np.abs(found.sigma)
-        bad = self.loose[~(miss[self.loose] <= found.allowed[self.loose])]
+        bad = rows[~(miss[rows] <= found.allowed[rows])]
         if len(bad):
             row = int(bad[0])
             raise ContradictionError(
-                f"row {self.named.row_name(row)} lies between fixed atoms and is off by {miss[row]:g}; "
+                f"row {self.named.row_name(row)} lies between fixed atoms and is off by {miss[row]:g}{where}; "
                 "remove it or free one of its atoms",
                 rows=[row],
                 atoms=self.named.row_atoms(row),
             )
-        speed = whole.velocity_target(x, time)
-        v = np.zeros_like(x)
-        v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
-        self.check_loose_rates(x, v, speed, time, "velocity")
 
     def check_loose_rates(self, x: FloatArray, y: FloatArray, rates: FloatArray | None, time: float, what: str) -> None:
         """Refuse rows between fixed atoms only whose A y, with the y of these atoms, is not `rates`.
@@ -228,6 +244,7 @@ def make_plan(
         in_place[pinned] = plan.pinned_targets(constraint_set.target(time))
         plan.check_loose_rows(in_place, time)
         if not constraint_set.moving:
+            plan.resting = (plan.loose, in_place)
             plan.loose = None
     whole_positions = constraint_set.whole(positions)
     for shape, whole in _shapes(constraint_set, labels, inverse_masses):

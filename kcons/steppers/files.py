@@ -108,6 +108,8 @@ def checked_state(values: dict[str, Any]) -> dict[str, Any]:
             values[name] = as_array(values[name], shape, name)
     for name in {"thermostat", "barostat"} & set(values):
         values[name] = np.atleast_1d(numbers(values[name], name))
+    if len(values.get("barostat", range(9))) < 9:
+        raise ValueError(f"barostat has {len(values['barostat'])} numbers, which are no cell")
     for name, kind in (("time", float | int), ("time_remainder", float | int), ("step", int)):
         if not isinstance(values.get(name, 0), kind):
             raise ValueError(f"{name} is {values[name]!r:.40}")

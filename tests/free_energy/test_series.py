@@ -9,7 +9,7 @@ from kcons import ConstraintSet, Motion, System, run
 from kcons.constraints import Dihedral, Distance, MovingTarget
 from kcons.errors import InputError
 from kcons.free_energy import HeldCoordinates, Recorder, Sample, Series
-from kcons.thermostats import Langevin
+from kcons.thermostats import CellSystem, ConstantPressure, Langevin, MonteCarloBarostat
 
 X = np.array([[0.0, 0.1, 0.2], [1.1, 0.0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9]])
 M = np.array([1.0, 12.0, 14.0, 2.0])
@@ -41,6 +41,21 @@ def test_a_run_records_by_name():
     # A second recorder may go on where another stopped.
     again = Recorder(recorder.system, recorder.coordinates, series)
     assert again.series is series and again.multipliers == {}
+
+
+def test_states_of_a_barostat_are_measured_in_their_own_cell():
+    """Also those that were kept: across a face the distance was off by what the cell had changed since."""
+    x = np.array([[1.0, 5, 5], [9.0, 5, 5], [5.0, 5, 5]])
+    held = {"gap": Distance([[0, 1]])}
+    motion = Motion(ConstraintSet([*held.values()], x, np.ones(3), cell=[10.0] * 3), x)
+    system = CellSystem(motion)
+    recorder = Recorder(system, HeldCoordinates(motion, held, x))
+    stepper = ConstantPressure(Langevin(1.0, 1.0, seed=1), MonteCarloBarostat(0.01, every=1, width=0.2))
+    kept = run(system, system.initial_state(x), 0.01, 9, stepper=stepper, record=3)
+    assert len({frame.cell[0, 0] for frame in kept.frames}) > 1
+    for frame in kept.frames:
+        recorder(frame)
+    np.testing.assert_allclose(recorder.series.value, 2.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("coordinate", ["length", "torsion"])

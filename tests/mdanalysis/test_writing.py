@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,23 @@ def test_core_runs(tmp_path, ending):
             np.testing.assert_allclose(ts.velocities, s.velocities, atol=1e-4)
     check = ConstraintCheck(universe, Distance(files.pairs(N), files.targets(N)), tolerance=0.0).run().check
     assert check.status == "kept", check.verdict
+
+
+def test_a_state_goes_with_its_own_cell(tmp_path):
+    """States that were kept were written with the last cell of the run."""
+    _, state, motion = system()
+    there = replace(state, barostat=1.1 * motion.lattice[0].ravel())
+    with TrajectoryWriter(tmp_path / "run.xtc", 3 * N, motion=motion) as writer:
+        writer(state)
+        with pytest.raises(InputError, match="another cell than its System"):
+            writer(there)
+        motion.set_cell(there.cell)
+        writer(there)
+    with TrajectoryWriter(tmp_path / "alone.xtc", 3 * N) as writer:
+        writer(there)
+    for name, sides in (("run.xtc", [12.0, 13.2]), ("alone.xtc", [13.2])):
+        found = [float(ts.dimensions[0]) for ts in read(tmp_path / name).trajectory]
+        np.testing.assert_allclose(found, sides, rtol=1e-5)
 
 
 def test_observables_of_h5md(tmp_path):

@@ -225,6 +225,7 @@ def test_a_file_that_ends_early_is_refused(saved: bytes) -> None:
         ("forces", np.zeros((2, 3), dtype="U3")),
         ("step", 0.5),
         ("time", "now"),
+        ("barostat", np.ones(5)),
     ],
 )
 def test_arrays_that_no_step_can_take_are_refused(name: str, value, tmp_path: Path) -> None:

@@ -7,14 +7,15 @@ from typing import IO, Any
 
 import numpy as np
 from ase import units
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure
-from kcons.thermostats.pressure.measured import Virial, refuse_virial
+from kcons.thermostats.pressure.measured import Virial, mean_pressure, refuse_virial
+from kcons.thermostats.pressure.pieces import Held
 
 
 class PressureReporter:
@@ -25,7 +26,7 @@ class PressureReporter:
     dynamics : ConstrainedDynamics
         Or any of the thermostats. It needs no barostat.
     file : path or text file, optional
-        Where to write time (fs), volume (A^3) and pressure (bar), a line for each call.
+        Where to write time (fs), volume (A^3) and pressure (bar, as in `mean`), a line for each call.
     virial : {'molecular', 'atomic', 'difference'}
         See `kcons.thermostats.instantaneous_pressure`; 'difference' is for calculators without stress.
     molecules : array_like of int, shape (n, 2), optional
@@ -79,14 +80,19 @@ class PressureReporter:
         )
         self.volumes.append(float(atoms.get_volume()))
         if self._file is not None:
-            bar = np.trace(self.values[-1]) / 3 / units.bar
+            bar = mean_pressure(self.values[-1:], self._axes) / units.bar
             line = f"{dynamics.get_time() / units.fs:.3f} {self.volumes[-1]:.6f} {bar:.6g}"
             print(line, file=self._file, flush=True)
 
     @property
     def mean(self) -> float:
-        """Of the pressure, in eV/A^3."""
-        return float(np.mean([np.trace(value) / 3 for value in self.values]))
+        """Of the pressure, in eV/A^3, along the axes that a barostat changes."""
+        return mean_pressure(self.values, self._axes)
+
+    @property
+    def _axes(self) -> NDArray[np.bool_]:
+        barostat = getattr(self.dynamics, "barostat", None)
+        return np.ones(3, dtype=bool) if barostat is None else barostat.strains.axes
 
     def _system(self) -> tuple[AtomsSystem, Pieces | None]:
         dynamics, motion = self.dynamics, self.dynamics.motion
@@ -99,6 +105,7 @@ class PressureReporter:
                 if barostat is not None and self.molecules is None:
                     pieces = barostat.pieces(dynamics._systems(), x, dynamics.time)
                 else:
-                    pieces = find_pieces(system, x, np.ones(3, dtype=bool), self.molecules, time=dynamics.time)
+                    held: Held = "refuse" if barostat is None else barostat.held
+                    pieces = find_pieces(system, x, self._axes, self.molecules, held, dynamics.time)
             self._known = motion, system, pieces
         return self._known[1:]

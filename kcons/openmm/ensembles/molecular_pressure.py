@@ -9,10 +9,10 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints.arguments import finite_number, positive, whole_number
+from kcons.constraints.arguments import finite_number, positive, refuse_other, whole_number
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.openmm.quantities import masses_of
@@ -43,13 +43,16 @@ def molecular_pressure(
     Raises
     ------
     InputError
-        The System is not periodic; a temperature that is not positive, a strain that is none.
+        No Context; the System is not periodic; a temperature that is not positive, a strain that is none.
+    NonFiniteError
+        An energy is not finite.
     UnsupportedError
         Rows of a part hold several molecules together, or one in space.
     """
     thermal = None if temperature is None else GAS_CONSTANT * positive(kelvins(temperature), "temperature")
     if not 0 < finite_number(strain, "strain") < 1:
         raise InputError(f"strain is {strain}; give a small number above zero, such as 0.001", item="strain")
+    refuse_other(context, openmm.Context, "context", "an openmm.Context, such as simulation.context")
     system = context.getSystem()
     if not system.usesPeriodicBoundaryConditions():
         raise InputError("a System without periodic boundaries has no pressure", item="context")
@@ -79,6 +82,12 @@ def molecular_pressure(
     finally:
         context.setPeriodicBoxVectors(*box)
         context.setPositions(x)
+    if not np.isfinite(energies).all():
+        raise NonFiniteError(
+            f"energies of a cell a little larger and smaller are {energies[0]} and {energies[1]}, which have no "
+            "difference: particles overlap, or the Context has no positions yet",
+            item="energy",
+        )
     total = np.bincount(label, masses, n)
     heavy = total > 0
     if thermal is None:

@@ -296,12 +296,20 @@ def check_system(system: openmm.System) -> None:
     UnsupportedError
         Particles or forces that need an integrator of their own, a barostat that scales atoms one by one although
         bonds are held, rigid triangles that OpenMM's solver gets wrong.
+    InputError
+        The pressure of a barostat is not finite.
     """
     _refuse_lopsided(SystemRows.of(system))
     for force in forces_of(system):
         name = type(force).__name__
         if name in _FOREIGN:
             raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
+        if name in BAROSTATS and not np.isfinite(force.getDefaultPressure()._value).all():
+            raise InputError(
+                f"the {name} has a pressure of {force.getDefaultPressure()}, by which it would accept every trial; "
+                "give a finite one",
+                item="pressure",
+            )
         if system.getNumConstraints() and _scales_atoms(force):
             raise UnsupportedError(f"the System has constraints, and {_ATOM_BY_ATOM}")
 

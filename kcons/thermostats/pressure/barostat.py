@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -22,10 +23,11 @@ from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
 from kcons.thermostats.pressure.strains import Kind, Strains
 
-#: In `State.barostat`: the cell, the work of accepted trials, then for each mode trials, their summed probability of
-#: acceptance, and what the barostat adapts.
+#: In `State.barostat`: the cell, the work of accepted trials, a number for the class and kind of the barostat, then for
+#: each mode trials, their summed probability of acceptance, and what the barostat adapts.
 WORK = 9
-MODES = 10
+OWNER = 10
+MODES = 11
 
 
 @dataclass(frozen=True)
@@ -180,21 +182,48 @@ class Barostat:
             self._pieces[system] = known
         return known
 
-    def goes_on_from(self, variables: FloatArray) -> bool:
-        """Whether these are variables of a barostat of this kind."""
-        return variables.shape == (MODES + 3 * len(self.strains),)
+    @cached_property
+    def _owner(self) -> float:
+        return float(zlib.crc32(f"{type(self).__name__} {self.strains.kind}".encode()))
+
+    def variables_of(self, state: State) -> FloatArray | None:
+        """Those that a state carries; None where no barostat has begun.
+
+        Raises
+        ------
+        InputError
+            They are those of a barostat of another class or kind.
+        """
+        known = state.barostat
+        if known is None or len(known) <= WORK:
+            return None
+        if known.shape != (MODES + 3 * len(self.strains),) or known[OWNER] != self._owner:
+            raise InputError(
+                f"the state carries variables of another barostat, not of {self!r}; start with "
+                f"dataclasses.replace(state, barostat=state.barostat[:{WORK}]), which is its cell",
+                item="barostat",
+            )
+        return known
 
     def begin(self, system: CellSystem) -> FloatArray:
         """Variables of a run that begins in the system's present cell."""
         variables = np.zeros(MODES + 3 * len(self.strains))
         variables[:WORK] = system.cell.ravel()
+        variables[OWNER] = self._owner
         return variables
 
     def acceptance(self, state: State) -> FloatArray:
-        """Mean probability of acceptance of each mode so far; NaN before the first trial."""
-        if not has_begun(state):
+        """Mean probability of acceptance of each mode so far; NaN before the first trial.
+
+        Raises
+        ------
+        InputError
+            As `variables_of`.
+        """
+        known = self.variables_of(state)
+        if known is None:
             return np.full(len(self.strains), np.nan)
-        tried, taken = self._modes(state.barostat)[:2]
+        tried, taken = self._modes(known)[:2]
         with np.errstate(invalid="ignore"):
             return np.asarray(taken / tried)
 
@@ -324,11 +353,6 @@ def _added(x: FloatArray, d: FloatArray, remainder: FloatArray | None) -> tuple[
         return y, None
     part = y - x
     return y, remainder + ((x - (y - part)) + (d - part))
-
-
-def has_begun(state: State) -> bool:
-    """Whether a state carries variables of a barostat, besides its cell."""
-    return state.barostat is not None and len(state.barostat) > WORK
 
 
 def require_barostat(given: object) -> Barostat:

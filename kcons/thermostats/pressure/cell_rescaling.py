@@ -47,9 +47,6 @@ class CellRescaling(Barostat):
         self.tau = positive(tau, "tau")
         self.compressibility = positive(compressibility, "compressibility")
 
-    def goes_on_from(self, variables: FloatArray) -> bool:
-        return super().goes_on_from(variables) and not self._modes(variables)[2].any()
-
     def _drift(
         self, system: CellSystem, pieces: Pieces, place: Place, time: float, thermal_energy: float, dt: float
     ) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, check_call
+from kcons.constraints.arguments import as_array, check_call, numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -71,7 +71,7 @@ class CellSystem(System):
         super().__init__(
             motion,
             None if force is None else (lambda x, t: force(x, t, self.cell)),
-            potential=None if potential is None else (lambda x, t: float(np.asarray(potential(x, t, self.cell)))),
+            potential=None if potential is None else (lambda x, t: _number(potential(x, t, self.cell))),
             far=far,
         )
 
@@ -109,7 +109,9 @@ class CellSystem(System):
             As `Motion.set_cell`; nothing was changed.
         """
         self.motion.set_cell(cell, self._pbc, positions)
-        self._matrix = np.array(cell)
+        lattice = self.motion.lattice
+        assert lattice is not None  # some direction is periodic
+        self._matrix = lattice[0].copy()
 
     def initial_state(
         self,
@@ -132,7 +134,7 @@ class CellSystem(System):
             As `set_cell`.
         """
         cell = state.cell
-        if cell is not None and not (cell == self.cell).all():
+        if cell is not None and not (cell == self.cell)[self.periodic].all():
             self.set_cell(cell.copy(), state.positions.copy())  # arrays of a state that is shown cannot be written to
 
     def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
@@ -151,11 +153,16 @@ class CellSystem(System):
         Raises
         ------
         NonFiniteError
-            It is NaN.
+            It is NaN, or minus infinity.
+        InputError
+            It is no number.
         """
         found = 0.0 if self.potential is None else float(self.potential(x, time))
-        if np.isnan(found):
-            error = NonFiniteError(f"the potential energy is NaN in a trial cell at step {step}")
+        if not found > -np.inf:
+            error = NonFiniteError(
+                f"the potential energy is {found} at step {step}, by which no trial cell can be judged: look at what "
+                "the force field returned"
+            )
             error.step = step
             raise error
         return found
@@ -180,3 +187,12 @@ class CellSystem(System):
         if not np.isfinite(found).all():
             raise NonFiniteError("the stress is not finite: look at what the force field returned")
         return 0.5 * (found + found.T)
+
+
+def _number(energy: ArrayLike) -> float:
+    found = numbers(energy, "potential")
+    if found.ndim:
+        raise InputError(
+            f"the potential function returned shape {found.shape}; it must return one number", item="potential"
+        )
+    return float(found)

@@ -13,7 +13,7 @@ from kcons.steppers.stepper import Listed
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
-from kcons.thermostats.pressure.barostat import WORK, Barostat, has_begun, require_barostat
+from kcons.thermostats.pressure.barostat import WORK, Barostat, require_barostat
 from kcons.thermostats.pressure.cell_system import CellSystem
 
 
@@ -85,17 +85,11 @@ class ConstantPressure(Listed):
         Raises
         ------
         UnsupportedError, InputError
-            As `check`, and as `Barostat.pieces`; the state carries variables of another barostat.
+            As `check`, `Barostat.pieces` and `Barostat.variables_of`.
         """
         self.check(system)
         assert isinstance(system, CellSystem)
-        known = state.barostat if has_begun(state) else None
-        if known is not None and not self.barostat.goes_on_from(known):
-            raise InputError(
-                f"the state carries variables of another barostat, not of {self.barostat!r}; start with "
-                f"dataclasses.replace(state, barostat=state.barostat[:{WORK}]), which is its cell",
-                item="barostat",
-            )
+        known = self.barostat.variables_of(state)
         system.enter(state)
         if known is None:
             self.barostat.pieces(system, state.positions, state.time)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
@@ -72,7 +74,9 @@ def instantaneous_pressure(
     pieces: Pieces | None = None,
     thermal_energy: float | None = None,
 ) -> FloatArray:
-    """The instantaneous pressure tensor, shape (3, 3); its trace over 3 is the pressure.
+    """The instantaneous pressure tensor, shape (3, 3); the mean of its diagonal is the pressure.
+
+    Beside a barostat that leaves an axis alone it is that of the others.
 
     Parameters
     ----------
@@ -80,8 +84,9 @@ def instantaneous_pressure(
     state : State
     virial : {'molecular', 'atomic', 'difference'}
         Of pieces as points, in which constraint forces have no part; of all atoms, with the constraint forces; or of
-        pieces, from energies in a cell a little larger and smaller, which needs no stress and gives the same in all
-        directions. The means are the same; that of pieces has the least noise.
+        pieces, from energies in a cell a little larger and smaller (along the axes that pieces of a barostat follow),
+        which needs no stress and gives the same in all directions. The means are the same; that of pieces has the least
+        noise.
     pieces : Pieces, optional
         As `find_pieces` gives them; by default what constraints tie.
     thermal_energy : float, optional
@@ -91,13 +96,21 @@ def instantaneous_pressure(
     Raises
     ------
     InputError
-        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume.
+        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume; pieces of another system.
     UnsupportedError
         There is no stress, or a piece is held in space.
     NonFiniteError
         An energy or a stress is not finite.
     """
     refuse_virial(virial, thermal_energy)
+    refuse_other(system, CellSystem, "system", "a CellSystem, which knows its cell")
+    if pieces is not None:
+        refuse_other(pieces, Pieces, "pieces", "what find_pieces or barostat.pieces gives")
+        if len(pieces.label) != system.n_atoms:
+            raise InputError(
+                f"pieces are those of {len(pieces.label)} atoms, and the system has {system.n_atoms}; find its own",
+                item="pieces",
+            )
     x, v, _ = system.taken(state)
     cell = system.cell
     volume = system.volume
@@ -115,18 +128,18 @@ def instantaneous_pressure(
     else:
         kinetic = positive(thermal_energy, "thermal_energy") * np.diag(pieces.moving).astype(float)
     if virial == "difference":
-        return kinetic / volume - np.eye(3) * _slope(system, state, pieces, cell) / (3 * volume)
+        return kinetic / volume - np.eye(3) * _slope(system, state, pieces, cell) / (pieces.axes.sum() * volume)
     stress = system.stress(x, state.time)
     rise = energy_by_strain(system, pieces, Place(cell, x, 0.0, system.with_forces(state).forces, stress))
     return (kinetic - 0.5 * (rise + rise.T)) / volume
 
 
 def _slope(system: CellSystem, state: State, pieces: Pieces, cell: FloatArray) -> float:
-    """dU/d ln(length) where the cell is scaled and pieces move by their centres."""
+    """dU/d ln(length) where the cell is scaled along the axes it changes along, and pieces move by their centres."""
     lattice, energies = lattice_of(system), []
     try:
         for h in (STRAIN, -STRAIN):
-            change = h * np.eye(3)
+            change = h * np.diag(pieces.axes.astype(float))
             system.set_cell(cell, state.positions)
             y = state.positions + pieces.moved(state.positions, change, lattice)
             system.set_cell(cell @ (np.eye(3) + change), y)
@@ -139,6 +152,11 @@ def _slope(system: CellSystem, state: State, pieces: Pieces, cell: FloatArray) -
             "difference: atoms overlap, or the force field returns what is no energy"
         )
     return (energies[0] - energies[1]) / (2 * STRAIN)
+
+
+def mean_pressure(values: Sequence[FloatArray], axes: NDArray[np.bool_]) -> float:
+    """Of tensors, along the axes along which a cell changes."""
+    return float(np.mean([np.diagonal(value)[axes] for value in values]))
 
 
 class PressureObserver:
@@ -189,5 +207,5 @@ class PressureObserver:
 
     @property
     def mean(self) -> float:
-        """Of the pressure."""
-        return float(np.mean([np.trace(value) / 3 for value in self.values]))
+        """Of the pressure, along the axes that the barostat changes where its pieces are given."""
+        return mean_pressure(self.values, np.ones(3, dtype=bool) if self.pieces is None else self.pieces.axes)

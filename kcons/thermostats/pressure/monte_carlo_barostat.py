@@ -48,10 +48,6 @@ class MonteCarloBarostat(Barostat):
         super().__init__(pressure, **kwargs)
         self.width = positive(width, "width")
 
-    def goes_on_from(self, variables: FloatArray) -> bool:
-        # Logarithms of widths are negative; other barostats adapt nothing.
-        return super().goes_on_from(variables) and bool((self._modes(variables)[2] < 0).all())
-
     def begin(self, system: CellSystem) -> FloatArray:
         variables = super().begin(system)
         self._modes(variables)[2] = np.log(np.minimum(self.width, self.strains.most))

@@ -42,6 +42,8 @@ class Pieces:
         The axes along which a piece follows the cell.
     tree : tuple of ndarray of int
         Atoms and the parents next to which they are, for pieces cut by the faces of the cell.
+    axes : ndarray of bool, shape (3,)
+        Those along which the cell changes.
     """
 
     label: IntArray
@@ -49,6 +51,7 @@ class Pieces:
     mass: FloatArray
     open: NDArray[np.bool_]
     tree: tuple[IntArray, IntArray]
+    axes: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.mass)
@@ -166,7 +169,7 @@ def find_pieces(
     total = np.bincount(label, masses).astype(float)
     order = np.argsort(~placed, kind="stable")
     near = _joined(nearest)
-    pieces = Pieces(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order))
+    pieces = Pieces(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order), axes)
     lattice = lattice_of(system)
     y = pieces.whole(positions, lattice)
     closing = np.flatnonzero(np.round((y[near[:, 1]] - y[near[:, 0]]) @ lattice[1]).any(axis=1))

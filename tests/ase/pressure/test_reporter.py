@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ase import units
-from ase.build import bulk
+from ase import Atoms, units
+from ase.build import bulk, fcc111
 from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms, Hookean
 from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, TEMPERATURE, dumbbells, pressure
@@ -106,3 +107,25 @@ def test_dynamics_of_ase_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"dynamics is <ase\.md\.verlet.*; give a dynamics object of kcons\.ase"):
         PressureReporter(VelocityVerlet(copper(), FS), tmp_path / "pressure.txt")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("virial", ["molecular", "difference"])
+def test_beside_a_wall_of_fixed_atoms_the_mean_is_that_of_the_rest(virial):
+    """Along the axis that the barostat changes: along the others the wall stays, and its share was the largest."""
+    atoms = fcc111("Cu", (3, 3, 2), vacuum=6.0, periodic=True)
+    top, n = atoms.positions[:, 2].max(), len(atoms)
+    atoms += Atoms("Ar2", positions=[[1.0, 1, top + 4], [4.0, 2, top + 5]])
+    atoms.set_constraint(FixAtoms(range(n)))
+    atoms.calc = LennardJones(sigma=2.5, epsilon=0.01, rc=6.0)
+    barostat = MonteCarloBarostat(0.0, kind="normal", held="stay")
+    dynamics = ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1, barostat=barostat)
+    reporter = PressureReporter(dynamics, virial=virial)
+    reporter()
+    energies = []
+    for h in (1e-5, -1e-5):
+        other = atoms.copy()
+        other.calc = atoms.calc
+        other.set_cell(atoms.cell.array * [1, 1, 1 + h])
+        other.positions[n:, 2] *= 1 + h
+        energies.append(other.get_potential_energy())
+    assert reporter.mean == pytest.approx(-(energies[0] - energies[1]) / (2e-5 * atoms.get_volume()), rel=1e-3)

@@ -29,8 +29,8 @@ from ase_systems import (
     water_gas,
 )
 
-from kcons.ase import ConstrainedDynamics, constrain, rigid_water
-from kcons.constraints import Distance
+from kcons.ase import ConstrainedCalculator, ConstrainedDynamics, constrain, rigid_water
+from kcons.constraints import Distance, Plane
 from kcons.errors import UnsupportedError
 from kcons.steppers import BlanesMoan4
 
@@ -224,6 +224,31 @@ def test_what_scales_atoms_past_their_constraints_is_refused():
     optimiser = BFGS(StrainFilter(atoms), logfile=None)
     with pytest.raises(UnsupportedError, match="StrainFilter"):
         optimiser.run(fmax=0.01, steps=5)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("calculator", [False, True])
+def test_filters_beside_atoms_that_stay_are_refused(name, calculator):
+    """Fixed atoms do not follow the cell, and forces of the filter took them to."""
+    atoms = crystal()
+    atoms.set_constraint()
+    rows = [Plane([0], [0, 0, 1.0])]
+    if calculator:
+        atoms.calc = ConstrainedCalculator(atoms.calc, rows)
+    else:
+        constrain(atoms, rows)
+    with pytest.raises(UnsupportedError, match=r"#0 Plane\(0\) holds atoms in space along z, and .*CellFilter"):
+        filtered(FILTERS[name], atoms).get_forces()
+    assert np.isfinite(atoms.get_stress()).all()
+    flat = filtered(lambda a: FILTERS[name](a, mask=[1, 1, 0, 0, 0, 1]), atoms)
+    x, forces, energies = flat.get_positions(), flat.get_forces(), []
+    n = len(atoms)
+    for h in (1e-5, -1e-5):
+        y = x.copy()
+        y[n, 0] += h
+        flat.set_positions(y)
+        energies.append(flat.get_potential_energy())
+    assert -forces[n, 0] == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-4, abs=1e-5)
 
 
 def test_free_atoms_and_the_strain_filter_go_together():

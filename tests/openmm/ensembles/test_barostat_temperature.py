@@ -6,6 +6,7 @@ import openmm
 import pytest
 from openmm_systems import context_of, water_box
 
+from kcons.errors import InputError
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, NoseHooverMiddle, ProjectedIntegrator
 
 ENSEMBLES = [
@@ -53,3 +54,16 @@ def test_a_barostat_of_another_temperature(ensemble, barostat):
 def test_without_a_temperature_there_is_nothing_to_compare():
     integrator, _ = started(openmm.MonteCarloBarostat(1.0, 310), Isokinetic(momentum="free"))
     integrator.step(1)
+
+
+@pytest.mark.parametrize(
+    "barostat",
+    [
+        openmm.MonteCarloBarostat(float("nan"), 300),
+        openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, float("inf"), 1), 300),
+    ],
+)
+def test_a_pressure_that_is_none(barostat):
+    """OpenMM accepts every trial then, and the box wanders."""
+    with pytest.raises(InputError, match=r"Barostat has a pressure of .*; give a finite one"):
+        started(barostat, Langevin(300, 1))

@@ -9,7 +9,7 @@ from openmm import app, unit
 from openmm_systems import dumbbell, started, state_of, water_box
 
 from kcons.constraints import Distance
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import Langevin, PressureReporter, ProjectedIntegrator, hold, molecular_pressure
 
 
@@ -60,6 +60,11 @@ def test_numbers_that_are_none(tmp_path):
     for bad in ({"temperature": -1}, {"temperature": 1 * unit.nanometer}, {"strain": 0}, {"strain": np.nan}):
         with pytest.raises(InputError):
             molecular_pressure(context, **bad)
+    with pytest.raises(InputError, match=r"simulation\.context"):
+        molecular_pressure(system)
+    context.setPositions(np.zeros_like(x))
+    with pytest.raises(NonFiniteError, match="overlap"):
+        molecular_pressure(context)
     for interval in (0, 2.5, None):
         with pytest.raises(InputError, match="reportInterval"):
             PressureReporter(tmp_path / "pressure.csv", interval)

@@ -51,7 +51,7 @@ def test_widths_go_to_an_acceptance_of_one_half_and_trials_are_counted():
         state = barostat.move(system, state, 1.0, 1.0)
         vars(state)["step"] = k
     assert np.isnan(barostat.acceptance(replace(state, barostat=None))).all()
-    tried, _, widths = state.barostat[10:].reshape(3, 2)
+    tried, _, widths = state.barostat[11:].reshape(3, 2)
     assert tried.sum() == 400
     assert np.all(np.exp(widths) > 0.03)
     assert np.all(barostat.acceptance(state) > 0.4)

@@ -26,6 +26,35 @@ def test_functions_see_the_present_cell():
     assert system.stress(x, 0.0)[0, 1] == system.stress(x, 0.0)[1, 0] == 1.0
 
 
+def test_a_cell_is_the_same_however_it_is_given():
+    system, x = gas(n=3)
+    system.set_cell([11, 12, 13], x)
+    assert np.array_equal(system.cell, np.diag([11.0, 12, 13])) and system.volume == pytest.approx(11 * 12 * 13)
+
+
+def test_a_pressure_is_an_energy_over_an_area_in_a_slab():
+    """Whatever length the vector has that is not periodic."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0]])
+    held = ConstraintSet(Distance([[0, 1]]), x, [1.0, 1.0], cell=[10.0, 10, 30], pbc=[True, True, False])
+    system = CellSystem(Motion(held, x))
+    state = system.initial_state(x)
+    assert system.volume == pytest.approx(100)
+    system.set_cell(np.diag([11.0, 10, 30]), x)
+    assert system.volume == pytest.approx(110)
+    system.enter(state)
+    assert system.volume == pytest.approx(100)
+
+
+def test_an_energy_that_is_none():
+    for energy, error in ((None, InputError), ("-1", InputError), ([1.0], InputError), (1j, InputError)):
+        system, x = gas(n=2, force=no_force, potential=lambda x, t, h, energy=energy: energy)
+        with pytest.raises(error, match="potential"):
+            system.energy(x, 0.0, 3)
+    system, x = gas(n=2, force=no_force, potential=lambda x, t, h: -np.inf)  # every trial there was accepted
+    with pytest.raises(NonFiniteError, match="-inf at step 3"):
+        system.energy(x, 0.0, 3)
+
+
 def test_a_cell_that_is_refused_changes_nothing():
     system, x = gas(n=3)
     with pytest.raises(InputError, match="half the box"):

@@ -113,8 +113,11 @@ def test_what_is_refused():
     with pytest.raises(UnsupportedError, match="CellSystem"):
         ConstantPressure(Langevin(1.0, 1.0, 0), barostat).step(plain, plain.initial_state(x), 0.1)
     after = made("langevin").step(system, state, 0.1)
-    with pytest.raises(InputError, match="another barostat"):
-        made("langevin", kind="anisotropic").step(system, after, 0.1)
+    for other in ("anisotropic", "lateral"):  # the second one has as many variables
+        with pytest.raises(InputError, match="another barostat"):
+            made("langevin", kind=other).step(system, after, 0.1)
+        with pytest.raises(InputError, match="another barostat"):
+            MonteCarloBarostat(PRESSURE, kind=other).acceptance(after)
     assert made("langevin", kind="anisotropic").step(system, replace(after, barostat=None), 0.1).cell is not None
     rescaling = ConstantPressure(Langevin(1.0, 0.5, 3), CellRescaling(PRESSURE, 1.0, 1.0))  # as many variables
     with pytest.raises(InputError, match="another barostat"):

@@ -10,7 +10,7 @@ from kcons.constraints import Distance, MovingTarget
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
-from kcons.steppers import run
+from kcons.steppers import System, run
 from kcons.thermostats import Langevin, thermal_velocities
 from kcons.thermostats.pressure import (
     CellSystem,
@@ -161,6 +161,15 @@ def test_bonds_make_pieces():
 
 def test_what_is_refused():
     system, state = started()
+    for wrong, match in ((3, "pieces is 3"), (started(n=3)[0], "pieces is <")):
+        with pytest.raises(InputError, match=match):
+            instantaneous_pressure(system, state, pieces=wrong)
+    few, there = started(n=3)
+    with pytest.raises(InputError, match="pieces are those of 9 atoms"):
+        pieces = find_pieces(few, there.positions, np.ones(3, dtype=bool))
+        instantaneous_pressure(system, state, pieces=pieces, thermal_energy=1.0)
+    with pytest.raises(InputError, match="CellSystem"):
+        instantaneous_pressure(System(system.motion), state)
     with pytest.raises(InputError, match="virial"):
         instantaneous_pressure(system, state, "viral")
     x = state.positions
@@ -174,3 +183,19 @@ def test_what_is_refused():
     with pytest.raises(NonFiniteError, match="inf and inf"):
         instantaneous_pressure(endless, endless.initial_state(x), "difference", thermal_energy=1.0)
     assert np.array_equal(endless.cell, SIDE * np.eye(3))
+
+
+@pytest.mark.parametrize("kind", ["normal", "lateral", "isotropic"])
+def test_the_mean_is_the_pressure_that_the_barostat_keeps(kind):
+    """Along the axes it changes: differences scaled the others as well, and the mean had a third of each axis."""
+    system, state = started()
+    barostat = MonteCarloBarostat(0.02, kind=kind)
+    pieces, axes = barostat.pieces(system, state.positions), barostat.strains.axes
+    whole = instantaneous_pressure(system, state, pieces=pieces)
+    seen = {}
+    for virial in ("molecular", "difference"):
+        seen[virial] = PressureObserver(system, virial, pieces=pieces)
+        seen[virial](state)
+    assert seen["molecular"].mean == pytest.approx(np.diagonal(whole)[axes].mean(), rel=1e-12)
+    assert seen["difference"].mean == pytest.approx(seen["molecular"].mean, rel=1e-5)
+    assert kind == "isotropic" or seen["molecular"].mean != pytest.approx(np.trace(whole) / 3, rel=1e-3)
