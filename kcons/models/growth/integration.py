@@ -8,7 +8,7 @@ starts from there. Values between the steps come from the method's own interpola
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
+from kcons.constraints.arguments import check_call, numbers, refuse_other
 from kcons.errors import InputError, NonFiniteError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
@@ -169,9 +170,11 @@ def solve(
     p0 = Populations.from_logarithms(t0, log_start)
     bound = system.bind(p0)
     log_start = bound.project(t0, log_start) if project else log_start
-    options = {"rtol": 1e-9, "atol": 1e-11} | options
+    options = {"rtol": 1e-9, "atol": 1e-11} | {name: value for name, value in options.items() if value is not None}
     check_sizes(options, system.n)
-    tolerance = max(options["atol"] + options["rtol"], 1e-13)
+    sizes = {name: numbers(options[name], name) for name in ("rtol", "atol")}
+    options |= sizes
+    tolerance = max(float(np.min(sizes["rtol"] + sizes["atol"])), 1e-13)
     holder: dict[str, Any] = {}
 
     def slope(t: float, y: FloatArray) -> FloatArray:
@@ -213,6 +216,9 @@ def solve(
             holder.clear()
         elif ode.status < 0 and "not finite" in holder:
             _refuse_rates(bound, *holder["not finite"])
+        with np.errstate(all="ignore"):
+            for row in bound.rows:  # what depends on time may do so later only
+                row.check_derivatives(Populations.from_logarithms(float(ode.t[-1]), ode.y[:, -1]))
     return _assemble(bound, ode, holder, (t0, t1), wanted, dense_output, events, log_start, project)
 
 
@@ -364,11 +370,16 @@ def _event_list(events: Event | Sequence[Event] | None) -> list[Event] | None:
     if events is None:
         return None
     wrapped: list[Event] = []
+    refuse_other(events, (Callable, Iterable), "events", "a function (t, x), or a list of such")
     for event in [events] if callable(events) else list(events):
+        check_call("event", event, ("t", "x"))
 
         def of_logarithms(t: float, y: FloatArray, event: Event = event) -> float:
             with np.errstate(under="ignore"):
-                return event(t, np.exp(y))
+                value = numbers(event(t, np.exp(y)), "event")
+            if value.size != 1:
+                raise InputError(f"an event returned shape {value.shape}; it must return a number", item="event")
+            return float(value.item())
 
         for name in ("terminal", "direction"):
             if hasattr(event, name):

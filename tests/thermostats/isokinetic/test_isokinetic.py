@@ -172,7 +172,7 @@ def check_order(made, order, counts):
     assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@ORDERS
 def test_a_run_from_reversed_velocities_returns(order):
     """No variable of the thermostat turns: the integral of alpha runs back by itself."""
     held, x = dumbbells(2)
