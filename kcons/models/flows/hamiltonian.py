@@ -137,9 +137,7 @@ class HamiltonianFlow(Flow):
             allowed = WRONG * np.max(np.abs(fine[part])) + rounding
             if np.any(np.abs(fine - coarse)[part] > allowed):
                 if given is None:
-                    raise InputError(
-                        f"H changes too fast for differences: give {name}, or variables of order 1", item=name
-                    )
+                    raise InputError(f"H changes too fast for differences: give its {name}", item=name)
             elif np.any(np.abs(field - fine)[part] > allowed):
                 raise InputError(
                     f"{name} is {field[part]} at the start, but differences of H give {fine[part]}; correct it, or "

@@ -139,8 +139,8 @@ class Pendulum(HamiltonianFlow):
         times = numbers(t, "t")
         m = self.energy(X0) / (2.0 * self.omega)
         # 1 - m without its cancellation, and what rounding makes of a start on the separatrix.
-        up, half = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0)
-        short, rounding = (up - half) * (up + half), 1e-15 * (up * up + 1e-17)
+        up, half, off = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0), 2.2e-16 * max(1.0, abs(theta0))
+        short, rounding = (up - half) * (up + half), (2 * up + off) * off
         if rounding < abs(short) < NEAR_SEPARATRIX:
             raise InputError(
                 f"the start is so near the separatrix (by {short:.2g} of its energy) that elliptic functions lose "

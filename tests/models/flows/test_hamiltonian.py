@@ -154,7 +154,7 @@ def test_user_functions_cannot_change_the_state():
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(InputError, match="degree"):
+    with pytest.raises(InputError, match="f is 0"):
         HamiltonianFlow(coupled, 0)
     flow = HamiltonianFlow(coupled, 2)
     with pytest.raises(InputError, match="separable"):
