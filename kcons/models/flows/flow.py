@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import check_call, lent, numbers, refuse_other, whole_number
+from kcons.constraints.arguments import check_call, lent, numbers, whole_number
 from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
 
@@ -44,7 +44,6 @@ class Flow:
 
     def __init__(self, velocity: Field, n: int, jacobian: Field | None = None) -> None:
         self.n = whole_number(n, "n")
-        refuse_other(velocity, Callable, "velocity", "a function (t, X)")
         check_call("velocity", velocity, ("t", "X"))
         check_call("jacobian", jacobian, ("t", "X"))
         self._velocity = velocity

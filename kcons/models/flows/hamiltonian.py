@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import check_call, finite_number, lent, numbers, refuse_other, whole_number
+from kcons.constraints.arguments import check_call, finite_number, lent, numbers, whole_number
 from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows.flow import STEP, FloatArray, Flow, jacobian_by_differences
@@ -78,7 +78,6 @@ class HamiltonianFlow(Flow):
     ) -> None:
         self.f = whole_number(f, "f")
         taken = ("q", "p", "t") if time_dependent else ("q", "p")
-        refuse_other(hamiltonian, Callable, "hamiltonian", f"a function ({', '.join(taken)})")
         for name, function in (("hamiltonian", hamiltonian), ("dH_dq", dH_dq), ("dH_dp", dH_dp)):
             check_call(name, function, taken, "; time_dependent says whether it gets the time")
         self.hamiltonian = hamiltonian
@@ -128,7 +127,8 @@ class HamiltonianFlow(Flow):
 
     def _check_gradients(self, X: FloatArray, t: float) -> None:
         """Refuse gradients that differences of H contradict, and differences that do not serve."""
-        field = np.concatenate([self.gradient_q(X[: self.f], X[self.f :], t), self.gradient_p(*np.split(X, 2), t)])
+        q, p = X[: self.f], X[self.f :]
+        field = np.concatenate([self.gradient_q(q, p, t), self.gradient_p(q, p, t)])
         energy = lambda s, Y: [self.energy(Y, s)]  # noqa: E731
         coarse, fine = (jacobian_by_differences(energy, t, X, step)[0] for step in (STEP, STEP / 2))
         rounding = 1e-10 * abs(self.energy(X, t))

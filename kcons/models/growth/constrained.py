@@ -112,10 +112,11 @@ class ConstrainedGrowth:
         ------
         InputError
         """
-        for item, name in ((self.model, "the model"), *((row, f"row {row.name}") for row in self.rows)):
-            if item.lanes not in ((), lanes):
+        found = [(self.model.lanes, "the model"), *((row.lanes, f"row {row.name}") for row in self.rows)]
+        for own, name in found:
+            if own not in ((), lanes):
                 raise InputError(
-                    f"parameters of {name} are for {item.lanes[0]} systems side by side, "
+                    f"parameters of {name} are for {own[0]} systems side by side, "
                     f"the start is {f'of {lanes[0]}' if lanes else 'a single one'}: give one number for all, or as "
                     "many as there are starts in solve_ensemble",
                     item="x0",

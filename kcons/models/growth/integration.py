@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import check_call, numbers, refuse_other
+from kcons.constraints.arguments import check_call, numbers
 from kcons.errors import InputError, NonFiniteError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
@@ -370,8 +370,7 @@ def _event_list(events: Event | Sequence[Event] | None) -> list[Event] | None:
     if events is None:
         return None
     wrapped: list[Event] = []
-    refuse_other(events, (Callable, Iterable), "events", "a function (t, x), or a list of such")
-    for event in [events] if callable(events) else list(events):
+    for event in list(events) if isinstance(events, Iterable) else [events]:
         check_call("event", event, ("t", "x"))
 
         def of_logarithms(t: float, y: FloatArray, event: Event = event) -> float:

@@ -204,7 +204,7 @@ def test_tolerances_of_each_species_and_none() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"events": 3}, "events is 3"),
+        ({"events": 3}, "event is 3"),
         ({"events": lambda t: t}, "is called with"),
         ({"events": lambda t, x: x}, "must return a number"),
         ({"events": lambda t, x: None}, "event is no array of numbers"),
