@@ -172,9 +172,8 @@ def solve(
     log_start = bound.project(t0, log_start) if project else log_start
     options = {"rtol": 1e-9, "atol": 1e-11} | {name: value for name, value in options.items() if value is not None}
     check_sizes(options, system.n)
-    sizes = {name: numbers(options[name], name) for name in ("rtol", "atol")}
-    options |= sizes
-    tolerance = max(float(np.min(sizes["rtol"] + sizes["atol"])), 1e-13)
+    options |= {name: numbers(options[name], name) for name in ("rtol", "atol")}
+    tolerance = max(float(np.min(options["rtol"] + options["atol"])), 1e-13)
     holder: dict[str, Any] = {}
 
     def slope(t: float, y: FloatArray) -> FloatArray:
@@ -216,10 +215,15 @@ def solve(
             holder.clear()
         elif ode.status < 0 and "not finite" in holder:
             _refuse_rates(bound, *holder["not finite"])
-        with np.errstate(all="ignore"):
-            for row in bound.rows:  # what depends on time may do so later only
-                row.check_derivatives(Populations.from_logarithms(float(ode.t[-1]), ode.y[:, -1]))
+        _check_end(bound, Populations.from_logarithms(float(ode.t[-1]), ode.y[:, -1]))
     return _assemble(bound, ode, holder, (t0, t1), wanted, dense_output, events, log_start, project)
+
+
+def _check_end(system: ConstrainedGrowth, p: Populations) -> None:
+    """Refuse derivatives that are wrong where a run has ended: what depends on time may do so later only."""
+    with np.errstate(all="ignore"):
+        for row in system.rows:
+            row.check_derivatives(p)
 
 
 def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:

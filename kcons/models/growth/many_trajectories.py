@@ -17,7 +17,7 @@ from scipy.integrate import DOP853
 from kcons.constraints.arguments import finite_number, numbers, whole_number
 from kcons.errors import InputError
 from kcons.models.growth.compensated_sums import two_sum
-from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
+from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth, check_lanes
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
 from kcons.models.projected_steps import check_sizes
 
@@ -111,7 +111,7 @@ def solve_ensemble(
             "an ensemble needs functions that are vectorized: GrowthModel(..., vectorized=True)", item="model"
         )
     n, N = start.shape
-    system.check_lanes((N,))
+    check_lanes(system, (N,))
     if times.ndim > 2 or (times.ndim == 2 and times.shape[1] != N):
         raise InputError(f"t_eval has shape (k,) or (k, {N}), not {times.shape}", item="t_eval")
     every = np.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), N))
