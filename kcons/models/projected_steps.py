@@ -71,7 +71,7 @@ def solver_of(method: str) -> type[OdeSolver]:
             "LSODA keeps its own copy of the state, which cannot be put back on the constraints; "
             "use 'Radau' or 'BDF' for stiff systems"
         )
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise InputError(f"there is no method {method!r}; choose from {', '.join(METHODS)}", item="method")
     return METHODS[method]
 

@@ -31,8 +31,7 @@ from kcons.steppers.stages.fused_stages import Flights
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
 
-#: Residual of initial positions (relative to the row's scale) and of initial velocities (relative to the
-#: speed) that is still taken for rounding; the first step removes it.
+#: Residual of initial positions (by the row's scale) and velocities (by the speed) that is taken for rounding.
 START_TOLERANCE = 1e-9
 
 #: What the stages of a step together round, of its kick.
@@ -49,8 +48,7 @@ class State:
     Attributes
     ----------
     positions, velocities : ndarray, shape (n_atoms, 3)
-        In the caller's units. Treat them as read-only: states share arrays where nothing changed. Those of states
-        that observers see cannot be changed.
+        In the caller's units. Read-only: states share arrays where nothing changed. Observers cannot change them.
     time : float
     forces : ndarray, shape (n_atoms, 3), or None
         Applied forces at this state, None before they are known. With them in hand a step evaluates the
@@ -58,8 +56,7 @@ class State:
     step : int
         Steps done since the start.
     remainder : ndarray, shape (n_atoms, 3), or None
-        What rounding took from the positions, kept where they are far from the origin compared with the
-        size of what is held (see `System.initial_state`).
+        What rounding took from the positions, kept where they are far from the origin (see `System.initial_state`).
     time_remainder : float
         What rounding took from the time, so that a million steps of dt are a million dt.
     thermostat, barostat : ndarray or None
@@ -138,10 +135,19 @@ class State:
             return False
         return self.is_of(system) and (there is here or np.array_equal(there, here))
 
-    def reversed(self) -> State:
-        """The same point with opposite velocities."""
+    def reversed(self, stepper: Any = None) -> State:
+        """The same point with opposite velocities; `stepper` is the thermostat whose variables it carries, if any.
+
+        Raises
+        ------
+        InputError
+            It carries some, and no stepper is given: they may be velocities, too.
+        """
+        if self.thermostat is not None and not hasattr(stepper, "step"):
+            raise InputError("the state carries variables of a thermostat; give it: reversed(stepper)", item="stepper")
         # Forces are dropped since they may depend on the velocities.
-        return replace(self, velocities=-self.velocities, forces=None)
+        back = replace(self, velocities=-self.velocities, forces=None)
+        return stepper.turned(back) if hasattr(stepper, "turned") else back
 
     def save(self, file: str | PathLike[str] | BinaryIO) -> None:
         """Write everything the state holds in NumPy's .npz format: a run continued from it is the same to the last bit.
@@ -206,11 +212,9 @@ class System:
     Parameters
     ----------
     motion : Motion
-        The engine of the constraint set; also the source of the masses. A set without rows gives plain
-        unconstrained dynamics.
+        The engine of the constraint set, and the masses. A set without rows gives unconstrained dynamics.
     force : callable, optional
-        Applied forces, shape (n_atoms, 3): ``force(x, t)``, or ``force(x, v, t)`` if `velocity_dependent`.
-        None means no forces.
+        Applied forces, shape (n_atoms, 3), ``force(x, t)``, or ``force(x, v, t)`` if `velocity_dependent`.
     potential : callable, optional
         Potential energy ``potential(x, t)``, for `total_energy`.
     velocity_dependent : bool
@@ -300,12 +304,10 @@ class System:
         Parameters
         ----------
         positions, velocities : array_like, shape (n_atoms, 3)
-            Copied and cast to float64. Without velocities the slowest admissible ones are taken: zero
-            unless a constraint moves by itself.
+            Copied and cast to float64. Without velocities the slowest admissible ones: zero where constraints rest.
         time : float
         project : bool
-            Whether to bring positions and velocities that violate the constraints onto them (nearest point
-            in the mass metric) instead of raising.
+            Whether to bring positions and velocities onto the constraints (nearest in the mass metric), not to raise.
 
         Notes
         -----
@@ -316,8 +318,7 @@ class System:
         Raises
         ------
         InputError
-            Wrong shapes, NaN or infinity; positions or velocities off the constraints while `project` is
-            False.
+            Wrong shapes, NaN or infinity; positions or velocities off the constraints without `project`.
         InfeasibleError
             With `project`, if no solution can be reached.
         OverdeterminedError
@@ -377,8 +378,8 @@ class System:
         """Speed below which velocities are rounding: of a kick by which atoms cross the system, or of one for `dt`."""
         kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
         size = extent(x)
-        # Or one by which no atom has moved by more than its rounding since time 0.
-        still = float(np.finfo(float).eps) * size / max(abs(time), abs(dt)) if time else 0.0
+        # Or, in a run, one by which no atom has moved by more than its rounding since time 0.
+        still = float(np.finfo(float).eps) * size / max(abs(time), abs(dt)) if time and dt else 0.0
         return max(KICK_ROUNDING * math.sqrt(kick * size), KICK_ROUNDING * kick * abs(dt), still)
 
     def forces(

@@ -156,6 +156,15 @@ class NoseHooverChain(Listed):
         assert state.thermostat is not None
         return may_be(float(state.thermostat[-1]), system, state, None, self.momentum)
 
+    def turned(self, state: State) -> State:
+        """With the velocities of the links turned round, as those of a state that was `reversed` are."""
+        if not carried(state, 2 * self.length + 1, "this NoseHooverChain"):
+            return state
+        assert state.thermostat is not None
+        chain = state.thermostat.copy()
+        chain[self.length : 2 * self.length] *= -1
+        return replace(state, thermostat=chain)
+
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.
 

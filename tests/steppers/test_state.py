@@ -72,6 +72,17 @@ def test_start_with_forbidden_velocities():
     assert np.abs(momentum).max() <= 1e-15
 
 
+@pytest.mark.parametrize("time", [1e-300, 1e-16, -1e-16, 0.0, 1e-3])
+def test_forbidden_velocities_near_time_0(time):
+    """What an atom can have moved since then says nothing of where it will go."""
+    rod = Distance([0, 1], MovingTarget(lambda t: 1.2 + 0.5 * t, lambda t: 0.5, lambda t: 0.0))
+    positions = np.array([[0.0, 0.0, 0.0], [1.2 + 0.5 * time, 0.0, 0.0]])
+    system = system_of([FixedAtoms([0]), rod], positions, [1, 1])
+    with pytest.raises(InputError, match="initial velocities violate"):
+        system.initial_state(positions, np.array([[0, 0, 0], [0.6, 0, 0]]), time=time)
+    assert system.initial_state(positions, np.array([[0, 0, 0], [0.5, 0, 0]]), time=time).time == time
+
+
 def test_start_within_rounding_is_taken_as_given():
     system, state = rotor()
     again = system.initial_state(state.positions, state.velocities)
@@ -245,7 +256,7 @@ def test_a_full_disk_leaves_nothing_behind(room: int, tmp_path: Path, monkeypatc
             return super().write(data)
 
     path = tmp_path / "state.npz"
-    older = whole_state().reversed()
+    older = replace(whole_state(), step=8)
     older.save(path)
     monkeypatch.setattr(Path, "open", lambda self, mode: Full(self, mode))
     with pytest.raises(OSError, match="No space left"):

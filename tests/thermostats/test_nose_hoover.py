@@ -11,7 +11,7 @@ from thermostat_systems import METHANE, TEN, dumbbells, quartic, quartic_potenti
 
 from kcons.constraints import Distance, Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import Geodesic, State, Suzuki4, System, run
+from kcons.steppers import Geodesic, ReversibilityCheck, State, Suzuki4, System, run
 from kcons.thermostats import NoseHooverChain, thermal_velocities
 
 
@@ -31,6 +31,26 @@ def test_a_negative_step_undoes_a_step(length, steps):
     assert np.abs(back.positions - begun.positions).max() <= 1e-10
     assert np.abs(back.velocities - begun.velocities).max() <= 1e-10
     assert np.abs(back.thermostat - begun.thermostat).max() <= 1e-10
+
+
+@pytest.mark.parametrize("wrapped", [False, True], ids=["alone", "checked"])
+def test_a_run_from_reversed_velocities_returns(wrapped):
+    """The links turn with the atoms: with links as they were the way back is another one."""
+    held, state = started()
+    thermostat = NoseHooverChain(0.5, 1.0)
+    begun = thermostat.start(held, state)
+    stepper = ReversibilityCheck(thermostat) if wrapped else thermostat
+    there = run(held, begun, 0.02, 100, stepper=stepper)
+    back = run(held, there.reversed(stepper), 0.02, 100, stepper=stepper).reversed(stepper)
+    assert np.abs(there.thermostat[3:6]).max() > 0.1
+    np.testing.assert_allclose(back.positions, begun.positions, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(back.velocities, begun.velocities, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(back.thermostat, begun.thermostat, rtol=0, atol=1e-10)
+    assert np.array_equal(there.reversed(stepper).reversed(stepper).thermostat, there.thermostat)
+    with pytest.raises(InputError, match=r"reversed\(stepper\)"):
+        there.reversed()
+    with pytest.raises(InputError, match="another thermostat"):
+        there.reversed(NoseHooverChain(0.5, 1.0, length=4))
 
 
 def test_order_two():

@@ -217,8 +217,19 @@ class FunctionRows(Constraint):
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
         length = self._length(r)
-        if self.gradient_function is not None:
-            difference = self._slope(r, along, 1e-3 * length, time)
+        difference = self._slope(r, along, 1e-3 * length, time)
+        if self.gradient_function is None:
+            finer = self._slope(r, along, 0.5e-3 * length, time)
+            self.refuse_singular(
+                ~(np.abs(finer - difference) <= WRONG * size),
+                first_row,
+                lambda k, row: (
+                    f"{row}: differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
+                    f"gradient, {difference[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
+                    "Move the atoms, give the length over which it varies (length=...), or its gradient"
+                ),
+            )
+        else:
             self._compare("gradient", _contract(slope, along), difference, size, first_row, (r, slope, time))
         if self.hessian_vector is not None:
             curvature = self._differenced_curvature(r, along, time)

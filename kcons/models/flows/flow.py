@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import check_call, lent, numbers, whole_number
+from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
 
 FloatArray = NDArray[np.float64]
@@ -38,13 +39,13 @@ class Flow:
     Raises
     ------
     InputError
-        If n < 1.
+        If n < 1; functions of other arguments.
     """
 
     def __init__(self, velocity: Field, n: int, jacobian: Field | None = None) -> None:
-        if n < 1:
-            raise InputError(f"a flow has at least one variable, not {n}", item="n")
-        self.n = int(n)
+        self.n = whole_number(n, "n")
+        check_call("velocity", velocity, ("t", "X"))
+        check_call("jacobian", jacobian, ("t", "X"))
         self._velocity = velocity
         self._jacobian = jacobian
 
@@ -74,6 +75,32 @@ class Flow:
         whole, half = (jacobian_by_differences(self._velocity, t, X, step) for step in (STEP, STEP / 2))
         # Beyond truncation: the rounding of V, which half the steps double.
         return np.asarray(2.0 * np.abs(whole - half) + 1e-12 * np.max(np.abs(whole)))
+
+    def check_jacobian(self, t: float, X: ArrayLike) -> None:
+        """Refuse a Jacobian that differences contradict, and differences that do not serve.
+
+        Raises
+        ------
+        InputError
+        """
+        X = self._state(X)
+        coarse, fine = (jacobian_by_differences(self._velocity, t, X, step) for step in (STEP, STEP / 2))
+        given, size = self.jacobian(t, X), np.max(np.abs(fine))
+        serves = np.abs(fine - coarse) <= WRONG * size
+        if self._jacobian is None and not serves.all():
+            raise InputError(
+                f"the velocity changes too fast about X = {X} for differences: give its Jacobian, or variables of "
+                "order 1",
+                item="jacobian",
+            )
+        wrong = serves & (np.abs(given - fine) > WRONG * size)
+        if wrong.any():
+            k = tuple(np.argwhere(wrong)[0].tolist())
+            raise InputError(
+                f"jacobian gives {given[k]:.6g} for entry {list(k)} at X = {X}, but differences of the velocity give "
+                f"{fine[k]:.6g}; correct it, or leave it out",
+                item="jacobian",
+            )
 
     def divergence(self, t: float, X: ArrayLike) -> float:
         """div V = tr A (notes eqs. 36, 37)."""
@@ -163,15 +190,16 @@ def phase_volume(
     Raises
     ------
     InputError
-        Times that do not increase.
+        Times that do not increase; a Jacobian that differences contradict.
     ConvergenceError
-        If the integration fails.
+        If the integration fails, or a volume shrinks beyond the digits of its propagator.
     """
-    wanted = numbers(times, "times")
-    if wanted.ndim != 1 or len(wanted) < 1 or np.any(np.diff(wanted) <= 0):
+    wanted, pieces = numbers(times, "times"), whole_number(pieces, "pieces")
+    if wanted.ndim != 1 or len(wanted) < 1 or not np.all(np.diff(wanted) > 0):
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n
     state, total = flow._state(X0), np.eye(n)
+    flow.check_jacobian(float(wanted[0]), state)
     log_volume = divergence = 0.0
     rows = [(state, total, 0.0, 0.0)]
 
@@ -187,8 +215,14 @@ def phase_volume(
             if not found.success:
                 raise ConvergenceError(f"the variational equation could not be integrated beyond t = {found.t[-1]:.6g}")
             state, J = found.y[:n, -1], found.y[n:-1, -1].reshape(n, n)
-            log_volume += float(np.linalg.slogdet(J)[1])
-            divergence += float(found.y[-1, -1])
+            change, integral = float(np.linalg.slogdet(J)[1]), float(found.y[-1, -1])
+            if not abs(change - integral) <= WRONG * max(1.0, abs(integral)):
+                raise ConvergenceError(
+                    f"from t = {c:.6g} to {d:.6g} the volume changes by exp({integral:.6g}), which its propagator no "
+                    "longer resolves: raise `pieces`"
+                )
+            log_volume += change
+            divergence += integral
             total = J @ total
         rows.append((state, total, log_volume, divergence))
     states, propagators, volumes, divergences = zip(*rows, strict=True)

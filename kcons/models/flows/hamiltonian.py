@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import lent, numbers, whole_number
+from kcons.constraints.arguments import check_call, finite_number, lent, numbers, whole_number
+from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
-from kcons.models.flows.flow import FloatArray, Flow, jacobian_by_differences
+from kcons.models.flows.flow import STEP, FloatArray, Flow, jacobian_by_differences
 
 #: (q, p) -> float, or (q, p, t) -> float where H depends on time.
 Energy = Callable[..., float]
@@ -75,9 +76,10 @@ class HamiltonianFlow(Flow):
         separable: bool = False,
         time_dependent: bool = False,
     ) -> None:
-        if f < 1:
-            raise InputError(f"there is at least one degree of freedom, not {f}", item="f")
-        self.f = int(f)
+        self.f = whole_number(f, "f")
+        taken = ("q", "p", "t") if time_dependent else ("q", "p")
+        for name, function in (("hamiltonian", hamiltonian), ("dH_dq", dH_dq), ("dH_dp", dH_dp)):
+            check_call(name, function, taken, "; time_dependent says whether it gets the time")
         self.hamiltonian = hamiltonian
         self.separable, self.time_dependent = separable, time_dependent
         self._dH_dq, self._dH_dp = dH_dq, dH_dp
@@ -108,14 +110,40 @@ class HamiltonianFlow(Flow):
     def gradient_q(self, q: FloatArray, p: FloatArray, t: float = 0.0) -> FloatArray:
         """dH/dq, shape (f,)."""
         if self._dH_dq is not None:
-            return numbers(self._dH_dq(lent(q), lent(p), *self._at(t)), "dH_dq")
+            return self._gradient("dH_dq", self._dH_dq(lent(q), lent(p), *self._at(t)))
         return jacobian_by_differences(lambda s, x: [self.hamiltonian(x, lent(p), *self._at(s))], t, q)[0]
 
     def gradient_p(self, q: FloatArray, p: FloatArray, t: float = 0.0) -> FloatArray:
         """dH/dp, shape (f,)."""
         if self._dH_dp is not None:
-            return numbers(self._dH_dp(lent(q), lent(p), *self._at(t)), "dH_dp")
+            return self._gradient("dH_dp", self._dH_dp(lent(q), lent(p), *self._at(t)))
         return jacobian_by_differences(lambda s, x: [self.hamiltonian(lent(q), x, *self._at(s))], t, p)[0]
+
+    def _gradient(self, name: str, found: ArrayLike) -> FloatArray:
+        gradient = numbers(found, name)
+        if gradient.shape != (self.f,):
+            raise InputError(f"{name} returned shape {gradient.shape}, not ({self.f},)", item=name)
+        return gradient
+
+    def _check_gradients(self, X: FloatArray, t: float) -> None:
+        """Refuse gradients that differences of H contradict, and differences that do not serve."""
+        q, p = X[: self.f], X[self.f :]
+        field = np.concatenate([self.gradient_q(q, p, t), self.gradient_p(q, p, t)])
+        energy = lambda s, Y: [self.energy(Y, s)]  # noqa: E731
+        coarse, fine = (jacobian_by_differences(energy, t, X, step)[0] for step in (STEP, STEP / 2))
+        rounding = 1e-10 * abs(self.energy(X, t))
+        for k, part in enumerate((slice(0, self.f), slice(self.f, None))):
+            name, given = ("dH_dq", "dH_dp")[k], (self._dH_dq, self._dH_dp)[k]
+            allowed = WRONG * np.max(np.abs(fine[part])) + rounding
+            if np.any(np.abs(fine - coarse)[part] > allowed):
+                if given is None:
+                    raise InputError(f"H changes too fast for differences: give its {name}", item=name)
+            elif np.any(np.abs(field - fine)[part] > allowed):
+                raise InputError(
+                    f"{name} is {field[part]} at the start, but differences of H give {fine[part]}; correct it, or "
+                    "leave it out",
+                    item=name,
+                )
 
     def _field(self, t: float, X: FloatArray) -> FloatArray:
         q, p = X[: self.f], X[self.f :]
@@ -152,7 +180,8 @@ class HamiltonianFlow(Flow):
         Raises
         ------
         InputError
-            An unknown method, an explicit one for an H that is not separable, or a step that is zero or not finite.
+            An unknown method, an explicit one for an H that is not separable, a step that is zero or not finite, or
+            gradients that differences of H contradict.
         ConvergenceError
             If the implicit equations of a step could not be solved; take a smaller one.
         """
@@ -161,9 +190,14 @@ class HamiltonianFlow(Flow):
         if method != "gauss6" and not self.separable:
             raise InputError(f"{method} needs H = T(p) + U(q): say separable=True, or use gauss6", item="method")
         steps, every = whole_number(steps, "steps", 0), whole_number(every, "every")
-        if not np.isfinite(dt) or dt == 0.0 or not np.isfinite(t0):
-            raise InputError("dt is finite and not zero, t0 finite", item="dt")
-        X = self._state(np.concatenate([np.atleast_1d(numbers(q0, "q0")), np.atleast_1d(numbers(p0, "p0"))]))
+        dt, t0 = finite_number(dt, "dt"), finite_number(t0, "t0")
+        if dt == 0.0:
+            raise InputError("dt is finite and not zero", item="dt")
+        parts_of_state = [np.atleast_1d(numbers(part, name)) for name, part in (("q0", q0), ("p0", p0))]
+        if any(part.shape != (self.f,) for part in parts_of_state):
+            raise InputError(f"q0 and p0 have shape ({self.f},) each", item="q0")
+        X = self._state(np.concatenate(parts_of_state))
+        self._check_gradients(X, t0)
         if method != "gauss6":
             self._require_separable(X, t0)
         parts = [1.0] if method == "leapfrog" else list(SUZUKI)

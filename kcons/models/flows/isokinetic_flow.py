@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import check_call, lent, numbers, whole_number
 from kcons.errors import InputError
 from kcons.models.flows.flow import FloatArray, Flow, phase_volume
 
@@ -63,10 +63,12 @@ class Thermostat(Flow):
         m = numbers(masses, "masses").copy()
         if m.ndim != 1 or m.size < 2 or not np.all(np.isfinite(m) & (m > 0)):
             raise InputError("masses are positive, one for each of at least two Cartesian components", item="masses")
-        if momentum_removed and m.size % momentum_removed:
+        check_call("force", force, ("x",))
+        momentum_removed = whole_number(momentum_removed, "momentum_removed", 0)
+        if momentum_removed and (m.size % momentum_removed or m.size == momentum_removed):
             raise InputError("the components do not divide into particles of this dimension", item="momentum_removed")
         self.masses, self.root = m, np.sqrt(m)
-        self.force, self.removed = force, int(momentum_removed)
+        self.force, self.removed = force, momentum_removed
         super().__init__(self._field, 2 * m.size)
 
     @property
@@ -83,12 +85,17 @@ class Thermostat(Flow):
             Without kinetic energy, or with a total momentum although it was said to be removed.
         """
         x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
+        if x.shape != self.masses.shape or v.shape != self.masses.shape:
+            raise InputError(f"x and v have {self.masses.size} components each, as the masses", item="x")
         if not v @ (self.masses * v) > 1e-290:
             raise InputError("an isokinetic thermostat needs non-zero kinetic energy", item="v")
         if self.removed:
             total = (self.masses * v).reshape(-1, self.removed).sum(axis=0)
             if np.max(np.abs(total)) > 1e-12 * np.sum(np.abs(self.masses * v)):
                 raise InputError("the total momentum is not zero: subtract it from the start", item="v")
+            pull = self._force(x).reshape(-1, self.removed)
+            if np.max(np.abs(pull.sum(axis=0))) > 1e-9 * np.sum(np.abs(pull)):
+                raise InputError("the forces do not sum to zero, as momentum_removed has it", item="momentum_removed")
         return self._state(np.concatenate([self.root * x, self.root * v]))
 
     def positions(self, X: FloatArray) -> FloatArray:
@@ -102,7 +109,10 @@ class Thermostat(Flow):
         return float(w @ (self._force(self.positions(X)) / self.root) / (w @ w))
 
     def _force(self, x: FloatArray) -> FloatArray:
-        return numbers(self.force(lent(x)), "force")
+        f = numbers(self.force(lent(x)), "force")
+        if f.shape not in ((), x.shape):
+            raise InputError(f"force returned shape {f.shape}, not {x.shape}", item="force")
+        return np.broadcast_to(f, x.shape)
 
     def _field(self, t: float, X: FloatArray) -> FloatArray:
         w = X[self.masses.size :]
@@ -129,7 +139,7 @@ class Thermostat(Flow):
         """Measure the compression of phase space along a trajectory, and predict it from alpha."""
         X0 = self._state(X0)
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
-        wanted = numbers(times, "times")
+        wanted, pieces = np.atleast_1d(numbers(times, "times")), whole_number(pieces, "pieces")
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
         for a, b in pairwise(wanted):
             for c, d in pairwise(np.linspace(a, b, pieces + 1)):

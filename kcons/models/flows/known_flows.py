@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import finite_number, lent, numbers, positive
 from kcons.errors import InputError
 from kcons.models.flows.flow import FloatArray, Flow
 from kcons.models.flows.hamiltonian import HamiltonianFlow
 from kcons.models.flows.jordan import JordanBlocks, JordanForm, jordan_block
 from kcons.models.flows.linear_flow import LinearFlow
+
+#: Part of the energy of the separatrix, within which elliptic functions of double precision lose their digits.
+NEAR_SEPARATRIX = 1e-9
 
 
 class DampedOscillator(LinearFlow):
@@ -26,11 +29,9 @@ class DampedOscillator(LinearFlow):
     """
 
     def __init__(self, omega: float = 1.0, eta: float = 0.2) -> None:
-        if not (np.isfinite(omega) and omega > 0):
-            raise InputError(f"Omega is positive and finite, not {omega}", item="omega")
-        if not (np.isfinite(eta) and eta >= 0):
+        self.omega, self.eta = positive(omega, "omega"), finite_number(eta, "eta")
+        if self.eta < 0:
             raise InputError(f"eta is not negative, so it cannot be {eta}", item="eta")
-        self.omega, self.eta = float(omega), float(eta)
         super().__init__([[0.0, self.omega], [-self.omega, -self.eta]])
 
     @property
@@ -113,9 +114,7 @@ class Pendulum(HamiltonianFlow):
     """
 
     def __init__(self, omega: float = 1.0) -> None:
-        if not (np.isfinite(omega) and omega > 0):
-            raise InputError(f"Omega is positive and finite, not {omega}", item="omega")
-        self.omega = float(omega)
+        self.omega = positive(omega, "omega")
         super().__init__(
             lambda q, p: float(self.omega * (0.5 * p[0] ** 2 + 2.0 * np.sin(0.5 * q[0]) ** 2)),
             1,
@@ -130,17 +129,31 @@ class Pendulum(HamiltonianFlow):
 
         With k^2 = H/(2 Omega): sin(theta/2) = k sn(Omega t + u_0 | k^2) for k < 1, and theta/2 = am(k Omega t + u_0 |
         1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
+
+        Raises
+        ------
+        InputError
+            A start that is near the separatrix, and not on it.
         """
         theta0, rate0 = self._state(X0)
         times = numbers(t, "t")
         m = self.energy(X0) / (2.0 * self.omega)
+        # 1 - m without its cancellation, and what rounding makes of a start on the separatrix.
+        up, half, off = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0), 2.2e-16 * max(1.0, abs(theta0))
+        short, rounding = (up - half) * (up + half), (2 * up + off) * off
+        if rounding < abs(short) < NEAR_SEPARATRIX:
+            raise InputError(
+                f"the start is so near the separatrix (by {short:.2g} of its energy) that elliptic functions lose "
+                "their digits: take flow.solve(...)",
+                item="X0",
+            )
         # Measured from the nearest lowest position.
         turns = np.round(theta0 / (2 * np.pi))
         sine, half_rate = np.sin(0.5 * (theta0 - 2 * np.pi * turns)), 0.5 * rate0
         if m == 0.0:
             return np.stack(np.broadcast_arrays(theta0 + 0 * times, 0.0 * times), axis=-1)
         k = np.sqrt(m)
-        if m == 1.0:
+        if abs(short) <= rounding:
             # On the separatrix, where the elliptic functions are infinite; at rest at the top, arctanh is.
             with np.errstate(divide="ignore", over="ignore"):
                 u = np.sign(rate0) * self.omega * times + np.arctanh(sine)
@@ -181,10 +194,7 @@ class ParticleOnSphere(Flow):
     def __init__(
         self, radius: float = 1.0, mass: float = 1.0, force: Callable[[FloatArray], ArrayLike] | None = None
     ) -> None:
-        for name, value in (("radius", radius), ("mass", mass)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} is positive and finite, not {value}", item=name)
-        self.radius, self.mass = float(radius), float(mass)
+        self.radius, self.mass = positive(radius, "radius"), positive(mass, "mass")
         self.force = force
         super().__init__(lambda t, X: np.concatenate([X[3:], self.acceleration(X[:3], X[3:])]), 6)
 
@@ -198,8 +208,18 @@ class ParticleOnSphere(Flow):
         return np.asarray(a)
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
-        """The free motion x(t), shape (3,) or (k, 3); v0 is tangent to the sphere."""
-        x0, v0 = numbers(x0, "x0"), numbers(v0, "v0")
+        """The free motion x(t), shape (3,) or (k, 3).
+
+        Raises
+        ------
+        InputError
+            x0 is off the sphere, or v0 leaves it.
+        """
+        x0, v0 = np.split(self._state(np.concatenate([np.ravel(numbers(x0, "x0")), np.ravel(numbers(v0, "v0"))])), 2)
         speed = float(np.linalg.norm(v0))
+        if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
+            raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the centre, not {self.radius:.9g}", item="x0")
+        if abs(x0 @ v0) > 1e-9 * self.radius * speed:
+            raise InputError("v0 leaves the sphere: give its part along it, v - x (x.v)/R^2", item="v0")
         angle = numbers(t, "t")[..., None] * speed / self.radius
         return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import root
 
 from kcons.constraints.arguments import numbers
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows.flow import FloatArray, jacobian_by_differences
 
 Lagrangian = Callable[[FloatArray, FloatArray, float], float]
@@ -25,6 +25,8 @@ def action(lagrangian: Lagrangian, times: ArrayLike, path: ArrayLike) -> float:
     Lagrange's equations to second order in the time step.
     """
     t, q = numbers(times, "times"), numbers(path, "path")
+    if t.ndim != 1 or not np.all(np.diff(t) > 0) or q.shape[:1] != t.shape:
+        raise InputError("times increase, and the path has a place for each of them", item="times")
     q = q.reshape(len(t), -1)
     steps = np.diff(t)
     middles, velocities = 0.5 * (q[1:] + q[:-1]), np.diff(q, axis=0) / steps[:, None]

@@ -92,6 +92,7 @@ class ConstrainedGrowth:
         """
         if len(p.x) != self.n:
             raise InputError(f"the start has {len(p.x)} populations, the model {self.n}", item="x0")
+        check_lanes(self, p.x.shape[1:])
         bound = copy.copy(self)
         bound.rows = tuple(row.bind(p) for row in self.rows)
         for number, row in enumerate(bound.rows):
@@ -99,6 +100,8 @@ class ConstrainedGrowth:
         bad = bound.model.not_finite(p)
         if bad is not None:
             raise InputError(f"the {bad[0]} of species {bad[1]} at the start is not finite", item="rates")
+        if p.x.ndim == 2:
+            _refuse_mixed(bound, p)
         bound._held(p)
         return bound
 
@@ -154,7 +157,7 @@ class ConstrainedGrowth:
         )
 
     def logarithmic_velocity(self, p: Populations) -> FloatArray:
-        """d ln x/dt = phi + z + Psi/x, shape of p.x; what `solve` integrates.
+        """d ln x/dt = phi + z + Psi/x, shape of p.x; what `solve` integrates. NaN of systems whose rows contradict.
 
         Raises
         ------
@@ -171,7 +174,8 @@ class ConstrainedGrowth:
                 found = self._solve(p, drift)
                 if p.x.ndim == 1:
                     self._refuse(found, p)
-                slope = phi + found.z
+                off = np.any(found.contradiction > orthogonal_rows.SOLVABILITY_TOLERANCE, axis=0)
+                slope = np.where(off, np.nan, phi + found.z)
             if psi is not None:
                 slope = slope + psi * np.exp(-p.log_x)
             fallen = (p.log_x < 1e-17 * LEAST_LOGARITHM) & (slope < 0)
@@ -351,6 +355,51 @@ def _misses(rows: Sequence[Row], p: Populations, lanes: tuple[int, ...]) -> tupl
         sizes = [np.maximum(row.size(p), np.finfo(np.float64).tiny) for row in rows]
         left = np.max([np.abs(v) / (EPSILON * s) for v, s in zip(values, sizes, strict=True)], axis=0)
     return values, np.where(np.isfinite(left), left, np.inf)
+
+
+def check_lanes(system: ConstrainedGrowth, lanes: tuple[int, ...]) -> None:
+    """Refuse parameters that are for another number of systems than there are, () for a single one.
+
+    Raises
+    ------
+    InputError
+    """
+    found = [(system.model.lanes, "the model"), *((row.lanes, f"row {row.name}") for row in system.rows)]
+    for own, name in found:
+        if own not in ((), lanes):
+            raise InputError(
+                f"parameters of {name} are for {own[0]} systems side by side, "
+                f"the start is {f'of {lanes[0]}' if lanes else 'a single one'}: give one number for all, or as "
+                "many as there are starts in solve_ensemble",
+                item="x0",
+            )
+
+
+def _refuse_mixed(system: ConstrainedGrowth, p: Populations) -> None:
+    """Refuse vectorized functions that give another result for the last of N systems when it is alone."""
+    last = np.array([p.x.shape[1] - 1])
+    alone, q = system.take(last), Populations(np.asarray(p.time)[last], p.x[:, last], p.log_x[:, last])
+    pairs = [("the rates", system.model.rates(p), alone.model.rates(q))]
+    if system.model.sources(p) is not None:
+        pairs.append(("the sources", np.asarray(system.model.sources(p)), np.asarray(alone.model.sources(q))))
+    for row, own in zip(system.rows, alone.rows, strict=True):
+        pairs.append((f"the coefficients of {row.name}", row.gradient(p), own.gradient(q)))
+        for what, both in (("rate", (row.rate(p), own.rate(q))), ("value", _values(row, p, own, q))):
+            whole, part = (np.broadcast_to(b, s.x.shape[1:]) for b, s in zip(both, (p, q), strict=True))
+            pairs.append((f"the {what} of {row.name}", whole, part))
+    for what, whole, part in pairs:
+        size = np.max(np.abs(part), initial=np.finfo(np.float64).tiny)
+        if np.any(np.abs(whole[..., -1] - part[..., 0]) > 1e-6 * size):
+            raise InputError(
+                f"{what}: of several systems side by side, the last has another value than alone. A vectorized "
+                "function takes x of shape (n, N): sum over axis 0, and nothing over systems",
+                item="vectorized",
+            )
+
+
+def _values(row: Row, p: Populations, own: Row, q: Populations) -> tuple[FloatArray | float, FloatArray | float]:
+    """Of one row in two ways, plus 1 lest rounding at 0 be compared; the same number where it has none."""
+    return (row.value(p) / row.size(p) + 1.0, own.value(q) / own.size(q) + 1.0) if row.holonomic else (1.0, 1.0)
 
 
 def _rows_in(given: Sequence[Row] | Row, n: int) -> tuple[Row, ...]:

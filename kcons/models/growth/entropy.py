@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import check_call, finite_number, numbers, positive, refuse_other
 from kcons.errors import BudgetError, InputError
 from kcons.models.growth.compensated_sums import compensated_sum
 from kcons.models.growth.mixture import Mixture
-from kcons.models.growth.model import FloatArray, Populations, taken
+from kcons.models.growth.model import FloatArray, Populations, common_lanes, taken
 from kcons.models.growth.rows import EPSILON, Row
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ class EntropyLaw(ABC):
 
     #: Whether `excess_rate` looks at the excess of the state.
     feedback: bool = False
+    #: Shape of parameters that differ from system to system, (N,); () where none do.
+    lanes: tuple[int, ...] = ()
 
     @abstractmethod
     def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
@@ -90,11 +92,12 @@ class Relaxation(EntropyLaw):
 
     def __init__(self, tau: float | FloatArray, budget: float | None = None, *, partial: bool = False) -> None:
         self.tau: FloatArray = numbers(tau, "tau").copy()
-        if not np.all(np.isfinite(self.tau) & (self.tau > 0)):
-            raise InputError(f"tau is a positive time, not {tau}", item="tau")
-        if budget is not None and not (np.isfinite(budget) and budget >= 0):
+        if self.tau.ndim > 1 or not np.all(np.isfinite(self.tau) & (self.tau > 0)):
+            raise InputError(f"tau is a positive time, or one a system, not {tau}", item="tau")
+        self.lanes = self.tau.shape
+        self.budget = None if budget is None else finite_number(budget, "budget")
+        if self.budget is not None and self.budget < 0:
             raise InputError(f"the budget T(s_eq - s_0) is not negative, so it cannot be {budget}", item="budget")
-        self.budget = None if budget is None else float(budget)
         self.partial = partial
 
     def _budget(self, excess0: FloatArray) -> FloatArray:
@@ -150,7 +153,9 @@ class Relaxation(EntropyLaw):
         return 1.0 / (2.0 * self.tau) if not self.partial else None
 
     def take(self, lanes: NDArray[np.intp]) -> Self:
-        return taken(self, lanes, "tau")
+        part = taken(self, lanes, "tau")
+        part.lanes = part.tau.shape
+        return part
 
 
 class NoProduction(EntropyLaw):
@@ -188,9 +193,9 @@ class PrescribedProduction(EntropyLaw):
     LOOKS = 2001
 
     def __init__(self, produced: Callable[[float], float], rate: Callable[[float], float], *, until: float) -> None:
-        if not (np.isfinite(until) and until > 0):
-            raise InputError("`until` is a positive time", item="until")
-        self._produced, self._rate, self.until = produced, rate, float(until)
+        check_call("produced", produced, ("t",))
+        check_call("rate", rate, ("t",))
+        self._produced, self._rate, self.until = produced, rate, positive(until, "until")
         if abs(produced(0.0)) > 1e-12:
             raise InputError(f"nothing has been produced at t = 0, not {produced(0.0):.6g}", item="produced")
         times = np.linspace(0.0, until, 101)
@@ -205,10 +210,27 @@ class PrescribedProduction(EntropyLaw):
             )
 
     def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
-        return np.vectorize(self._produced, otypes=[np.float64])(elapsed)
+        return np.vectorize(self._produced, otypes=[np.float64])(self._looked_at(elapsed))
+
+    def _looked_at(self, elapsed: float | FloatArray) -> float | FloatArray:
+        """Times from the start that lie in what was checked.
+
+        Raises
+        ------
+        InputError
+            They do not.
+        """
+        off = np.max(np.maximum(elapsed - self.until, -np.asarray(elapsed)), initial=0.0)
+        if off > 1e-9 * self.until:
+            raise InputError(
+                f"the prescribed production is known from the start until {self.until:g} after it: end the run there, "
+                "or raise `until`",
+                item="until",
+            )
+        return elapsed
 
     def excess_rate(self, elapsed: float | FloatArray, excess: FloatArray, excess0: FloatArray) -> FloatArray:
-        return -np.vectorize(self._rate, otypes=[np.float64])(elapsed)
+        return -np.vectorize(self._rate, otypes=[np.float64])(self._looked_at(elapsed))
 
     def check(self, excess0: FloatArray, most: FloatArray) -> None:
         times = np.linspace(0.0, self.until, self.LOOKS)
@@ -239,8 +261,11 @@ class EntropyRow(Row):
     name = "entropy production"
 
     def __init__(self, mixture: Mixture, law: EntropyLaw) -> None:
+        refuse_other(mixture, Mixture, "mixture", "a kcons.models.growth.Mixture")
+        refuse_other(law, EntropyLaw, "law", "a law such as kcons.models.growth.Relaxation(tau)")
         self.mixture = mixture
         self.law = law
+        self.lanes = common_lanes(mixture=mixture.lanes, law=law.lanes)
         self.start: float | FloatArray = 0.0
         self.total: FloatArray | None = None
         self.excess0: FloatArray | None = None
@@ -278,6 +303,8 @@ class EntropyRow(Row):
         return np.maximum(4.0 * np.minimum(excess, self.mixture.kT * self._total(p)), slope)
 
     def bind(self, p: Populations) -> EntropyRow:
+        if self.mixture.n != len(p.x):
+            raise InputError(f"the mixture has {self.mixture.n} species, the start {len(p.x)}", item="mixture")
         bound = copy.copy(self)
         bound.start = p.time
         bound.total = compensated_sum(p.x)
@@ -291,6 +318,7 @@ class EntropyRow(Row):
     def take(self, lanes: NDArray[np.intp]) -> EntropyRow:
         part = taken(self, lanes, "start", "total", "excess0")
         part.mixture, part.law = self.mixture.take(lanes), self.law.take(lanes)
+        part.lanes = lanes.shape if self.lanes else ()
         return part
 
 

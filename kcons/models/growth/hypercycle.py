@@ -24,12 +24,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, whole_number
 from kcons.errors import InputError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation
 from kcons.models.growth.mixture import Mixture
-from kcons.models.growth.model import FloatArray, GrowthModel, Populations
+from kcons.models.growth.model import FloatArray, GrowthModel, Populations, common_lanes
 from kcons.models.growth.rows import Row, TotalPopulation
 
 #: Largest turning time of the direction, in parts of the other times, at which motion may count as settled.
@@ -67,11 +67,10 @@ class Hypercycle(GrowthModel):
     """
 
     def __init__(self, n: int = 5, k_h: ArrayLike = 3.0, mu0: ArrayLike | None = None, kT: ArrayLike = 1.0) -> None:
-        if int(n) != n or n < 2:
-            raise InputError(f"a hypercycle has at least two species, not {n}", item="n")
-        super().__init__(lambda t, x: self.k_h * np.roll(x, -1, axis=0), n=int(n), vectorized=True)
+        n = whole_number(n, "n", 2)
+        super().__init__(lambda t, x: self.k_h * np.roll(x, -1, axis=0), n=n, vectorized=True)
         self.k_h: FloatArray = numbers(k_h, "k_h").copy()
-        if not np.all(np.isfinite(self.k_h) & (self.k_h > 0)):
+        if self.k_h.ndim > 1 or not np.all(np.isfinite(self.k_h) & (self.k_h > 0)):
             raise InputError(f"the rate constant k_h is positive and finite, not {self.k_h}", item="k_h")
         if mu0 is None:
             levels = 0.1 + 0.05 * np.arange(1, n + 1)
@@ -79,12 +78,14 @@ class Hypercycle(GrowthModel):
         self.mixture = Mixture(mu0, kT)
         if self.mixture.n != n:
             raise InputError(f"{self.mixture.n} standard potentials for {n} species", item="mu0")
+        self.lanes = common_lanes(k_h=self.k_h.shape, mixture=self.mixture.lanes)
 
     def take(self, lanes: NDArray[np.intp]) -> Hypercycle:
         taken = Hypercycle.__new__(Hypercycle)
         GrowthModel.__init__(taken, lambda t, x: taken.k_h * np.roll(x, -1, axis=0), n=self.n, vectorized=True)
         taken.k_h = self.k_h[lanes] if self.k_h.ndim else self.k_h
         taken.mixture = self.mixture.take(lanes)
+        taken.lanes = lanes.shape if self.lanes else ()
         return taken
 
     # -- the three systems of figure 11 ----------------------------------------------------------------

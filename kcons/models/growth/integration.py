@@ -8,7 +8,7 @@ starts from there. Values between the steps come from the method's own interpola
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
+from kcons.constraints.arguments import check_call, numbers
 from kcons.errors import InputError, NonFiniteError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
@@ -169,9 +170,10 @@ def solve(
     p0 = Populations.from_logarithms(t0, log_start)
     bound = system.bind(p0)
     log_start = bound.project(t0, log_start) if project else log_start
-    options = {"rtol": 1e-9, "atol": 1e-11} | options
+    options = {"rtol": 1e-9, "atol": 1e-11} | {name: value for name, value in options.items() if value is not None}
     check_sizes(options, system.n)
-    tolerance = max(options["atol"] + options["rtol"], 1e-13)
+    options |= {name: numbers(options[name], name) for name in ("rtol", "atol")}
+    tolerance = max(float(np.min(options["rtol"] + options["atol"])), 1e-13)
     holder: dict[str, Any] = {}
 
     def slope(t: float, y: FloatArray) -> FloatArray:
@@ -213,7 +215,15 @@ def solve(
             holder.clear()
         elif ode.status < 0 and "not finite" in holder:
             _refuse_rates(bound, *holder["not finite"])
+        _check_end(bound, Populations.from_logarithms(float(ode.t[-1]), ode.y[:, -1]))
     return _assemble(bound, ode, holder, (t0, t1), wanted, dense_output, events, log_start, project)
+
+
+def _check_end(system: ConstrainedGrowth, p: Populations) -> None:
+    """Refuse derivatives that are wrong where a run has ended: what depends on time may do so later only."""
+    with np.errstate(all="ignore"):
+        for row in system.rows:
+            row.check_derivatives(p)
 
 
 def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:
@@ -364,11 +374,15 @@ def _event_list(events: Event | Sequence[Event] | None) -> list[Event] | None:
     if events is None:
         return None
     wrapped: list[Event] = []
-    for event in [events] if callable(events) else list(events):
+    for event in list(events) if isinstance(events, Iterable) else [events]:
+        check_call("event", event, ("t", "x"))
 
         def of_logarithms(t: float, y: FloatArray, event: Event = event) -> float:
             with np.errstate(under="ignore"):
-                return event(t, np.exp(y))
+                value = numbers(event(t, np.exp(y)), "event")
+            if value.size != 1:
+                raise InputError(f"an event returned shape {value.shape}; it must return a number", item="event")
+            return float(value.item())
 
         for name in ("terminal", "direction"):
             if hasattr(event, name):

@@ -17,7 +17,7 @@ from scipy.integrate import DOP853
 from kcons.constraints.arguments import finite_number, numbers, whole_number
 from kcons.errors import InputError
 from kcons.models.growth.compensated_sums import two_sum
-from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
+from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth, check_lanes
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
 from kcons.models.projected_steps import check_sizes
 
@@ -101,7 +101,7 @@ def solve_ensemble(
     t0, batch, threads = finite_number(t0, "t0"), whole_number(batch, "batch"), whole_number(threads, "threads")
     check_sizes({"rtol": rtol, "atol": atol}, 1)
     times = np.atleast_1d(numbers(t_eval, "t_eval"))
-    if not np.all(np.isfinite(times)) or np.any(np.diff(times, axis=0) <= 0) or np.any(times[0] < t0):
+    if not times.size or not np.all(np.isfinite(times)) or np.any(np.diff(times, axis=0) <= 0) or np.any(times[0] < t0):
         raise InputError("t_eval holds finite times that increase, none before t0", item="t_eval")
     start = starting_logarithms(x0, log_x0)
     if start.ndim != 2 or len(start) != system.n:
@@ -111,6 +111,7 @@ def solve_ensemble(
             "an ensemble needs functions that are vectorized: GrowthModel(..., vectorized=True)", item="model"
         )
     n, N = start.shape
+    check_lanes(system, (N,))
     if times.ndim > 2 or (times.ndim == 2 and times.shape[1] != N):
         raise InputError(f"t_eval has shape (k,) or (k, {N}), not {times.shape}", item="t_eval")
     every = np.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), N))
@@ -161,7 +162,7 @@ class _Batch:
         self._show(np.ones(N, dtype=bool))
         with np.errstate(divide="ignore"):
             speed = np.max(np.abs(self.f) / (atol + rtol * np.abs(self.y)), axis=0)
-            place = np.max(np.abs(self.y) / (atol + rtol * np.abs(self.y)), axis=0)
+            place = np.max(np.maximum(np.abs(self.y), 1.0) / (atol + rtol * np.abs(self.y)), axis=0)
             self.h = np.minimum(0.01 * place / np.maximum(speed, 1e-300), np.maximum(times[-1] - t0, 1e-300))
         self.was_rejected = np.zeros(N, dtype=bool)
         self.rounds = 0

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.models.growth.compensated_sums import compensated_sum, two_sum
-from kcons.models.growth.model import FloatArray, Populations, taken
+from kcons.models.growth.model import FloatArray, Populations, common_lanes, taken
 
 #: Below this |ln x/x_eq| the excess of a species is summed as a power series.
 NEAR = 0.2
@@ -42,10 +42,11 @@ class Mixture:
     def __init__(self, mu0: ArrayLike, kT: ArrayLike = 1.0) -> None:
         self.mu0: FloatArray = numbers(mu0, "mu0").copy()
         self.kT: FloatArray = numbers(kT, "kT").copy()
-        if self.mu0.ndim not in (1, 2) or not np.all(np.isfinite(self.mu0)):
+        if self.mu0.ndim not in (1, 2) or not self.mu0.size or not np.all(np.isfinite(self.mu0)):
             raise InputError("mu0 has shape (n,) and is finite", item="mu0")
-        if not np.all(np.isfinite(self.kT) & (self.kT > 0)):
-            raise InputError("kT is positive and finite", item="kT")
+        if self.kT.ndim > 1 or not np.all(np.isfinite(self.kT) & (self.kT > 0)):
+            raise InputError("kT is positive and finite, a number or one a system", item="kT")
+        self.lanes = common_lanes(mu0=self.mu0.shape[1:], kT=self.kT.shape)
         # -ln W, the Gibbs energy at equilibrium over c kT.
         reduced = -self._columns() / self.kT
         top = np.max(reduced, axis=0)
@@ -144,7 +145,9 @@ class Mixture:
     def take(self, lanes: NDArray[np.intp]) -> Self:
         """The mixtures of some of N systems."""
         parts = ["mu0"] * (self.mu0.ndim == 2) + ["kT"] + ["_log_w", "_log_fraction"] * (self._log_w.ndim > 0)
-        return taken(self, lanes, *parts)
+        part = taken(self, lanes, *parts)
+        part.lanes = lanes.shape if self.lanes else ()
+        return part
 
 
 def entropy_function(u: ArrayLike) -> FloatArray:

@@ -119,6 +119,9 @@ class GrowthModel:
         `n` is no whole number from 1 on; functions of other arguments.
     """
 
+    #: Shape of parameters that differ from system to system, (N,); () where none do.
+    lanes: tuple[int, ...] = ()
+
     def __init__(self, rates: OfState, sources: OfState | None = None, *, n: int, vectorized: bool = False) -> None:
         self.n = whole_number(n, "n")
         check_call("rates", rates, ("t", "x"))
@@ -171,6 +174,24 @@ class GrowthModel:
     def take(self, lanes: NDArray[np.intp]) -> GrowthModel:
         """The model of some of N systems side by side; itself where parameters are common to all."""
         return self
+
+
+def common_lanes(**shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape of parameters side by side, each of which is () or (N,).
+
+    Raises
+    ------
+    InputError
+        They are for different numbers of systems.
+    """
+    own = {shape for shape in shapes.values() if shape}
+    if len(own) > 1:
+        raise InputError(
+            f"{' and '.join(shapes)} are for different numbers of systems: "
+            f"{', '.join(str(shape[0]) for shape in shapes.values() if shape)}",
+            item=next(iter(shapes)),
+        )
+    return own.pop() if own else ()
 
 
 def taken(item: T, lanes: NDArray[np.intp], *names: str) -> T:

@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import check_call, numbers, whole_number
-from kcons.constraints.target import WRONG, contradicted
+from kcons.constraints.target import WRONG, contradicted, exact_step
 from kcons.errors import ConstraintError, InputError
 from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate, taken
 
 #: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
 START_TOLERANCE = 1e-10
 EPSILON = float(np.finfo(np.float64).eps)
+#: Step of differences, in ln x; they serve where half of it changes them by no more than this part.
+STEP, SMOOTH = 0.005, 1e-6
 
 
 class Row(ABC):
@@ -31,6 +33,8 @@ class Row(ABC):
     #: Whether the row has a value that the state is projected on.
     holonomic: bool = False
     name: str = "row"
+    #: Shape of parameters that differ from system to system, (N,); () where none do.
+    lanes: tuple[int, ...] = ()
 
     @abstractmethod
     def gradient(self, p: Populations) -> FloatArray:
@@ -55,6 +59,9 @@ class Row(ABC):
     def take(self, lanes: NDArray[np.intp]) -> Row:
         """The row of some of N systems side by side."""
         return self
+
+    def check_derivatives(self, p: Populations) -> None:
+        """Refuse derivatives that differences contradict, if it has any."""
 
     def check(self, p: Populations, number: int) -> None:
         """Refuse a start that is off the row.
@@ -151,14 +158,24 @@ class HolonomicRow(Row):
         ------
         InputError
         """
+        coarse, found = (relative_differences(self.measure, p, h) * p.x for h in (STEP, STEP / 2))
+        size = np.abs(found).sum(axis=0)
         if self._gradient is not None:
-            given, found = self.gradient(p) * p.x, relative_differences(self.measure, p) * p.x
-            wrong = ~(np.abs(given - found) <= WRONG * np.abs(found).sum(axis=0))
+            given = self.gradient(p) * p.x
+            wrong = (np.abs(given - found) > WRONG * size) & (np.abs(found - coarse) <= WRONG * size)
             if wrong.any():
                 k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
                 raise InputError(
                     f"gradient of {self.name}: {(given / p.x)[k]:.6g} for species {k[0]}, but differences of the "
                     f"function give {(found / p.x)[k]:.6g}; correct it, or leave it out",
+                    item="gradient",
+                )
+        else:
+            rough = np.abs(found - coarse) > SMOOTH * size + 1e-12 * self._magnitude(p)
+            if rough.any():
+                k = np.unravel_index(int(np.argmax(rough)), rough.shape)
+                raise InputError(
+                    f"{self.name} changes too fast with species {k[0]} for differences: give its gradient",
                     item="gradient",
                 )
         if self._time_derivative is None:
@@ -170,6 +187,9 @@ class HolonomicRow(Row):
         """Compare a derivative in time at the state `p` with differences, where these are smooth."""
         coarse, fine = (self._rate_by_differences(p, h) for h in (1e-3, 5e-4))
         wrong = contradicted(given, coarse, fine, 1e-9 * self._magnitude(p))
+        for h in (1e-6, 1e-9) if np.any(wrong) else ():  # what changes faster is seen by these
+            near = self._rate_by_differences(p, h)
+            wrong &= ~(np.abs(near - given) <= WRONG * np.maximum(np.abs(near), np.abs(given)))
         if np.any(wrong):
             k = int(np.argmax(wrong))
             values = [float(np.broadcast_to(v, np.shape(wrong)).ravel()[k]) for v in (given, fine)]
@@ -178,8 +198,10 @@ class HolonomicRow(Row):
             )
 
     def _rate_by_differences(self, p: Populations, h: float) -> FloatArray:
+        h = exact_step(h, p.time)
         later, earlier = (self._at_time(Populations.from_logarithms(p.time + dt, p.log_x)) for dt in (h, -h))
-        return (later - earlier) / (2 * h)
+        with np.errstate(all="ignore"):
+            return (later - earlier) / (2 * h)
 
     def _at_time(self, p: Populations) -> FloatArray:
         """What changes with time at fixed x."""
@@ -215,6 +237,8 @@ class LinearRow(HolonomicRow):
         name: str = "linear row",
     ) -> None:
         c = numbers(coefficients, "coefficients").copy()
+        if callable(target):
+            check_call(f"{name}: target", target, ("t",))
         if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
             raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
         self.coefficients: FloatArray = c
@@ -242,12 +266,13 @@ class LinearRow(HolonomicRow):
         assert moving is not None
         return np.asarray(np.vectorize(lambda t: self._pair(moving(t), t)[item], otypes=[np.float64])(p.time))
 
-    def _pair(self, given: tuple[float, float], t: float) -> tuple[float, float]:
-        if np.shape(given) != (2,):
+    def _pair(self, given: tuple[float, float], t: float) -> FloatArray:
+        pair = numbers(given, "target")
+        if pair.shape != (2,):
             raise InputError(
                 f"the target of {self.name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
             )
-        return given
+        return pair
 
     def value(self, p: Populations) -> FloatArray:
         return self.measure(p) - self._moved(p, 0) if self.moving else super().value(p)
@@ -297,6 +322,9 @@ class VelocityRow(Row):
         vectorized: bool = False,
         name: str = "velocity row",
     ) -> None:
+        for what, given in (("coefficients", coefficients), ("rate", rate)):
+            if callable(given):
+                check_call(f"{name}: {what}", given, ("t", "x"))
         self._coefficients = coefficients if callable(coefficients) else numbers(coefficients, "coefficients").copy()
         self._rate = rate if callable(rate) else _number(rate, "rate")
         self.vectorized = vectorized
@@ -317,7 +345,7 @@ class VelocityRow(Row):
 
 
 def relative_differences(
-    measure: Callable[[Populations], FloatArray], p: Populations, step: float = 0.02
+    measure: Callable[[Populations], FloatArray], p: Populations, step: float = STEP
 ) -> FloatArray:
     """d measure/dx by central differences in ln x, extrapolated to order six (steps h, h/2, h/4)."""
     gradient = np.empty_like(p.x)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import finite_number, numbers, positive
 from kcons.errors import InputError
 from kcons.models.growth.model import FloatArray, GrowthModel
 
@@ -29,18 +29,23 @@ class Logistic(GrowthModel):
         return self.alpha / self.beta
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
-        """x(t) (notes eq. 66), written with exp(-alpha t), which does not overflow.
+        """x(t) (notes eq. 66), written so that no exponential overflows.
 
         Raises
         ------
         InputError
-            Times before the one at which a population above the plateau came from infinity.
+            A negative population; times before the one at which one above the plateau came from infinity.
         """
-        exponent = -self.alpha * numbers(t, "t")
+        exponent, x0 = -self.alpha * numbers(t, "t"), finite_number(x0, "x0")
+        if x0 < 0:
+            raise InputError(f"x0 is {x0:g}; populations are not negative", item="x0")
         if x0 > self.plateau and np.any(exponent >= -np.log1p(-self.plateau / x0)):
             since = np.log1p(-self.plateau / x0) / self.alpha
             raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
-        return np.asarray(self.alpha * x0 / (self.alpha * np.exp(exponent) - self.beta * x0 * np.expm1(exponent)))
+        # Either way with exponentials of what is not positive.
+        up, down = np.exp(np.minimum(exponent, 0.0)), np.exp(-np.maximum(exponent, 0.0))
+        fed = self.beta * x0 * np.expm1(-np.abs(exponent))
+        return np.asarray(self.alpha * x0 * down / (self.alpha * up - np.where(exponent > 0, -fed, fed)))
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (1, 1)."""
@@ -98,7 +103,4 @@ class LotkaVolterra(GrowthModel):
 
 
 def _positive(**parameters: float) -> tuple[float, ...]:
-    for name, value in parameters.items():
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"{name} is positive and finite, not {value}", item=name)
-    return tuple(float(v) for v in parameters.values())
+    return tuple(positive(value, name) for name, value in parameters.items())

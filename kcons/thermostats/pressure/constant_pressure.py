@@ -98,6 +98,9 @@ class ConstantPressure(Listed):
                 system.stress(state.positions, state.time)
         return state
 
+    def turned(self, state: State) -> State:
+        return self.stepper.turned(state) if isinstance(self.stepper, Listed) else state
+
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.
 

@@ -164,3 +164,11 @@ def test_a_period_that_is_none_is_refused(period):
         Custom([0, 1], gap, period=period)
     with pytest.raises(InputError, match=r"Formula: period is .*; give a positive number"):
         Formula("x1", 0, period=period)
+
+
+@pytest.mark.parametrize("make", [ImplicitSurface, Custom])
+def test_a_gradient_that_vanishes_is_refused_when_it_is_differenced(make) -> None:
+    """Differences leave rounding of it, in whose direction the atom was held."""
+    row = make([0], lambda r: (np.sum(r * r, axis=-1 if make is ImplicitSurface else None) - 1) ** 2, target=0.0)
+    with pytest.raises(SingularGeometryError, match="it vanishes, or the function varies faster"):
+        ConstraintSet([row], np.array([[0.6, 0.0, 0.8]]), np.ones(1))

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from kcons.errors import InputError
+from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows import (
     DampedOscillator,
     Flow,
+    LinearFlow,
     ParticleOnSphere,
     Pendulum,
     Thermostat,
@@ -125,3 +126,34 @@ def test_time_dependent_trajectory():
 def test_bad_input_is_refused(act):
     with pytest.raises(InputError):
         act()
+
+
+def test_a_jacobian_that_is_wrong_or_cannot_be_differenced_is_refused() -> None:
+    with pytest.raises(InputError, match="jacobian gives 5 for entry"):
+        phase_volume(Flow(lambda t, X: -X, 1, lambda t, X: [[5.0]]), [1.0], [0.0, 1.0])
+    steep = lambda t, X: [-1e-9 * np.tanh(X[0] / 1e-9)]  # noqa: E731
+    with pytest.raises(InputError, match="too fast about X"):
+        phase_volume(Flow(steep, 1), [1e-9], [0.0, 1.0])
+    given = Flow(steep, 1, lambda t, X: [[-1 / np.cosh(X[0] / 1e-9) ** 2]])
+    found = phase_volume(given, [1e-9], [0.0, 1.0], atol=1e-20)
+    np.testing.assert_allclose(found.log_volume, found.integrated_divergence, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pieces", [0, -1, 2.5])
+def test_no_pieces(pieces) -> None:
+    """Nothing was integrated, and the volume did not change."""
+    with pytest.raises(InputError, match="pieces"):
+        phase_volume(DampedOscillator(), [1.0, 0.0], [0.0, 5.0], pieces=pieces)
+
+
+def test_a_volume_beyond_the_digits_of_its_propagator() -> None:
+    flow = LinearFlow([[-50.0, 1.0], [0.0, -1.0]])
+    with pytest.raises(ConvergenceError, match="raise `pieces`"):
+        phase_volume(flow, [1.0, 0.0], [0.0, 10.0])
+    assert phase_volume(flow, [1.0, 0.0], [0.0, 10.0], pieces=50).log_volume[-1] == pytest.approx(-510, rel=1e-6)
+
+
+@pytest.mark.parametrize(("velocity", "n"), [(lambda t, X: X, "2"), (lambda t, X: X, 2.5), (3, 2), (lambda X: X, 2)])
+def test_what_is_no_flow(velocity, n) -> None:
+    with pytest.raises(InputError):
+        Flow(velocity, n)

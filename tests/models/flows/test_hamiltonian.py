@@ -154,7 +154,7 @@ def test_user_functions_cannot_change_the_state():
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(InputError, match="degree"):
+    with pytest.raises(InputError, match="f is 0"):
         HamiltonianFlow(coupled, 0)
     flow = HamiltonianFlow(coupled, 2)
     with pytest.raises(InputError, match="separable"):
@@ -188,3 +188,37 @@ def test_pendulum_on_its_separatrix(direction):
     assert flow.exact(times, [0.0, 2.0 * direction]) == pytest.approx(expected, abs=1e-13)
     assert flow.exact(times, [3 * np.pi, 0.0]) == pytest.approx(np.tile([3 * np.pi, 0.0], (3, 1)), abs=1e-13)
     assert flow.exact(1.0, [direction * np.pi, 0.0]) == pytest.approx([direction * np.pi, 0.0], abs=1e-13)
+
+
+def energy(q, p):
+    return 0.5 * p @ p + 0.5 * q @ q
+
+
+@pytest.mark.parametrize(
+    ("gradients", "words"),
+    [
+        ((lambda q, p: -q, lambda q, p: p), "dH_dq is .* differences of H give"),
+        ((lambda q, p: q, lambda q, p: 2 * p), "dH_dp is .* differences of H give"),
+        ((lambda q, p: q[:1], lambda q, p: p), r"dH_dq returned shape \(1,\), not \(2,\)"),
+        ((lambda q, p: q, lambda q, p: p[0]), r"dH_dp returned shape \(\), not \(2,\)"),
+        ((lambda q: q, None), "dH_dq takes"),
+    ],
+)
+def test_wrong_gradients_are_refused(gradients, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        HamiltonianFlow(energy, 2, *gradients).symplectic([1.0, 2.0], [0.5, 0.25], 0.1, 2)
+
+
+def test_an_energy_too_fine_for_differences() -> None:
+    fine = lambda q, p: 0.5 * p[0] ** 2 - 1e-4 * np.cos(q[0] / 1e-3)  # noqa: E731
+    with pytest.raises(InputError, match="too fast for differences: give its dH_dq"):
+        HamiltonianFlow(fine, 1).symplectic([1e-3], [0.1], 1e-4, 2)
+    HamiltonianFlow(fine, 1, lambda q, p: 0.1 * np.sin(q / 1e-3)).symplectic([1e-3], [0.1], 1e-4, 2)
+
+
+def test_starts_of_other_lengths() -> None:
+    """Together they had the right number of components, and were divided otherwise than they were given."""
+    with pytest.raises(InputError, match="q0 and p0 have shape"):
+        HamiltonianFlow(energy, 2).symplectic([1.0], [0.0, 1.0, 2.0], 0.1, 2)
+    with pytest.raises(InputError, match="dt"):
+        HamiltonianFlow(energy, 1).symplectic([1.0], [0.0], "small", 2)

@@ -93,3 +93,27 @@ def test_bad_input_is_refused():
         Thermostat(MASSES, quartic).state(np.zeros(6), np.zeros(6))
     with pytest.raises(InputError, match="momentum is not zero"):
         Thermostat(MASSES, springs, momentum_removed=2).state(np.zeros(6), np.ones(6))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Thermostat(np.ones(4), lambda x: -x, momentum_removed=-2), "momentum_removed is -2"),
+        (lambda: Thermostat(np.ones(5), lambda x: -x, momentum_removed=2.5), "momentum_removed is 2.5"),
+        (lambda: Thermostat(np.ones(2), lambda x: -x).state([1.0, 2.0, 0.3], [0.4]), "2 components each"),
+        (lambda: Thermostat(np.ones(2), lambda x: [1.0, 2.0, 3.0]).friction(np.ones(4)), "force returned shape"),
+        (
+            lambda: Thermostat(np.ones(2), lambda x: -x).compression([1.0, 0.2, 0.3, 0.4], [0.0, 1.0], pieces=0),
+            "pieces is 0",
+        ),
+        (
+            lambda: Thermostat(np.ones(4), lambda x: [1.0, 0.0, 0.0, 0.0], momentum_removed=2).state(
+                [0.0, 0.0, 1.0, 1.0], [0.3, 0.1, -0.3, -0.1]
+            ),
+            "forces do not sum to zero",
+        ),
+    ],
+)
+def test_thermostats_that_cannot_be(make, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make()

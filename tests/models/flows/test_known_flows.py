@@ -197,3 +197,30 @@ def test_acceleration_on_the_sphere_is_the_projected_one():
 def test_bad_parameters_are_refused(make):
     with pytest.raises(InputError):
         make()
+
+
+@pytest.mark.parametrize("start", [[0.0, 2.0 * (1 - 5e-13)], [0.0, 2.0 * (1 + 5e-13)], [np.pi, 1e-9]])
+def test_a_pendulum_next_to_its_separatrix_is_refused(start) -> None:
+    """Far beyond the first turn elliptic functions gave 1e32; at the top it stayed where it was for ever."""
+    with pytest.raises(InputError, match="near the separatrix"):
+        Pendulum().exact([3.0, 100.0], start)
+    near = [0.0, 2.0 * (1 - 2e-9)]
+    there = Pendulum().solve((0.0, 30.0), near, rtol=1e-13, atol=1e-15).y[:, -1]
+    np.testing.assert_allclose(Pendulum().exact(30.0, near), there, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "item"),
+    [
+        (lambda: ParticleOnSphere().great_circle(1.0, [2.0, 0.0, 0.0], [0.0, 1.0, 0.0]), "x0"),
+        (lambda: ParticleOnSphere().great_circle(1.0, [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]), "v0"),
+        (lambda: ParticleOnSphere().great_circle(1.0, [1.0, 0.0], [0.0, 1.0]), "state"),
+        (lambda: ParticleOnSphere("1"), "radius"),
+        (lambda: Pendulum("1"), "omega"),
+        (lambda: DampedOscillator(None), "omega"),
+        (lambda: DampedOscillator(1.0, "a"), "eta"),
+    ],
+)
+def test_what_is_no_known_flow(make, item: str) -> None:
+    with pytest.raises(InputError, match=item):
+        make()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows import Pendulum, action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
 
 M, LENGTH, G = 1.3, 0.8, 9.81
@@ -65,3 +65,9 @@ def test_action_is_stationary_on_the_true_path():
 def test_momentum_without_a_velocity():
     with pytest.raises(ConvergenceError, match="guess"):
         velocity_of_momentum(lambda q, v, t: float(np.tanh(v[0])), [0.0], [2.0])
+
+
+@pytest.mark.parametrize(("times", "path"), [([0.0, 0.0, 1.0], np.zeros(3)), ([0.0, 1.0, 2.0], np.zeros(7))])
+def test_paths_that_do_not_go_with_their_times(times, path) -> None:
+    with pytest.raises(InputError, match="times increase"):
+        action(lambda q, v, t: 0.5 * v @ v, times, path)

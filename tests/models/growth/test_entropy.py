@@ -6,7 +6,9 @@ from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError
 from kcons.models.growth import (
+    EntropyRow,
     Hypercycle,
+    Mixture,
     NoProduction,
     Populations,
     PrescribedProduction,
@@ -126,3 +128,34 @@ def test_production_law_of_the_notes():
     assert law.produced(t, np.float64(0.5)) == pytest.approx(0.5 * (1 - np.exp(-t / 30.0)), rel=1e-14)
     assert law.excess_rate(0.0, np.float64(0.5), np.float64(0.5)) == pytest.approx(-0.5 / 30.0)
     assert NoProduction().produced(t, np.float64(0.5)).tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("span", [(0.0, 3.0), (1.0, 0.0)], ids=["beyond", "before"])
+def test_a_prescribed_production_is_held_where_it_was_checked(span) -> None:
+    law = PrescribedProduction(lambda t: 0.01 * t, lambda t: 0.01, until=1.0)
+    with pytest.raises(InputError, match="known from the start until 1 after it"):
+        solve(Hypercycle(3).with_law(law), span, [0.2, 0.3, 0.5])
+    assert solve(Hypercycle(3).with_law(law), (1e6, 1e6 + 1), [0.2, 0.3, 0.5]).success
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Relaxation(3.0, "all"), "budget is 'all'"),
+        (lambda: PrescribedProduction(1.0, lambda t: 1.0, until=1.0), "produced is 1.0"),
+        (lambda: PrescribedProduction(lambda t: t, lambda: 1.0, until=1.0), "rate takes"),
+        (lambda: PrescribedProduction(lambda t: t, lambda t: 1.0, until="end"), "until is 'end'"),
+        (lambda: EntropyRow(3, Relaxation(1.0)), "mixture is 3"),
+        (lambda: EntropyRow(Mixture([0.1, 0.2]), 3.0), "law is 3.0"),
+        (lambda: EntropyRow(Mixture([0.1, 0.2]), Relaxation(1.0)).bind(START), "the mixture has 2 species"),
+        (lambda: Mixture([]), "mu0 has shape"),
+        (lambda: Mixture(np.ones((3, 4)), [1.0, 2.0]), "different numbers of systems"),
+        (lambda: Mixture([0.1, 0.2], np.ones((2, 2))), "kT is positive"),
+        (lambda: Hypercycle("5"), "n is '5'"),
+        (lambda: Hypercycle(np.nan), "n is nan"),
+        (lambda: Hypercycle(3, np.ones((2, 2))), "k_h"),
+    ],
+)
+def test_arguments_of_other_kinds(make, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make()

@@ -8,6 +8,7 @@ from kcons.errors import InputError, NonFiniteError, SingularGeometryError, Unsu
 from kcons.models.growth import (
     ConstrainedGrowth,
     GrowthModel,
+    HolonomicRow,
     Hypercycle,
     Logistic,
     Populations,
@@ -182,3 +183,35 @@ def test_rows_that_are_not_finite_are_told_where_the_run_has_come_to():
     row = VelocityRow([1.0, 1.0, 0.0], lambda t, x: 0.0 if t < 0.5 else np.nan)
     with pytest.raises(NonFiniteError, match=r"row 0 .* is not finite at t = 0\.5"):
         solve(ConstrainedGrowth(model, row), (0.0, 1.0), [0.2, 0.3, 0.5])
+
+
+@pytest.mark.parametrize("change", [np.cos, lambda t: max(t - 0.5, 0.0)], ids=["flat at the start", "later"])
+def test_a_row_that_depends_on_time_later_needs_its_derivative(change) -> None:
+    """The path would be that of projections, to first order in steps that nothing controls."""
+    model = GrowthModel(lambda t, x: [1.0 - x[1], x[0] - 0.5, -x[2]], n=3)
+    row = HolonomicRow(lambda t, x: x[0] + 0.1 * change(t))
+    with pytest.raises(InputError, match="depends on time, but has no time_derivative"):
+        solve(ConstrainedGrowth(model, [row]), (0.0, 1.0), [0.5, 0.3, 0.2])
+
+
+def test_tolerances_of_each_species_and_none() -> None:
+    system = ConstrainedGrowth(GrowthModel(lambda t, x: [1.0, 2.0], n=2), [TotalPopulation(2)])
+    usual = solve(system, (0.0, 1.0), [0.5, 0.5]).y[:, -1]
+    for options in ({"rtol": None}, {"rtol": [1e-9, 1e-9]}, {"atol": np.full(2, 1e-11)}):
+        np.testing.assert_allclose(solve(system, (0.0, 1.0), [0.5, 0.5], **options).y[:, -1], usual, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"events": 3}, "event is 3"),
+        ({"events": lambda t: t}, "is called with"),
+        ({"events": lambda t, x: x}, "must return a number"),
+        ({"events": lambda t, x: None}, "event is no array of numbers"),
+        ({"method": ["RK45"]}, "there is no method"),
+    ],
+)
+def test_events_and_methods_of_other_kinds(options, words: str) -> None:
+    system = ConstrainedGrowth(GrowthModel(lambda t, x: [1.0, 2.0], n=2), [TotalPopulation(2)])
+    with pytest.raises(InputError, match=words):
+        solve(system, (0.0, 1.0), [0.5, 0.5], **options)

@@ -8,9 +8,11 @@ from kcons.errors import BudgetError, ConstraintError, InputError
 from kcons.models.growth import (
     ConstrainedGrowth,
     GrowthModel,
+    HolonomicRow,
     Hypercycle,
     Populations,
     TotalPopulation,
+    VelocityRow,
     solve,
     solve_ensemble,
 )
@@ -154,3 +156,62 @@ def test_bad_input_is_refused():
     fixed = ConstrainedGrowth(model, TotalPopulation(5, 1.0))
     with pytest.raises(ConstraintError, match="off row 0"):
         solve_ensemble(fixed, [1.0], 2.0 * x0)
+
+
+STARTS = np.array([[0.5, 0.3], [0.2, 0.4]])
+
+
+@pytest.mark.parametrize(
+    ("rates", "rows"),
+    [
+        (lambda t, x: 1.0 - x.sum() + 0 * x, []),
+        (lambda t, x: np.array([1.0, 2.0]), []),  # as many species as systems
+        (lambda t, x: 0 * x, [HolonomicRow(lambda t, x: np.sum(x), vectorized=True)]),
+        (lambda t, x: 0 * x, [VelocityRow([1.0, 1.0], lambda t, x: 0.1 * np.sum(x), vectorized=True)]),
+    ],
+    ids=["sum over all", "no axis of systems", "row", "rate of a row"],
+)
+def test_vectorized_functions_that_mix_systems_are_refused(rates, rows) -> None:
+    system = ConstrainedGrowth(GrowthModel(rates, n=2, vectorized=True), rows)
+    with pytest.raises(InputError, match=r"than alone|returned shape \(2,\)"):
+        solve_ensemble(system, [1.0], STARTS)
+
+
+@pytest.mark.parametrize("many", [1, 3])
+def test_parameters_of_another_number_of_systems_are_refused(many: int) -> None:
+    """Those that were left over were dropped; as many as species were taken for one a species."""
+    starts = np.array([[0.4, 0.3], [0.3, 0.4], [0.3, 0.3]])
+    values = np.linspace(1.0, 2.0, many)
+    for system in (
+        Hypercycle(3, k_h=values).with_fixed_total(),
+        Hypercycle(3, kT=values).with_entropy_production(3.0),
+        Hypercycle(3).with_entropy_production(values),
+    ):
+        with pytest.raises(InputError, match=f"for {many} systems side by side, the start is of 2"):
+            solve_ensemble(system, [1.0], starts)
+        with pytest.raises(InputError, match=f"for {many} systems side by side, the start is a single one"):
+            solve(system, (0.0, 1.0), starts[:, 0])
+    with pytest.raises(InputError, match="different numbers of systems"):
+        Hypercycle(3, k_h=[1.0, 2.0], kT=[1.0, 2.0, 3.0])
+
+
+def test_a_start_at_one() -> None:
+    """All logarithms are 0, and the first step took its length from them."""
+    system = ConstrainedGrowth(GrowthModel(lambda t, x: -x, n=2, vectorized=True))
+    found = solve_ensemble(system, [1.0], np.ones((2, 3)))
+    assert not found.failed.any()
+    np.testing.assert_allclose(found.x, 0.5, rtol=1e-6)
+
+
+def test_rows_that_contradict_on_the_way_end_a_trajectory() -> None:
+    """From t = 1 on, two rows ask for different changes of the sum."""
+    rates = lambda t, x: 0 * x + np.array([[0.1], [0.2], [0.3]])  # noqa: E731
+    row = VelocityRow([1.0, 1.0, 1.0], lambda t, x: np.where(t > 1.0, 0.3, 0.0), vectorized=True)
+    system = ConstrainedGrowth(GrowthModel(rates, n=3, vectorized=True), [TotalPopulation(3), row])
+    found = solve_ensemble(system, [0.5, 2.0], np.ones((3, 2)))
+    assert found.failed.all() and np.isfinite(found.x[0]).all() and np.isnan(found.x[1]).all()
+
+
+def test_no_times() -> None:
+    with pytest.raises(InputError, match="t_eval"):
+        solve_ensemble(Hypercycle(3).with_fixed_total(), [], np.full((3, 1), 1 / 3))

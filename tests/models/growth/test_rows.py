@@ -122,3 +122,39 @@ def test_derivatives_that_contradict_their_function_are_refused(p):
         LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, -5.0)).bind(p)
     with pytest.raises(InputError, match=r"give \(value, rate\)"):
         LinearRow([1, 1, 1], lambda t: 1 + 0.1 * t).bind(p)
+
+
+def hill(power: int, *, given: bool = False) -> HolonomicRow:
+    gradient = lambda t, x: [power * x[0] ** (power - 1) / (1 + x[0] ** power) ** 2, 1.0]  # noqa: E731
+    return HolonomicRow(lambda t, x: x[0] ** power / (1 + x[0] ** power) + x[1], gradient if given else None)
+
+
+@pytest.mark.parametrize("power", [20, 60, 100])
+def test_differences_of_what_changes_fast_keep_their_digits(power: int) -> None:
+    p = Populations.from_values(0.0, [1.02, 0.3])
+    found, exact = (hill(power, given=given).gradient(p) for given in (False, True))
+    np.testing.assert_allclose(found, exact, rtol=2e-7)
+
+
+def test_differences_that_cannot_serve_are_refused() -> None:
+    """And derivatives that are right are not, only since differences are too coarse for them."""
+    p = Populations.from_values(0.0, [1.02, 0.3])
+    with pytest.raises(InputError, match="changes too fast with species 0"):
+        hill(400).bind(p)
+    hill(400, given=True).bind(p)
+    fast = TotalPopulation(2, lambda t: (1.32 + 1e-3 * np.sin(1e5 * t), 1e2 * np.cos(1e5 * t)))
+    fast.bind(p)
+    with pytest.raises(InputError, match="another rate of its target"):
+        TotalPopulation(2, lambda t: (1.32 + 1e-3 * np.sin(1e5 * t), 2e2 * np.cos(1e5 * t))).bind(p)
+
+
+def test_functions_of_rows_are_looked_at_early() -> None:
+    for make in (
+        lambda: VelocityRow(lambda x: x),
+        lambda: VelocityRow([1.0, 0.0], lambda: 0.0),
+        lambda: TotalPopulation(2, lambda: (1.0, 0.0)),
+    ):
+        with pytest.raises(InputError, match="is called with"):
+            make()
+    with pytest.raises(InputError, match="target is no array of numbers"):
+        TotalPopulation(2, lambda t: ("a", "b")).bind(Populations.from_values(0.0, [0.5, 0.5]))

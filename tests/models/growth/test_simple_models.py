@@ -103,3 +103,22 @@ def test_logistic_growth_did_not_begin_before_its_population_was_infinite():
     assert np.all(model.exact([-0.6, 5.0], 20.0) > model.plateau)
     with pytest.raises(InputError, match=r"x = 20 at t = 0 came from infinity at t = -0\.693147; give later times"):
         model.exact([0.0, -1.0], 20.0)
+
+
+def test_long_before_and_after() -> None:
+    np.testing.assert_array_equal(Logistic(1.0, 0.1).exact([-1e4, 1e6], 1.0), [0.0, 10.0])
+    assert Logistic(1.0, 0.1).exact(-2.0, 1.0) == pytest.approx(10.0 / (1 + 9 * np.exp(2.0)), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("make", "item"),
+    [
+        (lambda: Logistic("1"), "alpha"),
+        (lambda: LotkaVolterra([1.0, 2.0]), "alpha1"),
+        (lambda: Logistic().exact(1.0, [1.0, 2.0]), "x0"),
+        (lambda: Logistic().exact(1.0, -1.0), "x0"),
+    ],
+)
+def test_parameters_of_other_kinds(make, item: str) -> None:
+    with pytest.raises(InputError, match=item):
+        make()

@@ -172,6 +172,19 @@ def check_order(made, order, counts):
     assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
 
 
+@ORDERS
+def test_a_run_from_reversed_velocities_returns(order):
+    """No variable of the thermostat turns: the integral of alpha runs back by itself."""
+    held, x = dumbbells(2)
+    thermostat = Isokinetic(0.5, order=order)
+    begun = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 3)))
+    there = run(held, begun, 0.02, 50, stepper=thermostat)
+    back = run(held, there.reversed(thermostat), 0.02, 50, stepper=thermostat).reversed(thermostat)
+    np.testing.assert_allclose(back.positions, begun.positions, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(back.velocities, begun.velocities, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(back.thermostat, begun.thermostat, rtol=0, atol=1e-11)
+
+
 @pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.validation), 6])
 def test_going_back_undoes_a_run_to_the_order(order):
     """Where a drift by itself changes K a little, scaling it back is no symmetric step; dumbbells turn exactly."""
