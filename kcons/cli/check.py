@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.cli.terminal import console, rendered, say_written
-from kcons.errors import InputError, OccupiedError, UnreadableError
+from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 
 if TYPE_CHECKING:
     from kcons.mdanalysis.check.result import CheckResult
@@ -77,8 +77,15 @@ def _check(chosen: argparse.Namespace) -> int:
         print(f"kcons: {reason}", file=sys.stderr)
         say_written(_put(chosen, lambda folder: report.write_failure(chosen.trajectory, reason, folder)))
         return EXIT["incomplete"]
+    failed = False
     if chosen.forces is not None:
-        result.remarks += _temperatures(chosen, result)
+        try:
+            result.remarks += _temperatures(chosen, result)
+        except KconsError as error:  # the check itself is done, and is worth its time
+            failed = True
+            reason = " ".join(str(error).split())
+            result.remarks.append(f"no temperatures of the configurations: {reason}")
+            print(f"kcons: {reason}", file=sys.stderr)
     terminal = console()
     tables = (report.unit_table(result), report.row_table(result))
     terminal.print(report.summary(result), highlight=False, markup=False)
@@ -87,12 +94,14 @@ def _check(chosen: argparse.Namespace) -> int:
     terminal.print(report.verdict(result), soft_wrap=True)
     text = [report.summary(result), *map(rendered, tables), result.verdict]
     say_written(_put(chosen, lambda folder: report.write(result, folder, tables=text)))
-    return EXIT[result.status]
+    return 2 if failed else EXIT[result.status]
 
 
 def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
     from kcons.comparison.averages import trajectory_temperatures
 
+    if result.violated:
+        return ["no temperatures of the configurations: frames are off the constraints; say what the run held"]
     options = {"constrain": chosen.constrain, "select": chosen.select, "rigid_residues": list(chosen.rigid_residues)}
     found = trajectory_temperatures.along(chosen.trajectory, chosen.topology, chosen.forces, result.frames, **options)
     return trajectory_temperatures.sentences(found)

@@ -142,9 +142,11 @@ def _layers(chosen: argparse.Namespace, with_forces: Callable[[str], TestSystem]
         try:
             fast, slow = float(chosen.fast), None if chosen.slow is None else float(chosen.slow)
         except ValueError:
+            given = [
+                f"--{name} {getattr(chosen, name)}" for name in ("slow", "fast") if getattr(chosen, name) is not None
+            ]
             raise InputError(
-                f"--slow {chosen.slow} --fast {chosen.fast}: for a fluid give how far molecules reach, such as 4",
-                item="fast",
+                f"{' '.join(given)}: for a fluid give how far molecules reach, such as 4", item="fast"
             ) from None
         fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
         return layers.of_fluid(fluid, fast, slow, sweeps=10_000 if chosen.quick else 20_000, seed=chosen.seed)

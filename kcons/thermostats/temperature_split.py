@@ -49,6 +49,8 @@ UNCHANGED = 1e-9
 THIN = 1e-9
 #: Share of its thermal energy below which a cluster has no motion of its own.
 RIGID = 1e-9
+#: Sum of the forces in a cluster, relative to the sum of their sizes, that is their rounding; the same of torques.
+BALANCED = 1e-7
 #: Violation of a row, relative to its scale, that no temperature shows; OpenMM's own integrators leave 1e-5.
 OFF = 1e-4
 #: How far atoms are moved, as a share of the size of all, to see whether a row knows a place in space.
@@ -316,7 +318,14 @@ class TemperatureSplit:
             shift_frequency=math.sqrt(squares[0]),
             turn_frequency=math.sqrt(squares[1]),
             samples=len(series),
-            left_out=tuple(self._left_out(inside)),
+            left_out=(
+                *self._left_out(inside),
+                *(
+                    f"no force {does} clusters as a whole: that has no temperature"
+                    for does, kind in (("shifts", 0), ("turns", 1))
+                    if exists[kind].any() and not series[:, 0, kind].any()
+                ),
+            ),
         )
 
     # -- inner ----------------------------------------------------------------------------------
@@ -357,7 +366,10 @@ class TemperatureSplit:
         """Squares of the slopes by shifts, by turns, and of all, of each cluster; shape (3, clusters)."""
         clusters = self._clusters
         assert clusters is not None
-        force, torque = clusters.add_up(f), clusters.add_up(np.cross(arms, f))
+        sizes = np.sqrt((f * f).sum(axis=1))
+        force = _unbalanced(clusters.add_up(f), clusters.add_up(sizes))
+        reach = np.sqrt((arms * arms).sum(axis=1))
+        torque = _unbalanced(clusters.add_up(np.cross(arms, f)), clusters.add_up(reach * sizes))
         shift = np.where(clusters.shifts, (force * force).sum(axis=1) / clusters.mass, 0.0)
         turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
         whole = np.zeros_like(shift)
@@ -440,6 +452,11 @@ def configuration(system: System, positions: ArrayLike) -> FloatArray:
             atoms=held.row_atoms(row),
         )
     return x
+
+
+def _unbalanced(sums: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Sums of vectors by cluster; 0 where they are the rounding of what was added."""
+    return np.where((np.abs(sums).max(axis=1) > BALANCED * sizes)[:, None], sums, 0.0)
 
 
 def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:

@@ -426,4 +426,6 @@ def _nothing(topology: Topology, kind: str, selected: BoolArray | None) -> str:
         return f"nothing to hold within the selection of {int(selected.sum())} atoms ({CONSTRAIN[kind]}); widen it"
     if kind == "hbonds" and not topology.hydrogen.any():
         return "nothing to hold: there are no hydrogens; add them to the file, or hold all bonds (allbonds)"
+    if kind == "none":
+        return "nothing to hold: there is no water that would be rigid; name bonds, such as hbonds"
     return f"nothing to hold: found no water, and {CONSTRAIN[kind]} are none"

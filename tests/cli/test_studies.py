@@ -42,7 +42,7 @@ def test_how_long_the_step_may_be(tmp_path, monkeypatch, capsys):
     "command, text",
     [
         ("compare thermostat-water --slow 4", "--slow needs --fast"),
-        ("compare thermostat-water --fast near", "give how far molecules reach"),
+        ("compare thermostat-water --fast near", "kcons: --fast near: for a fluid give how far molecules reach"),
         ("compare chain --fast 3", "are for thermostat, thermostat-dumbbells, thermostat-water and for files"),
         ("compare thermostat-water --fast 3 --methods rattle", "there is no method 'rattle'"),
         ("compare thermostat-water --fast 9", "molecules reach 9"),

@@ -44,8 +44,24 @@ def test_a_dumbbell_on_springs():
     found = split.result()
     assert (found.shifts, found.turns, found.samples) == (3, 2, 40)
     assert found.shift_frequency == pytest.approx(math.sqrt(k / m), rel=1e-6) and found.turn_frequency < 0.01
-    assert found.turn is None or found.turn.value == 0 or abs(found.turn.value) < 1e-6
-    assert found.internal is None and found.left_out == ()
+    assert found.turn is None and found.internal is None
+    assert found.left_out == ("no force turns clusters as a whole: that has no temperature",)
+
+
+def test_a_cluster_alone_has_no_temperature_of_shifts_and_turns():
+    """What is left of its forces when they are added up is rounding: 0 K before."""
+    x = np.array([[0.0, 0.1, 0.0], [1.0, 0.0, 0.2], [1.3, 0.9, 0.0]])
+
+    def spring(x, t):
+        pull = (np.linalg.norm(x[2] - x[0]) - 1.5) * (x[2] - x[0])
+        return np.array([pull, 0 * pull, -pull]) + 1e-16 * np.random.default_rng(0).standard_normal((3, 3))
+
+    split = TemperatureSplit(system([Distance([[0, 1], [1, 2]])], x, [1.0, 2.0, 3.0], spring))
+    for _ in range(40):
+        split.add(x)
+    found = split.result()
+    assert found.shift is None and found.turn is None and found.internal is not None
+    assert [words.split()[2] for words in found.left_out] == ["shifts", "turns"]
 
 
 def test_a_dumbbell_in_a_field():

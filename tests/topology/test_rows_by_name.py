@@ -174,6 +174,11 @@ def test_bad_input_is_named(options, said):
         held_rows(solution(), **options)
 
 
+def test_nothing_but_water_and_no_water():
+    with pytest.raises(InputError, match="there is no water that would be rigid; name bonds"):
+        held_rows(snapshot(["C", "O"], [[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]], [(0, 1)]), "none")
+
+
 def test_water_whose_hydrogens_are_listed_as_bonded_is_a_rigid_body():
     """PSF files of TIP3P list H-H; as a bond it would be torn."""
     made = snapshot(["O", "H", "H"], WATER, [(0, 1), (0, 2), (1, 2)], residue_names=("TIP3",))

@@ -65,7 +65,7 @@ class Table:
 
 
 def terminal(table: Table) -> RichTable:
-    """The table of the terminal; columns of groups are not broken into lines."""
+    """The table of the terminal; in tables with groups, words give way before any digit or unit does."""
     from rich.table import Table as RichTable
 
     if table.grouped:
@@ -73,7 +73,9 @@ def terminal(table: Table) -> RichTable:
     else:
         made = RichTable(title=table.title or None)
     for k, heading in enumerate(table.headings):
-        made.add_column(heading, justify="left" if k in table.words else "right", no_wrap=table.grouped)
+        made.add_column(
+            heading, justify="left" if k in table.words else "right", no_wrap=table.grouped and k not in table.words
+        )
     for number, (_, group) in enumerate(groupby(table.rows, key=lambda row: row[0] if table.grouped else None)):
         if number:
             made.add_section()

@@ -286,10 +286,11 @@ class Bench:
         except OverBudgetError:
             status = "partial"
             note = f"step {log.steps + 1} was not done after {duration(clock() - now)}"
-        except UnsupportedError as error:
-            return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
         except Exception as error:  # whatever a peer raises is a result, and is shown
-            status = "failed"
+            if isinstance(error, UnsupportedError) and not log.steps:
+                note = textwrap.shorten(str(error), 300)
+                return Measurement(status="not run", note=note, **dict(common, setting=0.0))
+            status = "failed"  # a shorter step may succeed
             note = f"step {log.steps + 1}: {first_line(error)}"
         common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(test_system, method, run, log))
         if run is None or not log.seconds:

@@ -53,10 +53,10 @@ def verdict(result: CheckResult) -> Text:
 
 
 def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **options: Any) -> Table:
-    """Words to the left, numbers to the right."""
-    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1), **options)
+    """Words to the left, numbers to the right; where there is no room, cells are folded and not cut."""
+    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1), collapse_padding=True, **options)
     for header in headers:
-        shown.add_column(header, justify="left" if header in ("unit", "what") else "right")
+        shown.add_column(header, justify="left" if header in ("unit", "what") else "right", overflow="fold")
     for row in rows:
         shown.add_row(*row)
     return shown
@@ -64,7 +64,7 @@ def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **optio
 
 def unit_table(result: CheckResult) -> Table:
     """One line for lengths, one for angles."""
-    headers = ["unit", "rows", "largest", "rms", "rms of rounding", "mean", "largest mean\nof a row"]
+    headers = ["unit", "rows", "largest", "rms", "rms of\nrounding", "mean", "largest mean\nof a row"]
     headers.append("drift of rms\na ns")
     rates = any(unit.rate_rms is not None for unit in result.units)
     if rates:

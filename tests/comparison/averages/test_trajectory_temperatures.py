@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import water_files as files
 from ase import units
+from ase.build import molecule
+from ase.io import write
 
 from kcons.comparison import Potential, fluid
 from kcons.comparison.averages import trajectory_temperatures
@@ -70,3 +72,20 @@ def test_a_box_that_changes(folder, named, tmp_path):
             writer.write(atoms)
     with pytest.raises(UnsupportedError, match="the box of frame 30 is another one"):
         trajectory_temperatures.along(tmp_path / "other.trr", folder / "t.gro", "lj", range(FRAMES), constrain="none")
+
+
+def test_bonds_that_the_run_held_are_to_be_named(tmp_path, recwarn):
+    """Ethanol with stiff bonds: those to hydrogen are held and named, C-C and C-O are held and not named."""
+    ethanol, rng = molecule("CH3CH2OH"), np.random.default_rng(1)
+    frames = []
+    for _ in range(40):
+        frame = ethanol.copy()
+        frame.rotate(rng.uniform(0, 360), rng.standard_normal(3))
+        frames.append(frame)
+    write(tmp_path / "e.xyz", frames)
+    where = tmp_path / "e.xyz", tmp_path / "e.xyz", "emt", range(40)
+    found = trajectory_temperatures.along(*where, constrain="hbonds")
+    assert "2 bonds that nothing was said to hold keep their length" in found.left_out[-1]
+    assert "name all that the run held (--constrain)" in found.left_out[-1]
+    found = trajectory_temperatures.along(*where, constrain="allbonds")
+    assert not any("keep their length" in words for words in found.left_out) and not recwarn.list

@@ -31,9 +31,15 @@ def test_groups_are_named_once_and_set_apart():
     text = printed(grouped)
     assert "Title" in text and text.count("a | b") == 1
     assert [row.end_section for row in tables.terminal(grouped).rows] == [False, True, False]
-    assert all(column.no_wrap for column in tables.terminal(grouped).columns)
+    assert [column.no_wrap for column in tables.terminal(grouped).columns] == [False, True, True]
     # All cells stay in the table itself.
     assert tables.plain_text(grouped).count("a | b") == 2
+
+
+def test_where_there_is_no_room_words_give_way_and_not_numbers():
+    wide = Table(["method", *"abcde"], [["a method of many words", *["6.38 ms"] * 5]], grouped=True)
+    text = printed(wide)
+    assert text.count("6.38 ms") == 5 and "…" not in text and "words" in text
 
 
 def test_plain_text():

@@ -123,6 +123,17 @@ def test_methods_that_cannot_hold_a_sphere_say_so(spheres):
     assert spheres.of("rattle")
 
 
+def test_a_step_that_is_too_long_does_not_rule_shorter_ones_out(chain, monkeypatch):
+    """ASE's dynamics are refused at a step where they move atoms far off, which shorter steps do not."""
+    from kcons.ase import respect
+
+    monkeypatch.setattr(respect, "ABSURD", 1e-4)
+    monkeypatch.setattr(respect, "_SMALL", 1e-4)
+    found = measure.compare(chain.with_time_steps([10.0, 0.5]), methods=["ase-kcons"], budget=30).measurements
+    assert [(m.setting, m.status) for m in found] == [(10.0, "failed"), (0.5, "ok")]
+    assert "the time step is far too large" in found[0].note
+
+
 def test_energy_slope_is_the_fit():
     system = test_systems.build("sphere", 2)
     log = measure._Log(times=[0.0, 1.0, 2.0, 3.0, 4.0], energies=[1.0, 3.0, 5.0, 7.0, 9.0])
