@@ -145,8 +145,7 @@ class State:
         """
         if self.thermostat is not None and not hasattr(stepper, "step"):
             raise InputError("the state carries variables of a thermostat; give it: reversed(stepper)", item="stepper")
-        # Forces are dropped since they may depend on the velocities.
-        back = replace(self, velocities=-self.velocities, forces=None)
+        back = replace(self, velocities=-self.velocities, forces=None)  # these may depend on velocities
         return stepper.turned(back) if hasattr(stepper, "turned") else back
 
     def save(self, file: str | PathLike[str] | BinaryIO) -> None:
