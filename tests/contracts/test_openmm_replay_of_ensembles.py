@@ -201,6 +201,7 @@ def test_massless_particles(name, platform):
         context_of(system, MADE[name](0.001), platform)
 
 
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
 @pytest.mark.filterwarnings("ignore:total momentum")
 @made
 @pytest.mark.parametrize("platform", PLATFORMS)

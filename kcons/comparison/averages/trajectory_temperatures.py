@@ -22,7 +22,8 @@ from kcons.thermostats import Estimate, SplitTemperatures, TemperatureSplit
 FEWEST = 32
 #: Change of the box, relative, above which the forces are those of another system.
 CHANGED = 1e-3
-#: Spread of a length, relative, below which something holds it: bonds vibrate by 2 %, and XTC files round by 0.3 %.
+#: Spread of a length, relative, below which something may hold it: at 300 K bonds vibrate by 2 %, and XTC files round
+#: by 0.3 %.
 STIFF = 5e-3
 
 
@@ -92,9 +93,9 @@ def _along(
         return found
     i, j = stiff[0].tolist()
     held = (
-        f"{len(stiff)} bonds that nothing was said to hold keep their length, the first of them from "
-        f"{described.atom_name(i)} to {described.atom_name(j)}, so that these temperatures are too low: name all that "
-        "the run held (--constrain)"
+        f"{len(stiff)} bonds that nothing was said to hold keep their length within {STIFF:.1%}, the first of them "
+        f"from {described.atom_name(i)} to {described.atom_name(j)}: if the run held them, these temperatures are too "
+        "low; name all that it held (--constrain)"
     )
     return replace(found, left_out=(*found.left_out, held))
 

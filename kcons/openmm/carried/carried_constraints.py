@@ -14,7 +14,7 @@ from openmm import unit
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
+from kcons.errors import InfeasibleError, InputError, KconsError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.carried.callbacks import (
@@ -137,10 +137,6 @@ class CarriedConstraints(CarriedProgram):
         part._bind(LIVE[keys[0]], [force.getForceGroup() for force in mine])
         part._look_at(system)
         return part
-
-    def __deepcopy__(self, memo: dict[int, object]) -> CarriedConstraints:
-        """The same: the forces of the System call this engine, whichever integrator makes steps."""
-        return self
 
     def forces(self) -> list[openmm.PythonForce]:
         """The forces that carry the rows; `add_to` puts them into the System."""
@@ -348,12 +344,6 @@ class CarriedConstraints(CarriedProgram):
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         """The error that stopped the engine, with the number of the step."""
         return self._engine.explained_error(step)
-
-    def __reduce__(self) -> tuple[object, ...]:
-        raise UnsupportedError(
-            "rows of hold belong to their System and cannot be pickled with an integrator; pickle the System, and make "
-            "another integrator with parts=[CarriedConstraints.of(system)]"
-        )
 
     def __repr__(self) -> str:
         return f"<CarriedConstraints: {self.motion.constraint_set.n_rows} rows on {len(self.atoms)} particles>"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import openmm
 
+from kcons.errors import UnsupportedError
 from kcons.openmm.carried.callbacks import LOW_SCALE, SPEED_SCALE, Engine
 from kcons.openmm.carried.passage import CARRY_SCALE
 from kcons.openmm.carried.requirements import refuse_single_precision
@@ -97,3 +98,13 @@ class CarriedProgram(Part):
                 back = 1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)
                 program.each("v", f"v+v_low+{back!r}*{change}", "tangent, all of it")
         program.each("x", "xu", "back")
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """The same: the forces of the System call this engine, whichever integrator makes steps."""
+        return self
+
+    def __reduce__(self) -> tuple[object, ...]:
+        raise UnsupportedError(
+            "rows of hold belong to their System and cannot be pickled with an integrator; pickle the System, and make "
+            "another integrator with parts=[CarriedConstraints.of(system)]"
+        )

@@ -1,7 +1,10 @@
-"""The time of targets that move: a step that failed does not count."""
+"""The time of targets that move, where a step that failed does not count; what an integrator knows of it."""
 
 from __future__ import annotations
 
+import openmm
+
+from kcons.errors import InputError
 from kcons.openmm.integrator.program import Program
 
 
@@ -51,3 +54,18 @@ class Clock:
 
     def drift(self, p: Program, h: str) -> None:
         p.let(f"clock{self.code}", f"clock{self.code}+select(first_stage, 0, {h})", "targets at the end of the drift")
+
+
+def require_holder(integrator: openmm.CustomIntegrator) -> None:
+    """Refuse a Context, a Simulation or whatever else is given for the integrator that holds the rows."""
+    if not isinstance(integrator, openmm.CustomIntegrator):
+        raise InputError(
+            f"integrator is a {type(integrator).__name__}; give the integrator that holds the rows", item="integrator"
+        )
+
+
+def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
+    """All global variables of the integrator by name."""
+    require_holder(integrator)
+    numbers = range(integrator.getNumGlobalVariables())
+    return {integrator.getGlobalVariableName(k): integrator.getGlobalVariable(k) for k in numbers}

@@ -17,9 +17,9 @@ from kcons.errors import (
     InputError,
     UnsupportedError,
 )
-from kcons.openmm.collective.clock import Clock
+from kcons.openmm.collective.clock import Clock, require_holder, variables_of
 from kcons.openmm.collective.formula_rows import as_rows
-from kcons.openmm.collective.measured_rows import TOLERANCE, require_holder, variables_of
+from kcons.openmm.collective.measured_rows import TOLERANCE
 from kcons.openmm.collective.reported_rows import ReportedRows
 from kcons.openmm.collective.row_forces import (
     Rigid,

@@ -11,7 +11,8 @@ import numpy as np
 import openmm
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, SingularGeometryError
+from kcons.errors import SingularGeometryError
+from kcons.openmm.collective.clock import variables_of
 from kcons.openmm.collective.row_forces import energy
 from kcons.openmm.integrator.guard import positions_of, velocities_of, width
 from kcons.openmm.integrator.precision import Precision
@@ -243,27 +244,9 @@ def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator |
         found = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
     name = rows._of("push", 0)
     for one in found:
-        if isinstance(one, openmm.CustomIntegrator) and name in _names(one):
+        if isinstance(one, openmm.CustomIntegrator) and name in variables_of(one):
             return one
     return None
-
-
-def _names(integrator: openmm.CustomIntegrator) -> list[str]:
-    return [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
-
-
-def require_holder(integrator: openmm.CustomIntegrator) -> None:
-    """Refuse a Context, a Simulation or whatever else is given for the integrator that holds the rows."""
-    if not isinstance(integrator, openmm.CustomIntegrator):
-        raise InputError(
-            f"integrator is a {type(integrator).__name__}; give the integrator that holds the rows", item="integrator"
-        )
-
-
-def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
-    """All global variables of the integrator by name."""
-    require_holder(integrator)
-    return {name: integrator.getGlobalVariable(k) for k, name in enumerate(_names(integrator))}
 
 
 def applied_groups(rows: GroupRows, context: openmm.Context) -> set[int]:

@@ -9,8 +9,8 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.openmm.collective.clock import require_holder
 from kcons.openmm.collective.context_rows import ContextRows
-from kcons.openmm.collective.measured_rows import require_holder
 from kcons.openmm.collective.row_program import GroupRows
 from kcons.openmm.integrator.part import Miss
 from kcons.steppers.compositions import Composition

@@ -7,9 +7,8 @@ from typing import Any
 
 import openmm
 
-from kcons.openmm.collective.clock import Clock
+from kcons.openmm.collective.clock import Clock, variables_of
 from kcons.openmm.collective.forecast import Forecast, Measured
-from kcons.openmm.collective.measured_rows import variables_of
 from kcons.openmm.collective.small_algebra import Block
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program

@@ -86,6 +86,6 @@ def test_bonds_that_the_run_held_are_to_be_named(tmp_path, recwarn):
     where = tmp_path / "e.xyz", tmp_path / "e.xyz", "emt", range(40)
     found = trajectory_temperatures.along(*where, constrain="hbonds")
     assert "2 bonds that nothing was said to hold keep their length" in found.left_out[-1]
-    assert "name all that the run held (--constrain)" in found.left_out[-1]
+    assert "name all that it held (--constrain)" in found.left_out[-1]
     found = trajectory_temperatures.along(*where, constrain="allbonds")
     assert not any("keep their length" in words for words in found.left_out) and not recwarn.list

@@ -105,12 +105,14 @@ def test_whether_a_table_fits_is_measured():
     assert not report.fits(long, report.WIDTH)
     for found in (usual, long):
         width = next(w for w in range(60, 300) if report.fits(found, w))
-        page = StringIO()
-        Console(file=page, width=width, color_system=None).print(report.table(found))
-        assert "…" not in page.getvalue()
-        page = StringIO()
-        Console(file=page, width=width - 1, color_system=None).print(report.table(found))
-        assert "…" in page.getvalue()
+
+        def shown(wide, found=found):
+            page = StringIO()
+            Console(file=page, width=wide, color_system=None).print(report.table(found))
+            return page.getvalue()
+
+        assert "…" not in shown(width)
+        assert shown(width).count("\n") == shown(300).count("\n") < shown(width - 1).count("\n")
 
 
 def test_reference_is_drawn_where_errors_come_near_it(tmp_path):
