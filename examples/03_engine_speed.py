@@ -34,7 +34,7 @@ import kcons
 from kcons import ConstraintSet, State, System
 from kcons.ase import constrain
 from kcons.comparison import measure as compare
-from kcons.comparison import scripts, system_of
+from kcons.comparison import processor_of, scripts, system_of
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.motion import Motion
 from kcons.plan import make_plan
@@ -463,7 +463,7 @@ def show_certificates(result: dict, console: Console) -> None:
         )  # fmt: skip
     console.print(table)
     machine = result["machine"]
-    console.print(f"{machine['cpu']}, one thread; commit {machine['commit']}, {machine['date']}")
+    console.print(f"{processor_of(machine)}, one thread; commit {machine['commit']}, {machine['date']}")
 
 
 # -- the run --------------------------------------------------------------------------------------
@@ -531,7 +531,7 @@ def show(result: dict, console: Console) -> None:
     console.print(table)
     machine = result["machine"]
     versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "ase", "openmm"))
-    console.print(f"{machine['cpu']}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
+    console.print(f"{processor_of(machine)}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
     for name, peer in result["peers"].items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in peer.items()))
     for name, times in result["ase_step"].items():

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kcons import ConstraintSet
-from kcons.comparison import METHODS, CoreStepper, json_files, measure, test_systems
+from kcons.comparison import METHODS, CoreStepper, json_files, measure, processor_of, test_systems
 from kcons.constraints import Sphere
 from kcons.errors import KconsError
 from kcons.motion import Motion
@@ -212,7 +212,7 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print(table)
     machine = result["environment"]
     versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "scipy", "numba"))
-    console.print(f"{machine['cpu']}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
+    console.print(f"{processor_of(machine)}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
 
 
 def best_ratio(curves: dict[str, list[dict[str, float]]]) -> tuple[float, str]:

@@ -23,7 +23,7 @@ from ase.md.md import MolecularDynamics
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import ConstrainedDynamics, constrain, draw_velocities, rigid_water
-from kcons.comparison import environment, scripts
+from kcons.comparison import environment, processor_of, scripts
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
 
@@ -349,7 +349,7 @@ def show(result: dict) -> None:
         print(f"{r['what']:44s} {r['expected']:10.2f} {r['mean']:8.2f} {r['error']:15.2f}")
     computer = result["machine"]
     versions = ", ".join(f"{name} {v}" for name, v in computer["versions"].items() if v and name != "kcons")
-    print(f"\n{computer['cpu']}; {versions}")
+    print(f"\n{processor_of(computer)}; {versions}")
     print(f"commit {computer['commit']}, {computer['date']}")
 
 

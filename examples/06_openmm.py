@@ -25,7 +25,7 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons.comparison import measure as compare
-from kcons.comparison import scripts
+from kcons.comparison import processor_of, scripts
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -184,7 +184,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         console.print(table)
     machine = result["machine"]
     console.print(
-        f"{machine['cpu']}, one thread; OpenMM {machine['versions']['openmm']}; "
+        f"{processor_of(machine)}, one thread; OpenMM {machine['versions']['openmm']}; "
         f"commit {machine['commit']}, {machine['date']}"
     )
 

@@ -29,7 +29,7 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons import ConstraintSet
-from kcons.comparison import json_files, ring, scripts, system_of
+from kcons.comparison import json_files, processor_of, ring, scripts, system_of
 from kcons.comparison import measure as compare
 from kcons.constraints import Distance
 from kcons.errors import KconsError
@@ -483,7 +483,7 @@ def show(result: dict, console: Console) -> None:
     machine, other = result["machine"], result["steps_machine"]
     versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "openmm"))
     console.print(
-        f"{machine['cpu']}, one thread, CPU platform, processor time; {versions}; "
+        f"{processor_of(machine)}, one thread, CPU platform, processor time; {versions}; "
         f"commit {machine['commit']}, {machine['date']}"
     )
     if other["commit"] != machine["commit"]:

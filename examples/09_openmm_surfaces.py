@@ -24,7 +24,7 @@ from openmm import unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons.comparison import json_files, measure
+from kcons.comparison import json_files, measure, processor_of
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm import SCHEMES, ExpressionSurface, SurfaceIntegrator
 
@@ -196,7 +196,7 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print(table)
     machine = result["machine"]
     console.print(
-        f"{machine['cpu']}, one thread; OpenMM {machine['versions']['openmm']}; commit {machine['commit']}, "
+        f"{processor_of(machine)}, one thread; OpenMM {machine['versions']['openmm']}; commit {machine['commit']}, "
         f"{machine['date']}"
     )
 

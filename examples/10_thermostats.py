@@ -35,6 +35,7 @@ from kcons.comparison import (
     environment,
     fluid,
     json_files,
+    processor_of,
     scripts,
     work_off,
 )
@@ -382,7 +383,9 @@ def show(result: dict[str, Any], console: Console) -> None:
         console.print(table)
     taken = sum(part["cpu_seconds"] for part in result["parts"].values())
     machine = result["machine"]
-    console.print(f"\n{taken / 60:.0f} min of {machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
+    console.print(
+        f"\n{taken / 60:.0f} min of {processor_of(machine)}; commit {machine['commit'][:10]}, {machine['date']}"
+    )
 
 
 def main() -> None:

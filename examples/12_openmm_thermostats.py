@@ -25,7 +25,7 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import json_files, measure, scripts
+from kcons.comparison import json_files, measure, processor_of, scripts
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -281,7 +281,7 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 def _made_on(machine: dict[str, Any]) -> str:
     return (
-        f"{machine['cpu']}, one thread; OpenMM {machine['versions']['openmm']}; "
+        f"{processor_of(machine)}, one thread; OpenMM {machine['versions']['openmm']}; "
         f"commit {machine['commit']}, {machine['date']}"
     )
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from kcons import State, System, run, steppers
-from kcons.comparison import METHODS, Reference, json_files, test_systems
+from kcons.comparison import METHODS, Reference, json_files, processor_of, test_systems
 from kcons.comparison import measure as compare
 
 STEP_METHODS = ("rattle", "blanes-moan4", "blanes-moan6")
@@ -183,7 +183,7 @@ def plot(result: dict, path: Path) -> None:
         axes.grid(alpha=0.4)
     environment = result["environment"]
     figure.suptitle(
-        f"{environment['cpu']}; kcons {environment['versions']['kcons']}; {environment['date']}", fontsize=8
+        f"{processor_of(environment)}; kcons {environment['versions']['kcons']}; {environment['date']}", fontsize=8
     )
     figure.savefig(path, dpi=110)
 

@@ -18,7 +18,7 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator
 
 from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
-from kcons.comparison import Fluid, environment, scripts, test_systems
+from kcons.comparison import Fluid, environment, processor_of, scripts, test_systems
 from kcons.thermostats import thermal_velocities
 
 #: Fluid, molecules, steps of a block: 10 to 20 ms.
@@ -94,7 +94,7 @@ def show(result: dict[str, Any]) -> None:
     computer = result["machine"]
     names = ("numpy", "numba", "ase")
     versions = ", ".join(f"{name} {computer['versions'][name]}" for name in names if computer["versions"].get(name))
-    print(f"\n{computer['cpu']}; Python {computer['python']}, {versions}")
+    print(f"\n{processor_of(computer)}; Python {computer['python']}, {versions}")
     print(f"commit {computer['commit']}, {computer['date']}")
 
 

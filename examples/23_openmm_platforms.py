@@ -25,7 +25,7 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import measure, scripts
+from kcons.comparison import measure, processor_of, scripts
 from kcons.openmm import Isokinetic, Langevin, Precision, ProjectedIntegrator, RattleIntegrator, positions_of
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -199,7 +199,9 @@ def show(result: dict[str, Any]) -> None:
         headings = ("integrator", *(timed if times else ()), "largest residual", "drift, kT/ns/dof")
         console.print(scripts.table(part["title"], headings, {"integrator"}, rows))
     machine = result["machine"]
-    console.print(f"{result['device'] or machine['cpu']}; OpenMM {machine['versions']['openmm']}; {machine['date']}")
+    console.print(
+        f"{result['device'] or processor_of(machine)}; OpenMM {machine['versions']['openmm']}; {machine['date']}"
+    )
 
 
 def measured(chosen: argparse.Namespace) -> dict[str, Any]:

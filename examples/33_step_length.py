@@ -33,6 +33,7 @@ from kcons.comparison import (
     layers,
     long_steps,
     long_steps_report,
+    processor_of,
     scripts,
     work_off,
 )
@@ -239,7 +240,9 @@ def show(result: dict[str, Any], console: Console) -> None:
         show_steps(of_group(result, "rigid water"), console)
     taken = sum(part["cpu_seconds"] for part in result["parts"].values())
     machine = result["machine"]
-    console.print(f"\n{taken / 60:.0f} min of {machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
+    console.print(
+        f"\n{taken / 60:.0f} min of {processor_of(machine)}; commit {machine['commit'][:10]}, {machine['date']}"
+    )
 
 
 if __name__ == "__main__":

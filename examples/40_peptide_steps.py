@@ -33,6 +33,7 @@ from kcons.comparison import (
     layers,
     long_steps,
     long_steps_report,
+    processor_of,
     scripts,
     work_off,
 )
@@ -214,7 +215,9 @@ def show(result: dict[str, Any], console: Console) -> None:
         console.print(f"An evaluation of the cheap forces takes {ratio:.2f} of the time of an expensive one.")
     machine = result["machine"]
     spent = sum(part.get("cpu_seconds", 0.0) for part in result["parts"].values())
-    console.print(f"{spent / 60:.0f} min of {machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
+    console.print(
+        f"{spent / 60:.0f} min of {processor_of(machine)}; commit {machine['commit'][:10]}, {machine['date']}"
+    )
 
 
 def draw(result: dict[str, Any], path: str) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison import json_files, measure
+from kcons.comparison import json_files, measure, processor_of
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")
@@ -330,7 +330,8 @@ def show(result: dict[str, Any]) -> None:
             print(f"  {row['case']:26s} {row['method']:14s} {end}")
     m = result["machine"]
     print(
-        f"\n{m['cpu']}, {m['cores']} cores; numpy {m['versions']['numpy']}, scipy {m['versions']['scipy']}; {m['date']}"
+        f"\n{processor_of(m)}, {m['cores']} cores; numpy {m['versions']['numpy']}, scipy {m['versions']['scipy']}; "
+        f"{m['date']}"
     )
 
 

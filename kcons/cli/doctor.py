@@ -83,7 +83,7 @@ def machine() -> dict[str, str]:
     """Processor, the width of its registers, and threads."""
     import numba
 
-    from kcons.comparison.study.machine import processor
+    from kcons.comparison.study.machine import processor, simd_width
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     set_by = {
@@ -99,15 +99,6 @@ def machine() -> dict[str, str]:
         "threads of Numba": str(numba.get_num_threads()),
         "set in the shell": ", ".join(f"{name}={value}" for name, value in set_by.items()) or "nothing",
     }
-
-
-def simd_width() -> int:
-    """Bits of the widest registers that compiled kernels may use here."""
-    from llvmlite import binding
-
-    has = binding.get_host_cpu_features()
-    widths = {"avx512f": 512, "avx2": 256, "avx": 256, "sse2": 128, "neon": 128}
-    return max((bits for name, bits in widths.items() if has.get(name)), default=64)
 
 
 # -- OpenMM -----------------------------------------------------------------------------------------

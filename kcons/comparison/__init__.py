@@ -34,7 +34,7 @@ _NAMES = {
     "test_systems.openmm_engine": ("system_of",),
     "test_systems.system": ("ASE_UNITS",),
     "test_systems.potential": ("Potential", "PotentialCalculator"),
-    "study.machine": ("environment",),
+    "study.machine": ("environment", "processor_of"),
     "study.study": ("work_off",),
     "work_precision.measurement": ("Comparison", "Measurement"),
 }

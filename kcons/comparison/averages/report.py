@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from kcons.comparison.averages.sampling import GOAL, METHODS, Sampled, SamplingComparison
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw, say
+from kcons.comparison.study.machine import processor_of
 from kcons.comparison.study.tables import Marked, Table, duration, footnotes, numbered, verdict
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def figure(comparison: SamplingComparison) -> Figure:
         plain="xy",
         grid=grid,
     )
-    made = f"{about['cpu']}, 1 thread; {about['date']}"
+    made = f"{processor_of(about)}, 1 thread; {about['date']}"
     right = Panel(_growth(comparison, "seconds"), "wall time / s", notes=("", made), plain="xy", grid=grid)
     drawn = draw([[left, right]], (11, 5.2), title=comparison.scene["title"], same_y=True, legend=3)
     if not left.curves:

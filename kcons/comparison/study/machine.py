@@ -7,7 +7,7 @@ import hashlib
 import os
 import platform
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
@@ -66,10 +66,16 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
+def processor_of(environment: Mapping[str, Any]) -> str:
+    """The processor of a measurement and, where it was noted, its SIMD width: speeds of others are other ones."""
+    width = f", {environment['simd']}-bit SIMD" if "simd" in environment else ""
+    return f"{environment['cpu']}{width}"
+
+
 def simd_width() -> int:
     """Bits of the widest registers that the processor computes with in one instruction; 64 where none is known."""
     features = llvmlite.binding.get_host_cpu_features()
-    widths = (("avx512f", 512), ("avx2", 256), ("sse2", 128), ("neon", 128))
+    widths = (("avx512f", 512), ("avx2", 256), ("avx", 256), ("sse2", 128), ("neon", 128))
     return next((bits for name, bits in widths if features.get(name)), 64)
 
 

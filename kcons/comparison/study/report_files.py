@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.study import json_files
+from kcons.comparison.study.machine import processor_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,6 +30,6 @@ def made_by(result: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items() if version)
     return (
         f"{about['date']}, commit {about['commit']}, kcons {result['made_by']['version']}\n"
-        f"{about['cpu']}, {about['cores']} cores, one thread; Python {about['python']}\n{versions}\n"
+        f"{processor_of(about)}, {about['cores']} cores, one thread; Python {about['python']}\n{versions}\n"
         + ("quick: shortened runs" if result["made_by"]["quick"] else "full runs")
     )

@@ -13,6 +13,7 @@ from rich.console import Console
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw, say
+from kcons.comparison.study.machine import processor_of
 from kcons.comparison.study.tables import Table, duration, footnotes, numbered, verdict
 from kcons.comparison.work_precision.chosen_curves import MOST, Chosen, chosen
 from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_MD_ENGINE, Cost, Standing, cost_of
@@ -220,7 +221,7 @@ def figure(comparison: Comparison, most: int = MOST) -> Figure:
     right = Panel(
         [*_errors(comparison, shown, standings, "wall"), *_costs_without_error(comparison)],
         f"wall time per simulated {units['long_time']} / s",
-        notes=("", f"{environment['cpu']}, 1 thread; {environment['date']}"),
+        notes=("", f"{processor_of(environment)}, 1 thread; {environment['date']}"),
         plain="x",
         grid=grid,
         direct=True,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.study import html_page
 from kcons.comparison.study.html_page import Section
+from kcons.comparison.study.machine import processor_of
 from kcons.comparison.study.tables import Table, duration, markdown, plain_text
 from kcons.comparison.work_precision import interactive, report
 from kcons.comparison.work_precision.fronts import (
@@ -186,7 +187,7 @@ def _machines(parts: Sequence[Part]) -> Table:
         if environment is None:
             continue
         versions = ", ".join(f"{name} {value}" for name, value in environment["versions"].items() if value)
-        processor = f"{environment['cpu']}, {environment['cores']} cores, {environment['threads']} thread used"
+        processor = f"{processor_of(environment)}, {environment['cores']} cores, {environment['threads']} thread used"
         what = "quick" if part.data["key"]["quick"] else "full"
         commit = environment["commit"] or "not from a repository"
         row = (processor, f"{environment['system']}, Python {environment['python']}", versions, what)

@@ -45,6 +45,11 @@ def test_environment():
     assert about["simd"] in (64, 128, 256, 512)
 
 
+def test_processors_are_named_with_their_simd_width():
+    assert machine.processor_of({"cpu": "a processor", "simd": 256}) == "a processor, 256-bit SIMD"
+    assert machine.processor_of({"cpu": "a processor"}) == "a processor"  # results of before it was noted
+
+
 def test_simd_width_is_that_of_the_widest_instructions(monkeypatch):
     known = {"avx512f": True, "avx2": True, "sse2": True}
     monkeypatch.setattr(machine.llvmlite.binding, "get_host_cpu_features", lambda: known)
