@@ -114,7 +114,7 @@ TABLE = {
                 *("--full long-steps-reach", "--collect long-steps-reach", "--beyond long-steps-beyond"),
             ),
         ),
-        620,
+        300,
     ),
     "long_steps_xtb.json": Measurement((*BATHS, "ase", "comparison/averages"), script("36_xtb_steps"), 30),
     "monte_carlo.json": Measurement(
@@ -153,7 +153,7 @@ TABLE = {
     "openmm_surfaces.json": Measurement(OPENMM, script("09_openmm_surfaces"), 1),
     "openmm_thermostats.json": Measurement((*OPENMM, "thermostats"), script("12_openmm_thermostats"), 40),
     "random_cells.json": Measurement(CORE, ("python tests/contracts/random_cells.py --cases 10000 --out F",), 6),
-    "report": Measurement((*ASE, "openmm", "comparison"), ("kcons compare --all --out F",), 105),
+    "report": Measurement((*ASE, "openmm", "comparison"), ("kcons compare --all --out F",), 90),
     "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), 4),
     "solvated_peptide.json": Measurement((*BATHS, "comparison/averages"), script("40_peptide_steps"), 30),
     "stability.json": Measurement(
