@@ -95,7 +95,7 @@ TABLE = {
         ),
         95,
     ),
-    "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), 11),
+    "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), 5),
     "hard_cases.json": Measurement(HARD, ("kcons hardcases --out hardcases", "cp hardcases/hard_cases.json F"), 6),
     "high_order.json": Measurement(CORE, script("04_high_order"), 18),
     "killed_runs.json": Measurement(("free_energy",), ("python tests/contracts/killed_runs.py",), 3),
