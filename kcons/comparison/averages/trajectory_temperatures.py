@@ -53,7 +53,8 @@ def along(
     if len(frames) < FEWEST:
         raise InputError(f"{len(frames)} frames are too few for temperatures; give {FEWEST} or more", item="frames")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # bonds that are guessed: the check says so
+        # The check says so itself.
+        warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
         return _along(trajectory, topology, forces, frames, options)
 
 

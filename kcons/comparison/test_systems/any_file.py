@@ -127,12 +127,15 @@ def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
     """
     import MDAnalysis
 
+    from kcons.mdanalysis.loading import quiet
+
     files = [str(path), *([str(coordinates)] if coordinates else [])]
     for file in files:
         if Path(file).is_file() and not Path(file).stat().st_size:
             raise InputError(f"{file} is empty; give another file", item="file")
     try:
-        return MDAnalysis.Universe(*files)
+        with quiet():
+            return MDAnalysis.Universe(*files)
     except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
         text = " ".join(str(error).partition("\n   You can")[0].split()) or type(error).__name__
         raise InputError(
