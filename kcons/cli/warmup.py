@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
 
 def _warmup(chosen: argparse.Namespace) -> int:
     from kcons.cli.compiled_systems import KINDS, NEEDS
-    from kcons.constraints.compilation import announcer
+    from kcons.constraints.compilation import all_compiled, announcer
 
     if chosen.list:
         for name, use in KINDS.items():
@@ -46,7 +46,7 @@ def _warmup(chosen: argparse.Namespace) -> int:
             terminal.print(f"{name}: {needed} is not installed")
             continue
         begun, before = time.perf_counter(), announcer.seconds
-        with terminal.status(f"{name}: {KINDS[name].__doc__}"):
+        with all_compiled(), terminal.status(f"{name}: {KINDS[name].__doc__}"):
             KINDS[name]()
         compiled, whole = announcer.seconds - before, time.perf_counter() - begun
         terminal.print(f"{name}: compiled in {compiled:.1f} s" if compiled else f"{name}: is there ({whole:.1f} s)")

@@ -27,6 +27,8 @@ import shutil
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +63,18 @@ if _config.DISABLE_JIT:
 
 
 _in_python: dict[Any, int] = {}
+_all_compiled = False
+
+
+@contextmanager
+def all_compiled() -> Iterator[None]:
+    """Leave nothing to Python, however small: where kernels are compiled for larger systems."""
+    global _all_compiled
+    before, _all_compiled = _all_compiled, True
+    try:
+        yield
+    finally:
+        _all_compiled = before
 
 
 def plain_if_small(kernel: Any, size: int) -> Any:
@@ -75,7 +89,7 @@ def plain_if_small(kernel: Any, size: int) -> Any:
     size : int
         About how many elements are looked at; see `SMALL`.
     """
-    if size > SMALL or kernel.signatures or _in_python.get(kernel, 0) > MUCH:
+    if _all_compiled or size > SMALL or kernel.signatures or _in_python.get(kernel, 0) > MUCH:
         return kernel
     _in_python[kernel] = _in_python.get(kernel, 0) + size
     return kernel.py_func

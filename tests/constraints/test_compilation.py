@@ -20,7 +20,7 @@ from numba.core import event
 
 import kcons
 from kcons.constraints import compilation
-from kcons.constraints.compilation import MUCH, SMALL, Announcer, plain_if_small
+from kcons.constraints.compilation import MUCH, SMALL, Announcer, all_compiled, plain_if_small
 
 #: Compiles one small kernel; says how many kernels came from the folder, and how many were compiled.
 ONE_KERNEL = """
@@ -169,6 +169,8 @@ def test_little_work_is_left_to_python():
     assert plain_if_small(twice, 1) is twice  # it is there
 
     thrice = numba.njit(lambda n: 3 * n)
+    with all_compiled():
+        assert plain_if_small(thrice, 1) is thrice
     given = [plain_if_small(thrice, SMALL) for _ in range(MUCH // SMALL + 3)]
     assert given[0] is thrice.py_func and given[-1] is thrice  # that was much in all
 

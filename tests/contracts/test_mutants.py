@@ -1,4 +1,4 @@
-"""Each mutant of `mutants.py` fails the tests named for it, which pass without it. Long; run by `-m mutants`."""
+"""Each mutant of `mutants` fails the tests named for it, which pass without it. Long; run by `-m mutants`."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ LIMITS = (20.0, 3600.0)
 
 
 def chosen(only: Iterable[str] | None) -> dict[str, Case]:
-    """The cases named, or all of them.
+    """The cases named, or all of them; 'h1' is 'H01'.
 
     Raises
     ------
@@ -28,7 +28,8 @@ def chosen(only: Iterable[str] | None) -> dict[str, Case]:
         An unknown number; the message lists those there are.
     """
     known = all_cases()
-    names = picked(None if only is None else [name.upper() for name in only], known, "case", "only")
+    asked = None if only is None else [name[:1].upper() + name[1:].zfill(2) for name in only]
+    names = picked(asked, known, "case", "only")
     return {name: known[name] for name in known if name in names}
 
 

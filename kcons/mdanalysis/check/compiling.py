@@ -23,6 +23,7 @@ import scipy.sparse as sp
 from numba.core import event
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import all_compiled
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
@@ -222,4 +223,5 @@ def _use_elsewhere(sample: Sample) -> bool:
 def main() -> None:
     """Use the sample that comes in."""
     sample: Sample = pickle.load(sys.stdin.buffer)
-    sample.use()
+    with all_compiled():
+        sample.use()

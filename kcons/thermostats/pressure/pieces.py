@@ -240,8 +240,9 @@ def require_periodic(system: CellSystem, axes: NDArray[np.bool_], kind: str) -> 
     own, _ = np.linalg.qr(system.cell[system.periodic].T)
     wrong = axes & (1 - (own**2).sum(axis=1) > FLAT)
     if wrong.any():
+        slab = "" if kind == "lateral" else "for a slab in the xy plane use kind='lateral', else "
         raise InputError(
             f"kind={kind!r} changes the cell along {'xyz'[int(np.argmax(wrong))]}, in which it is not periodic; "
-            "for a slab in the xy plane use kind='lateral', or make the cell periodic",
+            f"{slab}make the cell periodic there",
             item="kind",
         )

@@ -46,6 +46,10 @@ def test_a_run_goes_on_where_it_was(result, monkeypatch, tmp_path):
     assert asked[1:] == [("H02", "kcons")]
 
 
+def test_cases_are_found_without_their_noughts():
+    assert list(chosen(["x6", "h2", "H22"])) == ["H02", "H22", "X06"]
+
+
 def test_unknown_cases_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"there is no case 'H99' .*; there are H01, H02"):
         chosen(["H99"])

@@ -13,6 +13,7 @@ import pytest
 import water_files as files
 
 from kcons.constraints import Angle, Distance
+from kcons.constraints.compilation import SMALL
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.mdanalysis.check import compiling
 from kcons.mdanalysis.check.compiling import Frame, compiled_elsewhere, sample_of
@@ -67,6 +68,14 @@ def test_the_process_that_checks_compiles_nothing(tmp_path):
     np.testing.assert_allclose(largest, second[-1], atol=1e-5)
     # Nothing is cold any more.
     assert checked(tmp_path, (blocks, topology)) == [[[], 0, 3 * N, largest]]
+
+
+def test_nor_where_there_are_so_many_rows_that_nothing_is_left_to_python(tmp_path):
+    n = SMALL // 3 + 1
+    x = files.water(n, 1)
+    words = files.write(tmp_path / "w.dcd", x), files.topology(tmp_path / "w.gro", n, x[0])
+    ((compiled, started, rank, _),) = checked(tmp_path, words)
+    assert (compiled, started, rank) == ([], 1, 3 * n)
 
 
 @pytest.mark.slow

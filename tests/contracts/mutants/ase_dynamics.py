@@ -1,0 +1,65 @@
+"""Mutants of dynamics in ASE."""
+
+MUTANTS = [
+    # -- ASE: what changes between steps --
+    (
+        "ase/dynamics.py",
+        "self.time, all_masses=True)",
+        "self.time)",
+        "tests/ase/test_dynamics.py::test_masses_of_free_atoms_changed_between_steps_are_taken",
+    ),
+    (
+        "ase/binding.py",
+        "if all(map(is_, now, known)):",
+        "if now[0] is known[0]:",
+        "tests/ase/test_binding.py::test_forces_of_the_same_calculator_that_changed",
+    ),
+    (
+        "ase/binding.py",
+        '("numbers", "initial_charges", "initial_magmoms")',
+        '("numbers",)',
+        "tests/ase/test_binding.py::test_forces_of_the_same_calculator_that_changed",
+    ),
+    (
+        "ase/binding.py",
+        "if now < before and by_number:",
+        "if False:",
+        "tests/ase/test_binding.py::test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
+    ),
+    (
+        "ase/logger.py",
+        'dyn.applied_forces() if hasattr(dyn, "motion") else applied_forces(atoms)',
+        "applied_forces(atoms)",
+        "tests/ase/test_logger.py::test_a_rod_against_friction",
+    ),
+    (
+        "thermostats/pressure/measured.py",
+        "motion.multipliers(x, v, f, time)",
+        "motion.multipliers(x, v, f)",
+        "tests/thermostats/pressure/test_measured.py::test_a_rod_that_is_made_longer",
+    ),
+    (
+        "thermostats/freedom.py",
+        "turns.see(*next(places))",
+        "break",
+        "tests/thermostats/test_freedom.py::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
+    ),
+    (
+        "thermostats/freedom.py",
+        "share = BALANCED if len(self._motions) == 6 else EXACT",
+        "share = BALANCED",
+        "tests/thermostats/test_freedom.py::test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster",
+    ),
+    (
+        "steppers/state.py",
+        "return None if state.remainder is None or self._free_of_origin is None else state.remainder",
+        "return state.remainder",
+        "tests/steppers/test_state.py::test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place",
+    ),
+    (
+        "steppers/stepper.py",
+        "{name: None if name in found else value",
+        "{name: value",
+        "tests/steppers/test_stepper.py::test_copies_leave_behind_what_was_found_for_a_system",
+    ),
+]

@@ -1,0 +1,107 @@
+"""Mutants of studies."""
+
+MUTANTS = [
+    # -- studies: what is kept, and what is shown --
+    (
+        "comparison/study/study.py",
+        "return found if found.get(self.under) == self.head[self.under] else {}",
+        "return found",
+        "tests/comparison/study/test_study.py::test_other_code_settings_or_formats_do_not_count",
+    ),
+    (
+        "comparison/study/study.py",
+        "            if name not in known:\n                put",
+        "            if True:\n                put",
+        "tests/comparison/study/test_study.py::test_pieces_are_done_once_and_progress_is_told",
+    ),
+    (
+        "steppers/files.py",
+        "if not math.isfinite(value):",
+        "if False:",
+        "tests/comparison/study/test_json_files.py::test_what_json_lacks_becomes_what_it_has",
+    ),
+    (
+        "comparison/study/tables.py",
+        "if table.grouped and k else shown",
+        "if table.grouped else shown",
+        "tests/comparison/study/test_tables.py::test_groups_are_named_once_and_set_apart",
+    ),
+    (
+        "comparison/study/curves.py",
+        'given: dict[str, Any] = {"transform": places[curve.along]} if curve.along else {}',
+        "given: dict[str, Any] = {}",
+        "tests/comparison/study/test_curves.py::test_marks_along_an_edge_do_not_count_as_data",
+    ),
+    (
+        "comparison/methods/engines.py",
+        "self.context.setPositions(x * self._length)",
+        "self.context.setPositions(x)",
+        "tests/comparison/methods/test_engines.py::test_units_of_openmm",
+    ),
+    (
+        "openmm/collective/row_program.py",
+        "if not self._single or _halved(p.integrator, scheme):",
+        "if not self._single:",
+        "tests/openmm/collective/test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
+    ),
+    (
+        "free_energy/windows/window_results.py",
+        "covariance = covariance + np.outer(half, half)",
+        "covariance = covariance + 0 * np.outer(half, half)",
+        "tests/free_energy/windows/test_window_results.py::test_sides_that_differ_by_more_than_chance_widen_the_error",
+    ),
+    (
+        "free_energy/held_coordinates.py",
+        "result[j] += mixed[s]",
+        "result[j] += mixed[j]",
+        "tests/free_energy/test_compiled_samples.py::test_the_same_as_the_general_formulas",
+    ),
+    (
+        "free_energy/held_coordinates.py",
+        "return seen if others is None else seen + metric.reactions @ others",
+        "return seen if others is None else seen - metric.reactions @ others",
+        "tests/free_energy/test_compiled_samples.py::test_the_same_as_the_general_formulas",
+    ),
+    (
+        "free_energy/compiled_samples.py",
+        "out[j] += there[s]",
+        "out[j] += there[j]",
+        "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
+    ),
+    (
+        "free_energy/compiled_samples.py",
+        "answer[k] = -product[i, d + k]",
+        "answer[k] = product[i, d + k]",
+        "tests/free_energy/test_held_coordinates.py::test_multipliers_are_those_of_the_engine",
+    ),
+    (
+        "free_energy/mean_forces.py",
+        "series.kinetic / (g - 1) if g",
+        "series.kinetic / g if g > 99",
+        "tests/free_energy/test_mean_forces.py::test_one_end_to_end_length_beside_two_bonds",
+    ),
+    (
+        "free_energy/mean_forces.py",
+        "np.mean(away * force[:, k]) / spread * difference",
+        "np.mean(away * force[:, k]) / spread * away / 2",
+        "tests/free_energy/test_mean_forces.py::test_of_two_estimates_the_mixture_that_fluctuates_least",
+    ),
+    (
+        "free_energy/rigid_turns.py",
+        "np.isfinite(before) and abs(after - before) < _SAME",
+        "np.isfinite(before)",
+        "tests/free_energy/test_rigid_turns.py::test_other_rows_must_not_change",
+    ),
+    (
+        "free_energy/rigid_turns.py",
+        "u, v, w = x[atom, 0] - x[near, 0],",
+        "u, v, w = x[atom, 0],",
+        "tests/free_energy/test_rigid_turns.py::test_the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy",
+    ),
+    (
+        "free_energy/profiles/profile.py",
+        "aims = grid[self.lower_than(below, grid)]",
+        "aims = grid[~self.lower_than(below, grid)]",
+        "tests/free_energy/profiles/test_profile.py::test_windows_that_help_what_is_low",
+    ),
+]
