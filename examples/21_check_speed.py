@@ -10,13 +10,11 @@ The files are made in a temporary folder and deleted: rigid water that tumbles a
 import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
-from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +23,6 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import MDAnalysis as mda
 
-from kcons import __version__
 from kcons.comparison import environment, json_files
 from kcons.constraints import Distance
 from kcons.mdanalysis import ConstraintCheck
@@ -239,10 +236,9 @@ def main() -> None:
             f"peak {one['peak']:.0f} MB; two workers {gain:.2f} times as fast; {one['status']}"
         )
     if chosen.out:
-        machine = {"python": platform.python_version(), "mdanalysis": mda.__version__, "kcons": __version__}
-        machine |= {"machine": platform.machine(), "cores": os.cpu_count(), "load": os.getloadavg()[0]}
+        machine = environment() | {"mdanalysis": mda.__version__, "load": os.getloadavg()[0]}
         chosen.out.parent.mkdir(parents=True, exist_ok=True)
-        data = {"date": date.today().isoformat(), "environment": machine, "cases": results}
+        data = {"environment": machine, "cases": results}
         if chosen.out.exists():
             # Memory of first checks is measured by itself.
             data |= {key: value for key, value in json_files.read(chosen.out).items() if key == "cold"}
