@@ -99,7 +99,7 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
     if not (hasattr(universe.atoms, "names") or hasattr(universe.atoms, "types")):
         raise InputError(
             f"{topology} says nothing of its atoms, as trajectories do; give a topology such as PSF, PRMTOP, TPR, GRO, "
-            "PDB or mmCIF. The trajectory comes first: check_trajectory(trajectory, topology)",
+            "PDB or mmCIF, and the trajectory beside it (check_trajectory takes the trajectory first)",
             item="topology",
         )
     if trajectory is not None:
@@ -189,7 +189,10 @@ def _stored_atoms(path: Path) -> int | None:
     with quiet(), _failing_quietly() as failures:
         try:
             reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=guess_format(str(path)))
-            return int(reader.parse_n_atoms(str(path)))
+            try:
+                return int(reader.parse_n_atoms(str(path)))
+            except NotImplementedError:  # of formats that say it frame by frame
+                return int(reader(str(path)).n_atoms)
         except _OPEN_ERRORS as error:
             failures.append(_first_line(error))
             return None

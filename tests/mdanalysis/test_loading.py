@@ -102,6 +102,6 @@ def test_topologies_that_cannot_be_read(tmp_path):
 
 def test_a_trajectory_is_no_topology(tmp_path, x):
     path, top = files.write(tmp_path / "w.dcd", x), files.topology(tmp_path / "t.pdb", N, x[0])
-    with pytest.raises(InputError, match=r"w\.dcd says nothing of its atoms, .* The trajectory comes first"):
+    with pytest.raises(InputError, match=r"w\.dcd says nothing of its atoms, .* takes the trajectory first"):
         check_trajectory(top, path)
     assert check_trajectory(path, top).n_atoms == 3 * N

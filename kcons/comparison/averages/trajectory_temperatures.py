@@ -61,6 +61,8 @@ def along(
 def _along(
     trajectory: Path | str, topology: Path | str, forces: str, frames: Sequence[int], options: dict[str, Any]
 ) -> SplitTemperatures:
+    from kcons.mdanalysis import open_universe
+
     test_system = any_file.from_file(topology, coordinates=trajectory, forces=forces, **options)
     motion, potential, lattice = test_system.motion, test_system.potential, test_system.constraint_set.lattice
     given = {name: value for name, value in options.items() if name not in ("force_field", "platform")}
@@ -72,7 +74,7 @@ def _along(
     sums = np.zeros((2, len(free)))
     tree = spanning_tree(bonds, len(test_system.positions))
     split = TemperatureSplit(System(motion, potential.forces))
-    universe = any_file.read(topology, trajectory)
+    universe = open_universe(topology, trajectory)
     first = None
     for number in frames:
         ts = universe.trajectory[number]

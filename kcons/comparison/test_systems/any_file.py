@@ -92,11 +92,11 @@ def plan(
     for name in (path, *([coordinates] if coordinates else [])):
         if not Path(name).is_file():
             raise InputError(f"there is no file {name}", item="file")
-    from kcons.mdanalysis import constraints_of
+    from kcons.mdanalysis import constraints_of, open_universe
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        universe = read(path, coordinates)
+        universe = open_universe(path, coordinates)
         try:
             rows = constraints_of(
                 universe,
@@ -115,34 +115,6 @@ def plan(
     motion = Motion(held, start)
     what = f"{Path(path).name}, {held.n_atoms} atoms, {constrain}: {rows.summary()}"
     return Plan(what, rows, motion.restore_positions(start), motion, notes)
-
-
-def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
-    """The Universe of a topology and coordinates.
-
-    Raises
-    ------
-    InputError
-        Files that MDAnalysis cannot read, or that have different numbers of atoms.
-    """
-    import MDAnalysis
-
-    from kcons.mdanalysis.loading import quiet
-
-    files = [str(path), *([str(coordinates)] if coordinates else [])]
-    for file in files:
-        if Path(file).is_file() and not Path(file).stat().st_size:
-            raise InputError(f"{file} is empty; give another file", item="file")
-    try:
-        with quiet():
-            return MDAnalysis.Universe(*files)
-    except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
-        text = " ".join(str(error).partition("\n   You can")[0].split()) or type(error).__name__
-        raise InputError(
-            f"{' with '.join(files)} cannot be read: {text}; give a topology, and with --coordinates a file of the "
-            "same atoms",
-            item="file",
-        ) from error
 
 
 def from_file(

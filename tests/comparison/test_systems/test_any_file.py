@@ -87,9 +87,8 @@ def test_errors_name_the_file_and_the_item(alanine, arguments, said, capsys):
 def test_coordinates_of_another_system_are_refused(alanine, ethanol, capsys):
     status, _, err = plan(alanine, "--coordinates", ethanol, capsys=capsys)
     assert status == 2
-    assert "alanine.gro" in err
-    assert "ethanol.xyz" in err
-    assert "same number of atoms" in err
+    assert "ethanol.xyz has 9 atoms" in err
+    assert "alanine.gro has 22" in err
 
 
 def test_unreadable_files_and_unknown_names(tmp_path, capsys):
@@ -97,13 +96,11 @@ def test_unreadable_files_and_unknown_names(tmp_path, capsys):
     broken.write_text("nothing\n3\nno atoms here\n")
     status, _, err = plan(broken, capsys=capsys)
     assert status == 2
-    assert f"{broken} cannot be read" in " ".join(err.split())
+    assert f"{broken}: MDAnalysis cannot read this topology" in err
     (tmp_path / "empty.xyz").touch()
     assert "empty.xyz is empty" in plan(tmp_path / "empty.xyz", capsys=capsys)[2]
     (tmp_path / "run.odd").write_text("nothing")
-    assert "can be minimally inferred.; give a topology" in " ".join(
-        plan(tmp_path / "run.odd", capsys=capsys)[2].split()
-    )
+    assert "give a file such as PSF" in plan(tmp_path / "run.odd", capsys=capsys)[2]
     assert plan("missing.gro", capsys=capsys)[2] == "kcons: there is no file missing.gro\n"
     assert "there is no test system 'watr'" in plan("watr", capsys=capsys)[2]
     assert "--forces is for files" in plan("ethanol", "--forces", "emt", capsys=capsys)[2]
