@@ -269,13 +269,12 @@ def fill(path: Path, parts: Sequence[Part]) -> list[Path]:
         raise InputError(f"{path} has no place for results, {BEGIN} and {END}", item="into")
     before, after = text.split(BEGIN)[0], text.split(END)[1]
     (path.parent / "figures").mkdir(exist_ok=True)
-    written = [path]
-    pictures = []
+    written, answer, pictures = [path], "", []
     gains = gain_picture(parts)
     if gains is not None:
         target = path.parent / "figures" / WINNERS_PICTURE
         gains.savefig(target, dpi=100)
-        pictures.append(f"![Who wins where](figures/{target.name})")
+        answer = f"![Who wins where](figures/{target.name})\n\n"
         written.append(target)
     for part in parts:
         figure = shown(part)[0] if part.key in PICTURES else None
@@ -284,7 +283,8 @@ def fill(path: Path, parts: Sequence[Part]) -> list[Path]:
             figure.savefig(target, dpi=75)
             pictures.append(f"![{part.heading}](figures/{target.name})")
             written.append(target)
-    path.write_text(f"{before}{BEGIN}\n{results(parts)}\n" + "\n".join(pictures) + f"\n{END}{after}", encoding="utf-8")
+    text = f"{before}{BEGIN}\n{answer}{results(parts)}\n" + "\n".join(pictures) + f"\n{END}{after}"
+    path.write_text(text, encoding="utf-8")
     return written
 
 
@@ -321,8 +321,8 @@ def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
         f"In {len(judged) - both} of {len(judged)} lines of this table no other method is both cheaper and more "
         f"accurate, by more than {percent} each, than a point on kcons' own front. At the same error, and beyond the "
         f"margin to which times repeat, no other method is cheaper than kcons in {won} of them.",
-        f"Within that margin, another method measured more than {percent} cheaper at the same error somewhere in "
-        f"{len(close)} lines: ties at best, not wins." + (" These are:" if close else ""),
+        f"Within that margin, another method was more than {percent} cheaper at the same error in "
+        + (f"{len(close)} of the lines. These are ties:" if close else "no line."),
     ], close
 
 
