@@ -22,7 +22,7 @@ import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons import Motion
-from kcons.comparison import read
+from kcons.mdanalysis import open_universe
 from kcons.topology import HeldRows, Snapshot, Topology, held_rows
 
 VILLIN = Path(app.__file__).parent / "data" / "test.pdb"
@@ -31,7 +31,7 @@ KINDS = ("hbonds", "allbonds", "hangles")
 
 def three_views(console: Console) -> None:
     """One file, three readers, the same rows."""
-    universe, atoms, pdb = read(VILLIN), ase.io.read(VILLIN), app.PDBFile(str(VILLIN))
+    universe, atoms, pdb = open_universe(VILLIN), ase.io.read(VILLIN), app.PDBFile(str(VILLIN))
     table = Table(title="Villin in water, 8867 atoms: rows as MDAnalysis, ASE and OpenMM see it")
     for heading in ("constrain", "rows", "same atoms", "largest difference of targets, Å"):
         table.add_column(heading, justify="right")
@@ -66,10 +66,12 @@ def adenylate_kinase(console: Console) -> None:
         console.print("adenylate kinase: python -m pip install MDAnalysisTests")
         return
     of = kcons.mdanalysis.constraints_of
-    described("CHARMM PSF and CRD, hangles", of(read(datafiles.PSF, datafiles.CRD), "hangles"), console)
-    described("PDB without bonds, hbonds", of(read(datafiles.PDB_small), "hbonds"), console)
-    described("Gromacs TPR and GRO, TIP4P water, hbonds", of(read(datafiles.TPR, datafiles.GRO), "hbonds"), console)
-    rings = of(read(datafiles.PSF, datafiles.CRD), "hbonds", rigid_residues=["PHE", "TYR", "HSD"])
+    described("CHARMM PSF and CRD, hangles", of(open_universe(datafiles.PSF, datafiles.CRD), "hangles"), console)
+    described("PDB without bonds, hbonds", of(open_universe(datafiles.PDB_small), "hbonds"), console)
+    described(
+        "Gromacs TPR and GRO, TIP4P water, hbonds", of(open_universe(datafiles.TPR, datafiles.GRO), "hbonds"), console
+    )
+    rings = of(open_universe(datafiles.PSF, datafiles.CRD), "hbonds", rigid_residues=["PHE", "TYR", "HSD"])
     console.print(f"CHARMM, hbonds, with PHE, TYR and HSD rigid: {rings.summary()}")
 
 

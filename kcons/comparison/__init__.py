@@ -28,7 +28,6 @@ _NAMES = {
     "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),
     "test_systems": ("Reference", "TestSystem"),
-    "test_systems.any_file": ("read",),
     "test_systems.fluid": ("Fluid",),
     "test_systems.lennard_jones": ("LennardJones",),
     "test_systems.openmm_engine": ("system_of",),
