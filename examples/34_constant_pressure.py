@@ -438,7 +438,7 @@ RUNS: dict[str, Any] = {
         compared, partial(repeated, partial(run_in_openmm, "Langevin", "flexible", 60_000), 4)
     ),
     **{f"cost, rescaling, {n}": partial(cost, n, turns) for n, turns in ((108, 60), (500, 20))},
-    **{f"crystal {seed}": partial(crystal, 60_000, seed) for seed in (1, 2)},
+    **{f"crystal {seed}": partial(crystal, 120_000, seed) for seed in (1, 2)},
     "slab": partial(slab, 20_000),
 }
 
