@@ -48,8 +48,8 @@ from kcons.thermostats import (
 )
 
 KELVIN = 300.0
-#: Time steps in fs with the time in ps that each is run, and time between samples in fs.
-STEPS, INTERVAL = {4.0: 600.0, 2.0: 600.0, 1.0: 80.0, 0.5: 40.0}, 8.0
+#: Time steps in fs with the times in ps of each of their runs, and time between samples in fs.
+STEPS, INTERVAL = {4.0: 4 * (600.0,), 2.0: 4 * (600.0,), 1.0: (80.0,), 0.5: (40.0,)}, 8.0
 THERMOSTATS = ("Nose-Hoover", "Langevin")
 
 
@@ -61,16 +61,16 @@ def rotating(velocities: np.ndarray, masses: np.ndarray) -> tuple[float, float]:
     return float((m.sum(axis=1) * (centre**2).sum(axis=1)).sum()), float((m[..., None] * about**2).sum())
 
 
-def equipartition(kind: str, step: float, picoseconds: float) -> dict[str, Any]:
+def equipartition(kind: str, step: float, picoseconds: float, seed: int = 1) -> dict[str, Any]:
     """Temperatures over the one asked for, of translation and rotation, by velocities and by configurations."""
     chosen = fluid.water(27)
     forces, kt, dt = chosen.forces, units.kB * KELVIN, step * units.fs
     system, n, masses = chosen.system(), chosen.n_molecules, chosen.forces.masses
-    x = forces.metropolis(chosen.positions, kt, 4000, 10, 1, chosen.shift, chosen.turn)[1]
-    state = State(x, thermal_velocities(system, x, kt, 1, zero_momentum=True))
+    x = forces.metropolis(chosen.positions, kt, 4000, 10, seed, chosen.shift, chosen.turn)[1]
+    state = State(x, thermal_velocities(system, x, kt, seed, zero_momentum=True))
     stepper: Any = NoseHooverChain(kt, chosen.period, momentum="conserved")
     if kind == "Langevin":
-        stepper = Langevin(kt, chosen.friction, 2, substeps=1, conserve_momentum=True)
+        stepper = Langevin(kt, chosen.friction, seed + 1, substeps=1, conserve_momentum=True)
     freedom = np.array([3 * n - 3, 3 * n])  # total momentum is zero
     kinetic, halfway, configurations = [], [], []
     every, split = round(INTERVAL / step), TemperatureSplit(system)
@@ -149,10 +149,11 @@ def jobs(full: bool) -> dict[str, Callable[[], dict[str, Any]]]:
             for friction in frictions:
                 run = partial(stepped, method, step, friction, 30.0, 8000)
                 found[f"{method}, {step:g} fs, {friction:g}/ps"] = partial(timed, "rigid water", run)
-    for step, picoseconds in STEPS.items() if full else ():
+    for step, lengths in STEPS.items() if full else ():
         for kind in THERMOSTATS if step >= 2 else THERMOSTATS[:1]:
-            run = partial(equipartition, kind, step, picoseconds)
-            found[f"{kind}, {step:g} fs"] = partial(timed, "equipartition", run)
+            for seed, picoseconds in enumerate(lengths, 1):
+                run = partial(equipartition, kind, step, picoseconds, seed)
+                found[f"{kind}, {step:g} fs, run {seed}"] = partial(timed, "equipartition", run)
     return found
 
 
@@ -173,6 +174,12 @@ def of_group(result: dict[str, Any], group: str) -> list[dict[str, Any]]:
     return [part for part in result["parts"].values() if part["group"] == group]
 
 
+def over_runs(pairs: list[list[float]]) -> list[float]:
+    """Value and standard error of runs of one length together."""
+    values, errors = np.transpose(pairs)
+    return [float(values.mean()), float(np.sqrt((errors**2).sum()) / len(errors))]
+
+
 def percent(found: list[float], less: float = 1.0) -> str:
     return f"{100 * (found[0] - less):+.2f} ± {100 * found[1]:.2f}"
 
@@ -182,9 +189,14 @@ def show_equipartition(runs: list[dict[str, Any]], console: Console) -> None:
     table = Table(box=None, title=title)
     for heading in ("thermostat", "step/fs", "", "at the positions", "in the middle", "configurations"):
         table.add_column(heading, justify="left" if heading in ("thermostat", "") else "right")
+    places = ("at the positions", "in the middle", "configurations")
+    kinds: dict[tuple[str, float], list[dict[str, Any]]] = {}
     for run in sorted(runs, key=lambda r: (THERMOSTATS.index(r["thermostat"]), -r["step"])):
+        kinds.setdefault((run["thermostat"], run["step"]), []).append(run)
+    for same in kinds.values():
+        run = same[0]
         for k, kind in enumerate(("moving", "turning")):
-            cells = [percent(run[place][k]) for place in ("at the positions", "in the middle", "configurations")]
+            cells = [percent(over_runs([run[place][k] for run in same])) for place in places]
             table.add_row("" if k else run["thermostat"], "" if k else f"{run['step']:g}", kind, *cells)
     console.print(table)
 
