@@ -123,7 +123,7 @@ def test_figure_is_drawn(tmp_path):
 
 def long_run_row(which: str, found: dict[str, float]) -> str:
     figures = [found[item] for item in ("energy", "momentum", "spin", "positions", "velocities") if item in found]
-    cells = [which, f"{found['steps']:,}", *(f"{x:.1e}" for x in figures), f"{found['cpu_s']:.0f} s"]
+    cells = [which, f"{found['steps']:,}", *(f"{x:.1e}" for x in figures), f"{found['cpu_s']:.2g} s"]
     return "| " + " | ".join(cells) + " |"
 
 
