@@ -64,8 +64,12 @@ def require_stepper(stepper: Any) -> None:
 class Portable:
     """Base of those that remember what they found for a System: copies and other processes find it anew."""
 
+    #: What the last step ended in, by which a state that goes on is known; in a copy it may be that of another System.
+    _left: Any = None
+
     def __getstate__(self) -> dict[str, Any]:
         found = {name for name, value in vars(self).items() if isinstance(value, tuple) and _is_of_a_system(value)}
+        found.add("_left")
         return {name: None if name in found else value for name, value in vars(self).items()}
 
 

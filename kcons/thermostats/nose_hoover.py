@@ -118,8 +118,6 @@ class NoseHooverChain(Listed):
             raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
         self.momentum: Momentum = momentum
         self.force_evaluations = self.stepper.force_evaluations
-        #: Variables of the state that the last step ended in.
-        self._left: FloatArray | None = None
 
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"

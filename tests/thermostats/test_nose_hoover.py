@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -122,6 +123,14 @@ def test_a_loaded_chain_of_other_degrees_of_freedom_begins_anew():
         assert told.start(held, loaded(saved)).thermostat[-1] == 3
     fewer = system([Distance(TEN[:4])], x, [12.0, 1, 1, 1, 1], waves)
     assert np.array_equal(NoseHooverChain(0.5, 1.0).start(fewer, loaded(saved)).thermostat, [0.0] * 6 + [11.0])
+
+
+def test_a_chain_copied_with_its_state_finds_other_degrees_of_freedom():
+    x, chain = METHANE, NoseHooverChain(0.5, 1.0)
+    held, fewer = (system([Distance(TEN[:n])], x, [12.0, 1, 1, 1, 1], waves) for n in (10, 4))
+    saved = run(held, State(x, thermal_velocities(held, x, 0.5, 1)), 0.02, 5, stepper=chain)
+    state, copied = pickle.loads(pickle.dumps((saved, chain)))
+    assert np.array_equal(copied.start(fewer, state).thermostat, [0.0] * 6 + [11.0])
 
 
 def test_another_stepper_of_order_two():

@@ -135,8 +135,6 @@ class Isokinetic(Splitting):
         self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum
         self._shares: tuple[System, Share] | None = None
-        #: Variables of the state that the last step ended in, and what was asked of it.
-        self._left: tuple[FloatArray | None, float | None, float | None] = None, None, None
         operations: list[Operation] = []
         for operation in splitting(*SCHEMES[order]):
             # Velocities are on the constraints whenever they turn.
@@ -226,7 +224,9 @@ class Isokinetic(Splitting):
     def _goes_on_from(self, system: System, share: Share, state: State) -> bool:
         """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
         left = self._left
-        if state.thermostat is left[0] and self.thermal_energy == left[1] and self.kinetic_energy == left[2]:
+        if left is not None and (
+            state.thermostat is left[0] and self.thermal_energy == left[1] and self.kinetic_energy == left[2]
+        ):
             return True  # most often, and in no time
         assert state.thermostat is not None
         twice, _, _, count = state.thermostat.tolist()

@@ -176,8 +176,6 @@ class HamiltonianMonteCarlo(Portable):
         self.conserve_momentum = bool(conserve_momentum)
         self.tolerance = positive(tolerance, "tolerance")
         self._known: tuple[System, ReversedSteps, FloatArray] | None = None
-        #: Variables of the state that the last step ended in.
-        self._left: FloatArray | None = None
 
     def __repr__(self) -> str:
         few, most = self.steps

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -151,6 +153,19 @@ def test_a_loaded_state_is_judged_by_the_energy_of_its_forces_now():
     assert np.array_equal(after.positions, expected.positions)
     assert after.thermostat[CHANGE] == expected.thermostat[CHANGE]
     assert Counts.of(after).accepted == 3
+
+
+def test_a_state_copied_with_its_sampler_is_judged_by_the_energy_of_its_forces_now():
+    """Copied or pickled in one piece, the state's variables are still those that the sampler left."""
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 3, 12)
+    end = run(held, state, 0.02, 2, stepper=sampler)
+    other = System(held.motion, lambda x, t: 3 * waves(x), potential=lambda x, t: 3 * waves_potential(x) + 40)
+    expected = HamiltonianMonteCarlo(0.5, 3, 12).step(other, replace(end, forces=None, thermostat=None), 0.02)
+    for copied in (pickle.loads(pickle.dumps((end, sampler))), copy.deepcopy((end, sampler))):
+        after = copied[1].step(other, copied[0], 0.02)
+        assert after.thermostat[CHANGE] == expected.thermostat[CHANGE]
+        assert np.array_equal(after.positions, expected.positions)
 
 
 @pytest.mark.parametrize("variables", [[0.5], [MARK, *range(9)]], ids=["Langevin", "IsokineticSpheres"])
