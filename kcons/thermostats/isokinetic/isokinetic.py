@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import positive
-from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
@@ -224,16 +223,18 @@ class Isokinetic(Splitting):
     def _goes_on_from(self, system: System, share: Share, state: State) -> bool:
         """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
         left = self._left
-        if left is not None and (
+        same = left is not None and (
             state.thermostat is left[0] and self.thermal_energy == left[1] and self.kinetic_energy == left[2]
-        ):
+        )
+        if same and state.velocities is left[3]:
             return True  # most often, and in no time
         assert state.thermostat is not None
         twice, _, _, count = state.thermostat.tolist()
-        if abs(self._twice_kinetic(share, count, twice) - twice) > ROUNDING * twice:
-            return False
-        if not may_be(count, system, state, self.atoms, self.momentum):
-            return False
+        if not same:
+            if abs(self._twice_kinetic(share, count, twice) - twice) > ROUNDING * twice:
+                return False
+            if not may_be(count, system, state, self.atoms, self.momentum):
+                return False
         return abs(share.square(state.velocities) - twice) <= KEPT * twice
 
     def _twice_kinetic(self, share: Share, count: float, found: float) -> float:
@@ -268,7 +269,7 @@ class Isokinetic(Splitting):
         if still is not None:
             return still
         after = isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
-        self._left = after.thermostat, self.thermal_energy, self.kinetic_energy
+        self._left = after.thermostat, self.thermal_energy, self.kinetic_energy, after.velocities
         return after
 
     # -- what can be read -----------------------------------------------------------------------

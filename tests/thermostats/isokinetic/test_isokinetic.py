@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -345,3 +346,18 @@ def test_a_run_that_goes_on_with_other_settings_takes_them(changed):
         thermostat, wanted, others = Isokinetic(1.0, atoms=[2, 3]), 4.0, np.isin(np.arange(6), [2, 3])
     after = run(held, state, 0.01, 5, stepper=thermostat)
     assert (held.masses[others, None] * after.velocities[others] ** 2).sum() == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_velocities_put_into_a_run_are_scaled_before_its_next_step(by_hand):
+    """They had the length of their own in the first flight, and only then that of the thermostat."""
+    held, x = dumbbells(3)
+    thermostat = Isokinetic(1.0)
+    state = run(held, State(x, thermal_velocities(held, x, 1.0, 1)), 0.01, 5, stepper=thermostat)
+    put = replace(state, velocities=3 * state.velocities)
+    if by_hand:
+        put = State(state.positions, 3 * state.velocities, forces=state.forces, thermostat=state.thermostat)
+    after = thermostat.step(held, put, 0.01)
+    expected = Isokinetic(1.0).step(held, replace(state, thermostat=None), 0.01)
+    np.testing.assert_allclose(after.positions, expected.positions, atol=1e-14)
+    np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-13)
