@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, whole_number
 from kcons.errors import InputError
 from kcons.thermostats import Estimate
 
@@ -84,10 +84,11 @@ def extrapolate(steps: ArrayLike, averages: Sequence[tuple[float, float]], order
     InputError
         One step only; a step, an error or an order that is not positive; values that are not finite.
     """
-    h, given = numbers(steps, "steps"), numbers([[float(v), float(e)] for v, e in averages], "averages")
+    h, given = numbers(steps, "steps"), numbers(averages, "averages")
     if h.ndim != 1 or given.shape != (len(h), 2):
         raise InputError(
-            f"{np.shape(steps)} steps and {len(given)} averages do not go together: give each average its step",
+            f"steps of shape {h.shape} and averages of shape {given.shape} do not go together: give each step its "
+            "(value, standard error)",
             item="averages",
         )
     if not (np.isfinite(h).all() and (h > 0).all()):
@@ -97,26 +98,36 @@ def extrapolate(steps: ArrayLike, averages: Sequence[tuple[float, float]], order
     values, errors = given.T
     if not (np.isfinite(given).all() and (errors > 0).all()):
         raise InputError("averages need finite values and positive errors", item="averages")
-    if isinstance(order, bool) or int(order) != order or order < 1:
-        raise InputError(f"order is {order!r}; give a whole number, 1 or more", item="order")
-    scale = float(h.max())
-    model = np.stack([np.ones_like(h), (h / scale) ** order], axis=1) / errors[:, None]
-    covariance = np.linalg.inv(model.T @ model)
-    found = covariance @ (model.T @ (values / errors))
+    order = whole_number(order, "order")
+    scale, finest = float(h.max()), float(errors.min())
+    powers, weights = (h / scale) ** order, (finest / errors) ** 2
+    # By pairs of averages, whose terms do not cancel however unequal the errors are.
+    i, j = np.triu_indices(len(h), 1)
+    shares = weights[i] * weights[j] / weights.sum()
+    spread = float((shares * (powers[i] - powers[j]) ** 2).sum())
+    if not spread > 0:
+        raise InputError(
+            f"of errors from {finest:g} to {errors.max():g} all but the smallest count for nothing: the averages tell "
+            "no slope. Leave out what is so uncertain",
+            item="averages",
+        )
+    slope = float((shares * (powers[i] - powers[j]) * (values[i] - values[j])).sum()) / spread
+    centre = float(weights @ powers / weights.sum())
+    value = float(weights @ values / weights.sum()) - centre * slope
     freedom = len(h) - 2
-    chi_square = float(((model @ found - values / errors) ** 2).sum())
     if freedom:
         from scipy.special import gammaincc  # slow to import
 
+        chi_square = float((((value + slope * powers - values) / errors) ** 2).sum())
         probability = float(gammaincc(0.5 * freedom, 0.5 * chi_square))
     else:
         chi_square, probability = 0.0, 1.0
     result = Extrapolated(
-        value=float(found[0]),
-        error=math.sqrt(covariance[0, 0]),
-        slope=float(found[1]) / scale**order,
-        slope_error=math.sqrt(covariance[1, 1]) / scale**order,
-        order=int(order),
+        value=value,
+        error=finest * math.sqrt(1 / float(weights.sum()) + centre**2 / spread),
+        slope=slope / scale**order,
+        slope_error=finest / math.sqrt(spread) / scale**order,
+        order=order,
         chi_square=chi_square,
         freedom=freedom,
         probability=probability,

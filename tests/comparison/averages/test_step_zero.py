@@ -30,6 +30,22 @@ def test_two_steps_are_richardson():
     assert found.estimate.off(1.0) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("errors", [(0.1, 1e-9), (1e-10, 0.1), (1e-200, 1e-200), (1e-9, 1e120)], ids=str)
+def test_errors_may_be_as_unequal_as_they_like(errors):
+    """The sums of squares of least squares lose what is uncertain beside what is certain."""
+    found = extrapolate([1.0, 2.0], [(0.9, errors[0]), (0.6, errors[1])])
+    assert found.value == pytest.approx(1.0, rel=1e-12) and found.slope == pytest.approx(-0.1, rel=1e-12)
+    assert found.error == pytest.approx(math.hypot(4 * errors[0], errors[1]) / 3, rel=1e-12)
+    assert found.slope_error == pytest.approx(math.hypot(*errors) / 3, rel=1e-12)
+
+
+def test_an_exact_run_among_others_holds_the_fit():
+    found = extrapolate([1.0, 2.0, 4.0], [(1.0, 1e-9), (1.3, 0.1), (2.5, 0.1)])
+    slope = (3 * 0.3 + 15 * 1.5) / (3**2 + 15**2)  # of a line through the first
+    assert found.slope == pytest.approx(slope, rel=1e-9) and found.value == pytest.approx(1 - slope, rel=1e-9)
+    assert found.chi_square == pytest.approx(((0.3 - 3 * slope) ** 2 + (1.5 - 15 * slope) ** 2) / 0.01, rel=1e-6)
+
+
 def test_errors_are_honest():
     """Synthetic runs: values scatter as told, chi^2 as it should."""
     rng = np.random.default_rng(3)
@@ -67,6 +83,11 @@ def test_a_model_that_does_not_fit_is_told():
         ([2.0, 1.0], [(1.0, 0.1), (1.0, 0.0)], 2, "positive errors"),
         ([2.0, 1.0], [(1.0, 0.1), (np.nan, 0.1)], 2, "finite values"),
         ([2.0, 1.0], [(1.0, 0.1), (1.0, 0.1)], 0, "order is 0"),
+        ([2.0, 1.0], [(1.0, 0.1), (1.0, 0.1)], math.nan, "order is nan"),
+        ([2.0, 1.0], [(1.0, 0.1), (1.0, 0.1)], None, "order is None"),
+        ([2.0, 1.0], [1.0, 1.0], 2, r"give each step its \(value, standard error\)"),
+        ([2.0, 1.0], [(1.0, 0.1), (1.0,)], 2, "averages is no array of numbers"),
+        ([2.0, 1.0], [(1.0, 1e-200), (1.0, 0.1)], 2, "all but the smallest count for nothing"),
     ],
 )
 def test_bad_input(steps, averages, order, text):
