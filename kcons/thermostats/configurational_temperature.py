@@ -34,8 +34,11 @@ class Estimate(NamedTuple):
     error: float
 
     def off(self, expected: float, error: float = 0.0) -> float:
-        """Distance from `expected` (known to `error`) in standard errors."""
-        return (self.value - expected) / math.hypot(self.error, error)
+        """Distance from `expected` (known to `error`) in standard errors; infinite where both are known exactly."""
+        away, doubt = self.value - expected, math.hypot(self.error, error)
+        if not doubt:
+            return math.copysign(math.inf, away) if away else 0.0
+        return away / doubt
 
 
 def mean(values: ArrayLike) -> Estimate:

@@ -40,6 +40,11 @@ def test_errors_of_correlated_series():
     assert (np.abs([f.value / f.error for f in found]) <= 3).mean() >= 0.98
 
 
+def test_what_does_not_change_is_no_distance_or_an_infinite_one_away():
+    still = mean(np.ones(40))
+    assert (still.off(1.0), still.off(2.0), still.off(0.5)) == (0.0, -math.inf, math.inf)
+
+
 def test_estimates():
     assert Estimate(1.1, 0.05).off(1.0) == pytest.approx(2.0)
     assert Estimate(1.1, 0.03).off(1.0, 0.04) == pytest.approx(2.0)
