@@ -21,6 +21,7 @@ from kcons.comparison.averages.layers import Layers
 from kcons.comparison.study.machine import environment
 from kcons.comparison.study.study import Watcher, interruptible, picked
 from kcons.comparison.test_systems.system import Units
+from kcons.constraints.arguments import positive
 from kcons.errors import InputError
 from kcons.steppers import BlanesMoan4, State, Stepper, System
 from kcons.thermostats import (
@@ -90,6 +91,7 @@ def _halfway(layers: Layers, step: float, friction: float, seed: int) -> Stepper
     steps = _groups(layers, step)
     if steps["fast"] == 1:
         return _langevin(layers, step, friction, seed)
+    steps["fast"] += steps["fast"] % 2  # of an odd number none ends in the middle
     return LangevinRespa(layers.thermal_energy, friction, seed, steps=steps, slow_kicks="middle", substeps=1)
 
 
@@ -223,11 +225,10 @@ def measure(
     """
     if (length is None) == (budget is None):
         raise InputError("give either length or budget", item="length")
-    for value, name in ((step, "dt"), (length, "length"), (budget, "budget"), (friction, "friction")):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise InputError(f"{name} is {value:g}; give a positive number", item=name)
-    if layers.inner_steps(step) > MOST:
-        raise InputError(f"a step of {step / layers.units.time_unit:g} {layers.units.time} is too long", item="dt")
+    for value, name in ((length, "length"), (budget, "budget")):
+        if value is not None:
+            positive(value, name)
+    _refuse(layers, step, friction)
     shown: dict[str, Any] = {
         "method": method.name,
         "step": step / layers.units.time_unit,
@@ -241,6 +242,14 @@ def measure(
     if run.samples < FEWEST:
         return Stepped(status="partial", note=f"{run.samples} samples are too few for an error", **shown)
     return Stepped(status="ok", **shown, **run.averages())
+
+
+def _refuse(layers: Layers, step: float, friction: float) -> None:
+    """Raise `InputError` for a step or a friction that no run can have."""
+    positive(step, "dt")
+    positive(friction, "friction")
+    if layers.inner_steps(step) > MOST:
+        raise InputError(f"a step of {step / layers.units.time_unit:g} {layers.units.time} is too long", item="dt")
 
 
 class _Run:
@@ -433,6 +442,8 @@ def compare(
         lengths = asked if method.several or steps is not None else asked[:2]
         pairs = [(step, rate) for step in lengths for rate in (rates if method.frictions else rates[:1])]
         planned += [(method, *pair, budget / len(pairs)) for pair in pairs]
+    for _, step, rate, _ in planned:
+        _refuse(layers, step, rate)  # before the first run, whose results would be lost
     runs: list[Stepped] = []
     with interruptible(lambda: len(runs), len(planned), "runs", partial) as interrupted:
         for method, step, rate, share in planned:

@@ -104,6 +104,21 @@ def test_comparison(layers):
     assert data["reference"][0] == pytest.approx(layers.reference.value / 27)
 
 
+def test_between_kicks_an_odd_number_of_inner_steps_becomes_even(layers):
+    """They get shorter, and never longer than asked for."""
+    stepper = METHODS["langevin-halfway"].make(layers, 6 * FS, 0.01 / FS, 1)
+    assert [(level.group, level.steps) for level in stepper.levels] == [("slow", 1), ("fast", 4)]
+    run = measure(layers, METHODS["langevin-halfway"], 6 * FS, 0.01 / FS, length=60 * FS)
+    assert run.status == "partial" and run.cheap == 4 * run.evaluations
+
+
+@pytest.mark.parametrize("wrong", [{"steps": [4 * FS, 1000 * FS]}, {"frictions": [0.01 / FS, -1.0]}], ids=str)
+def test_nothing_runs_where_one_run_cannot_be(layers, monkeypatch, wrong):
+    monkeypatch.setattr(long_steps, "measure", lambda *_, **__: pytest.fail("a run was made"))
+    with pytest.raises(InputError, match=r"is too long|friction is"):
+        compare(layers, **{"methods": ["spheres"], "budget": 1.0, **wrong})
+
+
 def test_bad_input(layers):
     with pytest.raises(InputError, match="there is no method 'rattle'; there are langevin"):
         compare(layers, methods=["rattle"])
