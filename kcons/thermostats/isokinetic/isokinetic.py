@@ -189,11 +189,8 @@ class Isokinetic(Splitting):
             state = replace(state, forces=None)
         share = self._share(system)
         if carried(state, 4, "Isokinetic") and self._goes_on_from(system, share, state):
-            if state.forces is None and state.thermostat is not None:
-                state = system.with_forces(state)
-                variables = np.array(state.thermostat)
-                variables[2] = share.push_square(system, state)
-                state = replace(state, thermostat=variables)
+            if state.forces is None or self._left is None or state.positions is not self._left[4]:
+                state = self._pushed(system, share, system.with_forces(state))
             return state
         state = system.with_forces(state)
         assert state.forces is not None
@@ -219,6 +216,15 @@ class Isokinetic(Splitting):
             velocities = rest if drive is None else drive + rest
         variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
+
+    def _pushed(self, system: System, share: Share, state: State) -> State:
+        """The state with f.M_par^+ f of its forces, which is kept where it is that but for rounding."""
+        assert state.thermostat is not None
+        variables, square = state.thermostat.copy(), share.push_square(system, state)
+        if abs(variables[2] - square) <= KEPT * square:
+            return state
+        variables[2] = square
+        return replace(state, thermostat=variables)
 
     def _goes_on_from(self, system: System, share: Share, state: State) -> bool:
         """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
@@ -269,7 +275,8 @@ class Isokinetic(Splitting):
         if still is not None:
             return still
         after = isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
-        self._left = after.thermostat, self.thermal_energy, self.kinetic_energy, after.velocities
+        asked = self.thermal_energy, self.kinetic_energy
+        self._left = after.thermostat, *asked, after.velocities, after.positions
         return after
 
     # -- what can be read -----------------------------------------------------------------------

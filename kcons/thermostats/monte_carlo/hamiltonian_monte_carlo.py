@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from operator import is_
 from weakref import ref
 
 import numpy as np
@@ -237,8 +238,9 @@ class HamiltonianMonteCarlo(Portable):
             raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
         held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
         held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
-        # Positions without forces may be new ones, and what a state carries, or a file, that of other forces.
-        strange = state.thermostat is not self._left and (state.origin is None or state.origin[0] is None)
+        # Positions without forces may be new ones, and what a state carries, or a file, that of other forces or places.
+        goes_on = self._left is not None and all(map(is_, self._left, (state.thermostat, state.positions)))
+        strange = not goes_on and (state.origin is None or state.origin[0] is None)
         if strange or not state.has_forces_of(system) or math.isnan(held[POTENTIAL]):
             known, held[POTENTIAL] = held[POTENTIAL], energy_at(system, state)
             if not math.isnan(known) and known != held[POTENTIAL]:
@@ -266,7 +268,7 @@ class HamiltonianMonteCarlo(Portable):
             held[POTENTIAL] = potential
         time, left_over = state.later(length)
         number, origin = state.step + 1, (ref(system), end.positions, end.velocities, time)
-        self._left = held
+        self._left = held, end.positions
         return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 
     def trajectory(self, system: System, state: State, dt: float, count: int) -> State:

@@ -15,6 +15,9 @@ from kcons.steppers.stages.compensated_steps import check_finite
 from kcons.thermostats.freedom import carried
 from kcons.thermostats.multistep.force_groups import ForceGroups
 
+#: Difference of the forces of a state from the sum of those of its groups, relative to these, that is their rounding.
+SAME = 1e-12
+
 
 @dataclass
 class GroupedForces:
@@ -63,12 +66,9 @@ class GroupedForces:
         known = carried(state, variables + stored, name, marked=marked)
         x, _, forces = system.taken(state)
         found = cls(system, names, {}, middle)
-        if middle:
-            for group in names[1:]:
-                found.evaluate(group, x, state.time, state.step)
-        elif forces is not None and not stored:
+        if forces is not None and not stored and not middle:
             found.now[names[0]] = forces
-        elif forces is not None and known:
+        elif forces is not None and known and stored:
             assert state.thermostat is not None
             if state.thermostat[variables] != _number_of(names):
                 raise InputError(
@@ -78,8 +78,11 @@ class GroupedForces:
                 )
             parts = state.thermostat[variables + 1 :].reshape(len(names), *x.shape)
             found.now.update(zip(sorted(names), parts, strict=True))
-        else:
-            for group in names:
+            # Positions and their forces may have been put together with variables of another place.
+            if not np.all(np.abs(parts.sum(axis=0) - forces) <= SAME * np.abs(parts).max()):
+                found.now.clear()
+        for group in names[1:] if middle else names:
+            if group not in found.now:
                 found.evaluate(group, x, state.time, state.step)
         return found, None if state.thermostat is None else state.thermostat[:variables]
 

@@ -361,3 +361,16 @@ def test_velocities_put_into_a_run_are_scaled_before_its_next_step(by_hand):
     expected = Isokinetic(1.0).step(held, replace(state, thermostat=None), 0.01)
     np.testing.assert_allclose(after.positions, expected.positions, atol=1e-14)
     np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-13)
+
+
+def test_positions_put_into_a_run_with_their_forces():
+    """The square of the forces along the constraints is that of these."""
+    held, x = dumbbells(3)
+    thermostat = Isokinetic(1.0)
+    state = run(held, State(x, thermal_velocities(held, x, 1.0, 1)), 0.01, 5, stepper=thermostat)
+    there = state.positions + np.array([0.4, -0.3, 0.2])
+    put = State(there, state.velocities, forces=held.force(there, 0.0), thermostat=state.thermostat)
+    after = thermostat.step(held, put, 0.01)
+    expected = Isokinetic(1.0).step(held, replace(put, forces=None), 0.01)
+    assert after.thermostat[1] == pytest.approx(expected.thermostat[1], rel=1e-12)
+    np.testing.assert_allclose(after.positions, expected.positions, atol=1e-14)

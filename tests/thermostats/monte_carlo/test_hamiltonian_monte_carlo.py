@@ -312,6 +312,10 @@ def test_positions_put_into_a_state_have_their_own_energy():
     assert np.abs(moved.positions - state.positions).max() > 0.01
     assert placed.thermostat[CHANGE] == fresh.thermostat[CHANGE]
     assert Counts.of(placed).proposals == 2
+    moved = sampler.step(held, state, 0.1)
+    made_by_hand = {"forces": waves(state.positions), "step": 1, "thermostat": moved.thermostat}
+    put = State(state.positions, state.velocities, **made_by_hand)
+    assert sampler.step(held, put, 0.1).thermostat[CHANGE] == fresh.thermostat[CHANGE]
 
 
 @pytest.mark.parametrize("value", ["1.0", None, 1.0 + 0j, np.ones(2), True])

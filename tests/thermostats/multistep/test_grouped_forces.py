@@ -38,6 +38,19 @@ def test_what_a_state_carries_is_not_evaluated_anew():
     assert groups.evaluations == {"fast": 2, "slow": 2}
 
 
+def test_forces_of_another_place_are_evaluated_anew():
+    """A state put together of new positions, their forces, and what another state carried."""
+    held, groups = made()
+    found, _ = GroupedForces.of(held, State(X, 0 * X), NAMES, 1, "X")
+    there = 1.1 * X
+    put = State(there, 0 * X, forces=groups(there, 0.0), thermostat=found.closed(np.zeros(1)))
+    again, _ = GroupedForces.of(held, put, NAMES, 1, "X")
+    np.testing.assert_array_equal(again.now["slow"], quartic(there))
+    np.testing.assert_array_equal(again.now["fast"], springs(there, 0))
+    halfway, _ = GroupedForces.of(held, replace(put, thermostat=np.zeros(1)), NAMES, 1, "X", middle=True)
+    assert halfway.now.keys() == {"fast"}
+
+
 def test_forces_of_groups_that_were_renamed():
     """By another order of the names they would change places."""
     held, _ = made()
