@@ -54,7 +54,7 @@ def exchange(
         raise InputError(
             f"{len(states)} states and {len(kt)} temperatures; give one for each, two or more", item="states"
         )
-    number = whole_number(number, "number", 0)
+    number = whole_number(number, "number", 0, 2**64 - 1)
     for k, state in enumerate(states):
         if (
             not isinstance(state, State)

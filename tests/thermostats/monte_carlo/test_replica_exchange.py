@@ -74,6 +74,7 @@ def test_bad_input():
         ([bare, *states[1:]], LADDER, 0, "state 0 does not know its potential energy"),
         ([states[0], two, states[2]], LADDER, 0, "state 1 has another number of atoms"),
         (states, LADDER, -1, "number is -1"),
+        (states, LADDER, 2**64, "number is 18446744073709551616"),
     ):
         with pytest.raises(InputError, match=words):
             exchange(given, temperatures, 1, number)
