@@ -317,6 +317,10 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
     def _stepper(self, temperature_K: float) -> NoseHooverChain:
         return NoseHooverChain(units.kB * positive(temperature_K, "temperature_K"), **self._options)
 
+    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
+        # A copy, at which the chain sees that momenta may be new.
+        return None if last is None or last.thermostat is None else last.thermostat.copy()
+
     def set_temperature(self, temperature_K: float) -> None:
         """Use another temperature from now on; the chain goes on."""
         self.stepper = self._stepper(temperature_K)

@@ -17,10 +17,13 @@ from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import (
+    AT_REST,
     Momentum,
     carried,
     freedom,
     may_be,
+    momentum_share,
+    open_directions,
     refuse_friction,
     warn_of_conserved_momenta,
 )
@@ -82,8 +85,8 @@ class NoseHooverChain(Listed):
     Warns
     -----
     UserWarning
-        At the start of a run: total momentum is conserved but for a factor, and not zero; or the forces exert no
-        torque, so that the same holds of angular momentum.
+        At the start of a run, or where it goes on with other velocities: total momentum is conserved but for a factor,
+        and not zero. At the start: the forces exert no torque, so that the same holds of angular momentum.
 
     Notes
     -----
@@ -142,17 +145,31 @@ class NoseHooverChain(Listed):
             state = replace(state, thermostat=None)  # degrees of freedom are those of another system
         known = carried(state, 2 * self.length + 1, "this NoseHooverChain")
         state = system.with_forces(state)
-        if known and (state.thermostat is self._left or self._fits(system, state)):
+        if known and state.thermostat is self._left:
+            return state
+        goes_on = known and self._fits(system, state)
+        if goes_on and not self._moves_on(system, state):
             return state
         assert state.forces is not None
         free = freedom(system, state, state.forces, None, self.momentum)
-        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, free.turns, stacklevel=4)
+        turns = free.turns and not goes_on
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=4)
+        if goes_on:
+            return state
         return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
 
     def _fits(self, system: System, state: State) -> bool:
         """Whether g is that of this system."""
         assert state.thermostat is not None
         return may_be(float(state.thermostat[-1]), system, state, None, self.momentum)
+
+    def _moves_on(self, system: System, state: State) -> bool:
+        """Whether velocities, which may be new ones, have total momentum, and g is less for what is conserved of it."""
+        assert state.thermostat is not None
+        if not state.thermostat[-1] < system.motion.degrees_of_freedom:
+            return False
+        directions = open_directions(system.motion, state.positions, state.time)
+        return momentum_share(system.masses, state.velocities, directions) > AT_REST
 
     def turned(self, state: State) -> State:
         """With the velocities of the links turned round, as those of a state that was `reversed` are."""

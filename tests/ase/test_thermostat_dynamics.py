@@ -412,7 +412,13 @@ def test_total_momentum_is_said():
             made(kind, atoms)
     draw_velocities(atoms, 300, 1, zero_momentum=True)
     for kind in ("isokinetic", "nose-hoover"):
-        made(kind, atoms).run(3)
+        moving = made(kind, atoms)
+        moving.run(3)
+        draw_velocities(atoms, 300, 2)
+        with pytest.warns(UserWarning, match="total momentum is not zero"):
+            moving.run(1)
+        draw_velocities(atoms, 300, 1, zero_momentum=True)
+        moving.run(3)
 
 
 @KINDS

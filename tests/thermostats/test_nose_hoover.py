@@ -125,6 +125,22 @@ def test_a_loaded_chain_of_other_degrees_of_freedom_begins_anew():
     assert np.array_equal(NoseHooverChain(0.5, 1.0).start(fewer, loaded(saved)).thermostat, [0.0] * 6 + [11.0])
 
 
+def test_a_loaded_run_whose_total_momentum_is_not_zero_says_so_again():
+    """Where none is conserved nothing is said, and no force is asked for."""
+    x, asked = METHANE, []
+    held = system([Distance(TEN)], x, [12.0, 1, 1, 1, 1], lambda x, t: asked.append(0) or waves(x))
+    state = State(x, thermal_velocities(held, x, 0.5, 1))
+    with pytest.warns(UserWarning, match="total momentum is not zero"):
+        saved = run(held, state, 0.02, 5, stepper=NoseHooverChain(0.5, 1.0, momentum="conserved"))
+    with pytest.warns(UserWarning, match="total momentum is not zero"):
+        again = NoseHooverChain(0.5, 1.0, momentum="conserved").start(held, loaded(saved))
+    assert np.array_equal(again.thermostat, saved.thermostat)
+    free = run(held, state, 0.02, 5, stepper=NoseHooverChain(0.5, 1.0))
+    asked.clear()
+    assert np.array_equal(NoseHooverChain(0.5, 1.0).start(held, loaded(free)).thermostat, free.thermostat)
+    assert not asked
+
+
 def test_a_chain_copied_with_its_state_finds_other_degrees_of_freedom():
     x, chain = METHANE, NoseHooverChain(0.5, 1.0)
     held, fewer = (system([Distance(TEN[:n])], x, [12.0, 1, 1, 1, 1], waves) for n in (10, 4))
