@@ -10,6 +10,7 @@ import numpy as np
 from kcons.constraints.arguments import finite_number, positive, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
+from kcons.thermostats.freedom import carried
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     POTENTIAL,
     SIZE,
@@ -155,8 +156,15 @@ def tune(
 
 
 def sum_of(state: State) -> float:
-    """Probabilities of acceptance of all proposals so far, added up."""
-    return 0.0 if state.thermostat is None else float(state.thermostat[SUM])
+    """Probabilities of acceptance of all proposals so far, added up.
+
+    Raises
+    ------
+    InputError
+        The state carries variables of another thermostat.
+    """
+    held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
+    return 0.0 if held is None else float(held[SUM])
 
 
 def wanted_share(wanted: float) -> float:

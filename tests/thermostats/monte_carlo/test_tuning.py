@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,8 @@ def test_bad_input():
             tune(held, state, 0.1, sampler, **options)
     with pytest.raises(InputError, match="dt is 0"):
         tune(held, state, 0.0, sampler)
+    with pytest.raises(InputError, match="variables of another thermostat, not of HamiltonianMonteCarlo"):
+        tune(held, replace(state, thermostat=np.zeros(1)), 0.1, sampler)
 
 
 def test_where_nothing_succeeds():
