@@ -15,6 +15,7 @@ from kcons.steppers import Rattle, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.splitting import Splitting
+from kcons.steppers.stages.compensated_steps import check_finite
 from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import (
     AT_REST,
@@ -188,7 +189,7 @@ class NoseHooverChain(Listed):
         InputError
             A time step that the chain cannot follow; the state carries variables of another thermostat.
         ConvergenceError, NonFiniteError, InputError, UnsupportedError
-            As for the stepper.
+            As for the stepper. NonFiniteError also for velocities at the start.
         """
         self.check(system)
         still = stays(state, dt)
@@ -200,6 +201,7 @@ class NoseHooverChain(Listed):
             after = self.stepper.step(system, replace(begin, velocities=v), dt)
             v, chain = self._half(system, after.velocities, chain, dt)
         except OverflowError:
+            check_finite(begin.velocities, "velocity", state.step + 1)
             raise InputError(
                 f"step {state.step + 1}: a chain of period {self.period:g} cannot follow a time step of {dt:g}; take "
                 "at most a twentieth of the period",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -183,6 +184,8 @@ def test_steps_that_cannot_be():
         NoseHooverChain(0.5, 900.0).step(held, begun, 90.0)
     with pytest.raises(InputError, match="step 1: a chain of period 1 cannot follow a time step of 90"):
         thermostat.step(held, begun, 90.0)
+    with pytest.raises(NonFiniteError, match="non-finite velocity at step 1 on atom 0"):
+        thermostat.step(held, replace(state, velocities=np.nan * state.velocities), 0.1)
     with pytest.raises(NonFiniteError, match="non-finite force at step 1"):
         thermostat.step(System(held.motion, lambda x, t: x * [1.0, 2.0, 3.0 if t == 0 else np.nan]), begun, 0.1)
     for now, before in zip((begun.positions, begun.velocities, begun.thermostat), copies, strict=True):
