@@ -143,8 +143,7 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
             continue
         if type(other) is ase.constraints.FixCom and all(c.translation_invariant for c in bound.given):
             continue  # a common shift of all atoms changes no row
-        indices = other.get_indices() if hasattr(other, "get_indices") else np.arange(bound.n_atoms)
-        shared = np.intersect1d(np.arange(bound.n_atoms)[indices], bound.touched)
+        shared = np.intersect1d(_acted_on(other, bound.n_atoms), bound.touched)
         if len(shared):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {shared[0]}, which kcons holds too; ASE would apply the two "
@@ -152,6 +151,14 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
                 f"{_REPLACEMENTS.get(type(other).__name__, '')}"
             )
     bound.others = tuple(present)
+
+
+def _acted_on(other: Any, n_atoms: int) -> IntArray:
+    """Atoms that an ASE constraint acts on; all where it does not say."""
+    if isinstance(other, ase.constraints.FixedMode):  # its own get_indices names none
+        return np.flatnonzero(other.mode.reshape(-1, 3).any(axis=1))
+    indices = other.get_indices() if hasattr(other, "get_indices") else slice(None)
+    return np.arange(n_atoms)[indices]
 
 
 _REPLACEMENTS = {

@@ -13,6 +13,7 @@ from ase.constraints import (
     FixBondLengths,
     FixCartesian,
     FixCom,
+    FixedMode,
     FixedPlane,
     Hookean,
 )
@@ -58,6 +59,7 @@ from kcons.steppers import BlanesMoan4
         (FixedPlane([1], (0, 0, 1)), "Plane"),
         (FixCartesian([2]), "LinearCombination"),
         (Constraints(Distance([2, 4])), ""),
+        (FixedMode(np.eye(6)[:, :3]), ""),  # of atoms 0, 1 and 2; it says itself that it acts on none
     ],
     ids=lambda v: type(v).__name__,
 )
