@@ -10,6 +10,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import failures
 from kcons.plan.plan import Plan
@@ -27,6 +28,8 @@ NEAREST_ROUNDS = 200
 #: Newton iterations that one restoration may take in all. Dense algebra takes fewer for clusters of more than so many
 #: rows, by the square of their number. A projection that fails counts as this many, and so many may be rescued.
 MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
+#: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
+_STILL, _ROUNDING = 1e-12, 16 * float(np.finfo(float).eps)
 #: Rounds towards the constraints that must gain a tenth, or damping does better.
 STALLED = 10
 #: Halvings of one step of it.
@@ -200,12 +203,16 @@ class FarStart:
     def _settle(self, start: FloatArray, x: FloatArray, time: float) -> bool:
         """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
 
-        Its fixed point is the foot of the mass-weighted perpendicular from the start. False, and `x` as it
-        was, where the iteration does not settle.
+        Its fixed point is the foot of the mass-weighted perpendicular from the start. False where the iteration
+        does not settle, and `x` as it was, or as near as the work came that was left.
         """
         here, last = x, np.inf
+        still = max(_STILL * extent(start), _ROUNDING * float(np.abs(start).max(initial=0.0)))
+        first = np.inf
         for _ in range(NEAREST_ROUNDS):
             if self._work.iterations <= 0:
+                if last < first:  # on its way to the foot, and nearer than where it began
+                    np.copyto(x, here)
                 return False
             ahead = start.copy()
             try:
@@ -214,10 +221,12 @@ class FarStart:
                 return False
             move = float(np.max(np.abs(ahead - here), initial=0.0))
             here = ahead
-            if move == 0.0 or (move > 0.5 * last and move < 1e-12):
+            if move == 0.0 or (move > 0.5 * last and move < still):
                 break
             if move > 2 * last:
                 return False
+            if last == np.inf:
+                first = move
             last = move
         np.copyto(x, here)
         return True

@@ -80,6 +80,30 @@ def test_nearest_point(name: str, seed: int) -> None:
         assert distance(aside) >= distance(found) * (1 - 1e-12)
 
 
+@pytest.mark.parametrize("unit", [2.0**-33, 2.0**30])
+def test_the_nearest_point_is_the_same_in_any_unit(unit: float) -> None:
+    rng = np.random.default_rng(9)  # a search that takes many rounds
+    x, masses = rng.normal(size=(4, 3)), rng.uniform(1, 16, 4)
+    start = x + 0.25 * rng.normal(size=x.shape)
+
+    def nearest(length: float) -> np.ndarray:
+        motion = Motion(ConstraintSet(held.Angle([(0, 1, 2), (1, 2, 3)]), length * x, masses), length * x)
+        return motion.restore_positions(length * start, bonds=[]) / length
+
+    np.testing.assert_allclose(nearest(unit), nearest(1.0), rtol=0, atol=1e-10)
+
+
+def test_a_search_that_uses_up_its_work_keeps_how_far_it_came() -> None:
+    rng = np.random.default_rng(17)
+    x, masses = rng.normal(size=(4, 3)), rng.uniform(1, 16, 4)
+    start = x + 0.25 * rng.normal(size=x.shape)
+    whole = ConstraintSet(held.Distance([(0, 1), (1, 2), (2, 3)]), x, masses)
+    motion = Motion(whole, x)
+    found = motion.restore_positions(start, bonds=[])
+    fulfilled(whole, found)
+    assert off_the_perpendicular(whole, motion, start, found) < 1e-6
+
+
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("factor", [0.8, 1.2, 0.5, 2.0])
 def test_scaled_starts(name: str, factor: float) -> None:
