@@ -136,15 +136,35 @@ class ConstrainedDynamics(MolecularDynamics):
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
-        logfile = kwargs.pop("logfile", None)
-        super().__init__(atoms, timestep, **kwargs)
-        if logfile:
-            log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
-            self.attach(log, kwargs.get("loginterval", 1))
+        before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
+        try:
+            self._prepare(atoms, timestep, state)
+            # Files last: to open one for writing ends what an older run left there.
+            steps, logfile = self.nsteps, kwargs.pop("logfile", None)
+            super().__init__(atoms, timestep, **kwargs)
+            self.nsteps = steps
+            if logfile:
+                log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
+                self.attach(log, kwargs.get("loginterval", 1))
+        except BaseException:
+            atoms.set_positions(before[0], apply_constraint=False)
+            atoms.set_momenta(before[1], apply_constraint=False)
+            atoms.cell[...] = before[2]
+            raise
+
+    def _prepare(self, atoms: Atoms, timestep: float, state: State | None) -> None:
+        """Whatever can be refused, and what the first step needs."""
+        self.atoms, self.dt, self.nsteps = atoms, timestep, 0
+        if not atoms.has("momenta"):
+            atoms.set_momenta(np.zeros((len(atoms), 3)), apply_constraint=False)
         if state is not None:
             self._resume(state)
         self._answers.note()
         self._start(self._systems())
+        self._begin()
+
+    def _begin(self) -> None:
+        """What else a class does before the first step is logged."""
 
     # -- what a person asks for -----------------------------------------------------------------
 

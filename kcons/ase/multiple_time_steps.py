@@ -157,6 +157,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
 
     def _begin(self) -> None:
         """Find the spheres, so that what cannot be is refused before the first step."""
+        super()._begin()
         if isinstance(self.stepper, IsokineticSpheres):
             self.stepper.radii(self._systems(), self.atoms.positions)
 

@@ -60,20 +60,12 @@ class ThermostattedDynamics(ConstrainedDynamics):
             if "state" in kwargs:
                 raise InputError("give restart or state, not both", item="restart")
             kwargs["state"] = _read(restart, len(atoms))
-        before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
-        try:
-            super().__init__(atoms, timestep, stepper, **kwargs)
-            if self.barostat is not None and self._state is not None:
-                self.barostat.variables_of(self._state)  # before anything is changed by a state of another one
-            self._begin()
-        except BaseException:
-            atoms.set_positions(before[0], apply_constraint=False)
-            atoms.set_momenta(before[1], apply_constraint=False)
-            atoms.cell[...] = before[2]
-            raise
+        super().__init__(atoms, timestep, stepper, **kwargs)
 
     def _begin(self) -> None:
         """Start the thermostat, so that atoms have the kinetic energy it keeps before the first step is logged."""
+        if self.barostat is not None and self._state is not None:
+            self.barostat.variables_of(self._state)  # before anything is changed by a state of another one
         if not isinstance(self.stepper, Isokinetic | NoseHooverChain):
             return
         state = self._start(self._systems())

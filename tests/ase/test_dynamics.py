@@ -283,6 +283,36 @@ def test_trajectory_log_and_observers(tmp_path):
     assert description["stepper"] == "Rattle()"
 
 
+@pytest.mark.parametrize("thermostat", [False, True])
+def test_a_refused_start_leaves_the_files_of_an_older_run(tmp_path, thermostat):
+    atoms, _ = water()
+    files = {"trajectory": str(tmp_path / "md.traj"), "logfile": str(tmp_path / "md.log")}
+    with ConstrainedDynamics(atoms, FS, **files) as dyn:
+        dyn.run(2)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert sorted(before) == ["md.log", "md.traj"]
+    if thermostat:
+        atoms.set_momenta(np.zeros((len(atoms), 3)))  # nothing that could be scaled
+        with pytest.raises(InputError):
+            IsokineticDynamics(atoms, FS, 300.0, **files)
+    else:
+        atoms.positions[0] += 0.1
+        with pytest.raises(InputError, match="atoms are off row"):
+            ConstrainedDynamics(atoms, FS, **files)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_what_ase_refuses_leaves_the_atoms(tmp_path):
+    atoms, _ = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(3)
+    other, _ = water()
+    before = state(other)
+    with pytest.raises(TypeError, match="nonsense"):
+        ConstrainedDynamics(other, FS, state=dyn.state, nonsense=1)
+    assert equal(state(other), before)
+
+
 def test_one_force_evaluation_a_step():
     atoms, _ = water()
     dyn = ConstrainedDynamics(atoms, FS)
