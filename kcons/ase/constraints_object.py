@@ -186,7 +186,8 @@ class Constraints(FixConstraint):
             still = KICK_ROUNDING * float(np.abs(velocities).max(initial=0.0)) if due else 0.0
             bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
             if due:
-                bound.motion.certify(atoms.arrays["positions"], velocities, still=still)
+                # Positions may be as a file gave them, off by less than START_TOLERANCE.
+                bound.motion.certify(atoms.arrays["positions"], velocities, still=still, moved=False)
                 self._momenta_due = CHECK_EVERY
             self._momenta_due -= 1
             np.multiply(velocities, masses, momenta, casting="unsafe")  # integers are all 0

@@ -223,10 +223,19 @@ class Motion(Projector):
 
     # -- certificate and report ---------------------------------------------------------------------------------
 
-    def certify(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, still: float = 0.0) -> None:
+    def certify(
+        self,
+        x: ArrayLike,
+        v: ArrayLike | None = None,
+        time: float = 0.0,
+        *,
+        still: float = 0.0,
+        moved: bool = True,
+    ) -> None:
         """Raise unless positions (and velocities) are on the constraints as the set, and not a solver, defines them.
 
         Where rows were converted, the rows that were given are looked at too. Speeds of `still` count as rest.
+        Positions that no solver has `moved` are not looked at.
 
         Raises
         ------
@@ -235,9 +244,9 @@ class Motion(Projector):
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
         self.cell()
-        certify(self.constraint_set, here, speed, time, still=still)
+        certify(self.constraint_set, here, speed, time, still=still, moved=moved)
         if self.conversions:
-            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still)
+            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still, moved=moved)
 
     def report(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, condition: bool = True) -> Report:
         """Rows, rank, condition, residuals, iterations and the solver of each kind of cluster, at `x` (and `v`).

@@ -286,6 +286,21 @@ def test_a_molecule_at_rest_stays_certified():
     assert np.abs(atoms.get_velocities()).max() <= 1e-12
 
 
+def test_momenta_of_water_from_a_file():
+    """With seven decimals the geometry is that of the model to what `constrain` takes, and not to a certificate."""
+    exact = molecule("H2O")
+    constrain(exact, rigid_water(exact, "tip3p"), project=True)
+    atoms = molecule("H2O")
+    atoms.positions = np.round(exact.positions, 7)
+    held = constrain(atoms, rigid_water(atoms, "tip3p"))
+    assert off(atoms, held) > 1e-8
+    thermalize_momenta(atoms, 300, rng=np.random.default_rng(1))
+    assert held.report(atoms).velocity_residual <= 1e-15
+    atoms.calc = Free()
+    VelocityVerlet(atoms, FS).run(1)
+    assert off(atoms, held) <= 1e-14
+
+
 # -- targets ----------------------------------------------------------------------------------------
 
 
