@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from math import isfinite
 from operator import is_
 from typing import Any, Literal
+from weakref import ref
 
 import ase.constraints
 import numpy as np
@@ -53,6 +54,23 @@ class Binding:
     #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
     weights: tuple[FloatArray, FloatArray, FloatArray] | None
     others: tuple[Any, ...] = ()
+    #: The object whose cells the engine follows, if it is still there.
+    owner: Callable[[], object] = lambda: None
+
+    def serves(self, holder: object, cell: FloatArray, new: FloatArray | None = None) -> bool:
+        """Whether `holder`, whose cell is this, can go on with the engine, also in a new cell.
+
+        Copies of an object share an engine as long as all are in one cell; then only its owner goes on with it.
+        """
+        owner = self.owner()
+        if owner is holder or not self.periodic:
+            return True
+        if cell.tobytes() != self.cell:
+            return False
+        if owner is None:
+            self.owner = ref(holder)
+            return True
+        return new is None or new.tobytes() == self.cell
 
     def fits(self, atoms: Atoms) -> bool:
         """Whether number of atoms, periodicity and masses are still the same."""

@@ -108,7 +108,7 @@ class Constraints(FixConstraint):
             self._forget()
             self._last = ref(atoms)
         bound = self._binding
-        if bound is None or not bound.fits(atoms):
+        if bound is None or not (bound.fits(atoms) and bound.serves(self, atoms.cell.array)):
             bound = self._bind(atoms)
         else:
             bound.follow_cell(atoms, atoms.cell.array)
@@ -121,6 +121,7 @@ class Constraints(FixConstraint):
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
         bound = bind(given, atoms, self.degenerate)
+        bound.owner = ref(self)
         self.constraints = bound.given
         self._repeated, self._binding = None, bound
         self._forget()
@@ -213,7 +214,10 @@ class Constraints(FixConstraint):
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
         bound = self._binding
         if bound is not None and bound.fits(atoms):
-            bound.follow_cell(atoms, numbers(cell, "cell"))
+            new = numbers(cell, "cell")
+            if not bound.serves(self, atoms.cell.array, new):
+                bound = self._bind(atoms)
+            bound.follow_cell(atoms, new)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
@@ -272,7 +276,7 @@ class Constraints(FixConstraint):
 
     def copy(self) -> Constraints:
         """Independent copy with the same targets."""
-        # Calculators copy the atoms at every step, so this is quick. Neither the rows nor an engine ever change;
+        # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
         warn_of_displacements(self.get_indices)
         twin = object.__new__(Constraints)

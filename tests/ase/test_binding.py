@@ -36,6 +36,7 @@ from ase_systems import (
 from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics, MultipleTimeSteps, constrain, rigid_water
 from kcons.constraints import (
     Angle,
+    CenterDistance,
     Distance,
     LinearVelocity,
     Sphere,
@@ -163,6 +164,22 @@ def test_a_new_cell_does_not_rebuild_the_engine():
     # A copy with another cell gets the engine with its own.
     assert peer.constraints[0].engine(peer).constraint_set.half_width == pytest.approx(3)
     assert held.engine(atoms).constraint_set.half_width == pytest.approx(2.95)
+
+
+def test_copies_in_cells_of_their_own():
+    """Centres that nothing ties together, whose images are followed over a tenth of a cell vector and no more."""
+    atoms = loose_waters(2)
+    atoms.cell, atoms.pbc = np.full(3, 12.0), True
+    constrain(atoms, [rigid_water(atoms), CenterDistance([0, 1, 2], [3, 4, 5])])
+    images = [atoms.copy() for _ in range(3)]
+    for image, factor in zip(images, (0.92, 1.0, 1.08), strict=True):
+        image.set_cell(factor * atoms.cell)
+    for seed in range(2):
+        for image in images:
+            image.set_positions(image.positions + np.random.default_rng(seed).normal(scale=0.01, size=(6, 3)))
+            assert off(image, image.constraints[0]) <= 1e-14
+    assert len({id(image.constraints[0].engine(image)) for image in images}) == 3
+    assert np.array_equal(atoms.constraints[0].engine(atoms).cell()[0], atoms.cell.array)
 
 
 def test_a_cell_too_small_is_refused_before_it_is_set():
