@@ -248,7 +248,7 @@ class Answers:
     def note(self) -> None:
         """What there is now is known."""
         self._known = self._now()
-        self._settings = [_settings(each) for each in (self._atoms.calc, *self._others)]
+        self._settings = [settings_of(each) for each in (self._atoms.calc, *self._others)]
 
     def _now(self) -> tuple[Any, ...]:
         calculators = (self._atoms.calc, *self._others)
@@ -258,7 +258,7 @@ class Answers:
         """Whether forces, if atoms are where they were in `last`, are others than these; asked for only in doubt."""
         calculators = (self._atoms.calc, *self._others)
         for each, before, settings in zip(calculators, self._known, self._settings, strict=False):
-            if each is before and not _same(_settings(each), settings):
+            if each is before and not same_settings(settings_of(each), settings):
                 each.reset()
         now, known = self._now(), self._known
         if all(map(is_, now, known)):
@@ -271,12 +271,14 @@ class Answers:
         return found is None or last.forces is None or not np.array_equal(np.asarray(found), last.forces)
 
 
-def _settings(calculator: Any) -> tuple[Any, ...]:
+def settings_of(calculator: Any) -> tuple[Any, ...]:
+    """What a calculator can be told, as it is now; nothing where it cannot forget what it found before."""
     found = getattr(calculator, "parameters", None)
     return tuple(found.values()) if isinstance(found, dict) and hasattr(calculator, "reset") else ()
 
 
-def _same(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+def same_settings(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    """Whether settings are the same objects, or equal ones."""
     return len(one) == len(other) and all(a is b or np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 

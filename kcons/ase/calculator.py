@@ -10,6 +10,7 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from numpy.typing import NDArray
 
+from kcons.ase.binding import same_settings, settings_of
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.pressure.virial import VOIGT, refuse_filters
 from kcons.constraints import Constraint
@@ -70,11 +71,25 @@ class ConstrainedCalculator(Calculator):
         given = constraints if isinstance(constraints, Constraints) else Constraints(constraints)
         self.constraints = given.copy()
         self.project = project
+        #: What the results belong to, beside the atoms.
+        self._known = self._asked()
+
+    def _asked(self) -> tuple[Any, ...]:
+        return (self.inner, self.constraints, self.project, *settings_of(self.inner))
 
     @property
     def implemented_properties(self) -> list[str]:  # type: ignore[override]
         """Those of the inner calculator."""
         return list(self.inner.implemented_properties)
+
+    def check_state(self, atoms: Atoms, tol: float = 1e-15) -> list[str]:
+        """What has changed since the last calculation: also masses, which share out forces, and settings."""
+        changes = list(super().check_state(atoms, tol))
+        if self.atoms is not None and not np.array_equal(self.atoms.get_masses(), atoms.get_masses()):
+            changes.append("masses")
+        if not same_settings(self._asked(), self._known):
+            changes.append("inner")
+        return changes
 
     def calculate(
         self,
@@ -85,6 +100,8 @@ class ConstrainedCalculator(Calculator):
         """Fill `results`; called by ASE where its cache does not hold the properties."""
         super().calculate(atoms, list(properties), list(system_changes))
         assert self.atoms is not None
+        if not same_settings(self._asked(), self._known) and hasattr(self.inner, "reset"):
+            self.inner.reset()  # some calculators do not look whether their settings were changed
         work = self.atoms.copy()
         work.set_constraint()
         motion = self.constraints.engine(work)
@@ -116,6 +133,7 @@ class ConstrainedCalculator(Calculator):
             missing = sorted(name for name, value in results.items() if value is None)
             raise PropertyNotImplementedError(f"{type(self.inner).__name__} has no {', '.join(missing)}")
         self.results = {**self.results, **results}
+        self._known = self._asked()
 
     def restore(self, atoms: Atoms) -> None:
         """Move `atoms` to the point on the constraints that energy and forces belong to."""

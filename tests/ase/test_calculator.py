@@ -8,6 +8,7 @@ from ase import Atoms
 from ase.build import bulk, molecule
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
 from ase.optimize import BFGS, FIRE
 
 from kcons.ase import ConstrainedCalculator, Constraints, constrain
@@ -74,6 +75,35 @@ def test_caching():
     assert atoms.get_potential_energy() == energy
     assert np.abs(atoms.get_forces() - forces).min() == pytest.approx(1.0)
     assert calculator.inner.calls == 2
+
+
+def test_new_masses_and_settings_are_noticed():
+    """Masses share out what the constraints take; ASE compares only what a calculator of free atoms reads."""
+
+    def fresh(inner, masses, project):
+        peer = molecule("CH3CH2OH")
+        peer.rattle(0.05, seed=1)
+        peer.set_masses(masses)
+        peer.calc = ConstrainedCalculator(inner, held, project=project)
+        return peer.get_forces()
+
+    held = Constraints(ROWS)
+    held.engine(molecule("CH3CH2OH"))
+    atoms = molecule("CH3CH2OH")
+    atoms.rattle(0.05, seed=1)
+    calculator = atoms.calc = ConstrainedCalculator(LennardJones(sigma=1.0, rc=5.0), held)
+    seen = [atoms.get_forces()]
+    masses = atoms.get_masses() * np.linspace(1, 3, 9)
+    for change, inner in (
+        (lambda: atoms.set_masses(masses), LennardJones(sigma=1.0, rc=5.0)),
+        (lambda: calculator.inner.parameters.update(sigma=1.1), LennardJones(sigma=1.1, rc=5.0)),
+        (lambda: setattr(calculator, "inner", LennardJones(sigma=1.2, rc=5.0)), LennardJones(sigma=1.2, rc=5.0)),
+        (lambda: setattr(calculator, "project", False), LennardJones(sigma=1.2, rc=5.0)),
+    ):
+        change()
+        assert not np.array_equal(atoms.get_forces(), seen[-1])
+        seen.append(atoms.get_forces())
+        assert np.array_equal(seen[-1], fresh(inner, masses, calculator.project))
 
 
 def test_off_the_constraints_energy_and_forces_belong_to_one_function():
