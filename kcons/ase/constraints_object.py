@@ -108,7 +108,8 @@ class Constraints(FixConstraint):
             self._forget()
             self._last = ref(atoms)
         bound = self._binding
-        if bound is None or not (bound.fits(atoms) and bound.serves(self, atoms.cell.array)):
+        known = bound is not None and bound.given is self.constraints  # which can be given anew
+        if bound is None or not (known and bound.fits(atoms) and bound.serves(self, atoms.cell.array)):
             bound = self._bind(atoms)
         else:
             bound.follow_cell(atoms, atoms.cell.array)

@@ -166,6 +166,15 @@ def test_a_new_cell_does_not_rebuild_the_engine():
     assert held.engine(atoms).constraint_set.half_width == pytest.approx(2.95)
 
 
+def test_rows_that_are_given_anew_are_held():
+    atoms = molecule("CH3CH2OH")
+    held = constrain(atoms, Distance([0, 1]))
+    held.constraints = (*held.constraints, Distance([1, 2]))
+    assert atoms.get_number_of_degrees_of_freedom() == 27 - 2
+    atoms.set_positions(atoms.positions + np.random.default_rng(0).normal(scale=0.01, size=(9, 3)))
+    assert off(atoms, held) <= 1e-14
+
+
 def test_copies_in_cells_of_their_own():
     """Centres that nothing ties together, whose images are followed over a tenth of a cell vector and no more."""
     atoms = loose_waters(2)
