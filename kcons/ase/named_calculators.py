@@ -65,9 +65,10 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
         from ase.calculators.names import names
 
         known = ["gfn2", "gfn1", *names]
+        hint = "" if name in known else did_you_mean(name, known)
         why = "" if ":" not in name and name not in known else f" with these settings ({type(error).__name__}: {error})"
         raise InputError(
-            f"there is no calculator {name!r}{why}{did_you_mean(name, known)}; there are gfn2, gfn1, those of ASE by "
+            f"there is no calculator {name!r}{why}{hint}; there are gfn2, gfn1, those of ASE by "
             "name (emt, lj, ...), and MODULE:NAME for what makes any other",
             item="calculator",
         ) from error
