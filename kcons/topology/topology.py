@@ -256,8 +256,9 @@ def split_residues(
 ) -> tuple[IntArray, IntArray]:
     """Residue of each atom and the first atom of each residue, from columns with one entry an atom.
 
-    A residue ends where its name, number or chain changes, and where an atom name of a short one comes again (files
-    that count residues to 9999 and begin anew).
+    A residue ends where its name, number or chain changes, and where all of its atom names come again in their order
+    (waters that all have one number). Other names that come again, as where atoms have symbols for names, are atoms
+    of one residue; so is one name alone, unless it is that of an ion.
     """
     n = len(names)
     if n == 0:
@@ -273,12 +274,14 @@ def split_residues(
     order = np.argsort(key, kind="stable")
     again = np.flatnonzero(key[order][1:] == key[order][:-1])
     for number in np.unique(residue[order[again]]).tolist():
-        seen: set[int] = set()
-        for atom in np.flatnonzero(residue == number).tolist():
-            if int(code[atom]) in seen:
-                begins[atom] = True
-                seen = set()
-            seen.add(int(code[atom]))
+        atoms = np.flatnonzero(residue == number)
+        unit = int(np.append(np.flatnonzero(code[atoms[1:]] == code[atoms[0]]), len(atoms) - 1)[0]) + 1
+        once = code[atoms[:unit]]
+        distinct = len(np.unique(once)) == unit and len(atoms) % unit == 0
+        if unit == 1:
+            distinct = _bare(str(residue_names[atoms[0]]).upper()) in {_bare(str(names[atoms[0]]).upper()), *_IONS}
+        if distinct and np.array_equal(code[atoms], np.tile(once, len(atoms) // unit)):
+            begins[atoms[::unit]] = True
     return (np.cumsum(begins) - 1).astype(np.int64), np.flatnonzero(begins).astype(np.int64)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import ase.io
 import numpy as np
 import pytest
 from ase import Atoms
@@ -35,6 +36,18 @@ def test_bonds_are_guessed_where_none_are_given():
     atoms.info["bonds"] = [[0, 2]]
     assert bonds_of(atoms).tolist() == [[0, 2]]
     assert bonds_of(Atoms("X2", positions=[[0, 0, 0], [1, 0, 0]])).shape == (0, 2)
+
+
+def test_a_molecule_that_ase_wrote_to_a_pdb_file_keeps_its_bonds(tmp_path):
+    """ASE writes symbols for names, so that a name comes again and again in one residue."""
+    atoms = molecule("CH3CH2OH")
+    ase.io.write(tmp_path / "ethanol.pdb", atoms)
+    back = ase.io.read(tmp_path / "ethanol.pdb")
+    for held in ("hbonds", "allbonds"):
+        rows, wanted = (constraints_of(each, held, guess_bonds=True) for each in (back, atoms))
+        assert rows[0].atoms.tolist() == wanted[0].atoms.tolist()
+        with pytest.warns(UserWarning, match="8 bonds were guessed"):
+            assert constraints_of(back, held)[0].n_rows == rows[0].n_rows
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,15 @@ def test_residues_end_where_a_name_comes_again():
     residues, first = split_residues(names, called, np.array([1, 1, 1, 1, 1, 1, 2, 2, 2, 2]))
     assert residues.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
     assert first.tolist() == [0, 3, 6, 9]
+    ions = split_residues(np.array(["NA"] * 3 + ["SOD"] * 2), np.array(["NA+"] * 3 + ["SOD"] * 2), np.ones(5, int))
+    assert ions[0].tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("names", ["C C O H H H H H H", "H H", "O H H O H H", "N CA CB CA CB", "C " * 60])
+def test_names_that_come_again_otherwise_are_of_one_residue(names):
+    names = np.array(names.split())
+    residues, first = split_residues(names, np.array(["MOL"] * len(names)), np.ones(len(names), int))
+    assert residues.tolist() == [0] * len(names) and first.tolist() == [0]
 
 
 def test_molecules_are_named_by_formula():
