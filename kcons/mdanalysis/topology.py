@@ -193,7 +193,9 @@ def topology_of(universe: Any) -> Topology:
     whole = group.universe
     n = len(group)
     resindex = group.resindices
-    old, residues = np.unique(resindex, return_inverse=True)
+    old, first, residues = np.unique(resindex, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # of their first atoms in the group, which need not be that of the Universe
+    old, residues = old[order], np.argsort(order)[residues]
     names = _texts(group, "names", n) if hasattr(group, "names") else _texts(group, "types", n)
     residue_names = _texts(whole.residues[old], "resnames", len(old))
     known = hasattr(group, "resnames") and bool((np.char.strip(residue_names) != "").any())

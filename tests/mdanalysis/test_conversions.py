@@ -83,6 +83,14 @@ def test_universe_to_openmm_and_back(villin, held):
     assert universe.atoms.resnames.tolist() == villin.atoms.resnames.tolist()
 
 
+def test_residues_in_another_order_than_in_the_universe(villin):
+    """A group may have its residues in any order; the atoms of each are still together."""
+    group = sum(residue.atoms for residue in villin.residues[[7, 2, 5]])
+    made = to_openmm(group, quietly(constraints_of, group, "hbonds"))
+    assert [atom.name for atom in made.topology.atoms()] == group.names.tolist()
+    assert [residue.name for residue in made.topology.residues()] == villin.residues[[7, 2, 5]].resnames.tolist()
+
+
 def test_ase_to_openmm_and_back(villin, held):
     atoms = to_ase(villin, held)
     made = ase_to_openmm(atoms)
