@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import MDAnalysis
 import numpy as np
-from MDAnalysis.lib.mdamath import triclinic_box
 
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
@@ -21,7 +20,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis.loading import format_of
-from kcons.mdanalysis.topology import check_box, snapshot_of, velocities_known
+from kcons.mdanalysis.topology import check_box, dimensions_of, snapshot_of, velocities_known
 from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows
@@ -292,7 +291,7 @@ def _dimensions(snapshot: Snapshot) -> Any:
     if snapshot.cell is None or not snapshot.pbc.any():
         return None
     check_box(snapshot.cell, snapshot.pbc, stacklevel=5)
-    return triclinic_box(*snapshot.cell)
+    return dimensions_of(snapshot.cell)
 
 
 def _rows(constraints: Iterable[Constraint]) -> list[Constraint]:

@@ -9,7 +9,7 @@ import MDAnalysis
 import numpy as np
 from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.guesser import tables
-from MDAnalysis.lib.mdamath import triclinic_vectors
+from MDAnalysis.lib.mdamath import triclinic_box, triclinic_vectors
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
@@ -290,6 +290,16 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
         text = "boxes of MDAnalysis are periodic in all directions; this cell is not"
         warnings.warn(text, UserWarning, stacklevel=stacklevel)
     require_standard_form(cell, "MDAnalysis")
+
+
+def dimensions_of(cell: FloatArray) -> NDArray[np.float32]:
+    """Lengths and angles of a cell that `check_box` does not refuse.
+
+    They are those of vectors with a positive diagonal: a vector and its opposite span the same lattice, but lengths
+    and angles of those given would be of its mirror image.
+    """
+    box: NDArray[np.float32] = triclinic_box(*(cell * np.where(np.diag(cell) < 0, -1.0, 1.0)[:, None]))
+    return box
 
 
 def cell_of(state: State, motion: Motion | None) -> FloatArray | None:

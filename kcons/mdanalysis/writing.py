@@ -17,13 +17,12 @@ from typing import Any, Self, TextIO
 
 import MDAnalysis
 import numpy as np
-from MDAnalysis.lib.mdamath import triclinic_box
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
-from kcons.mdanalysis.topology import cell_of, check_box
+from kcons.mdanalysis.topology import cell_of, check_box, dimensions_of
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 
@@ -347,7 +346,7 @@ def _dimensions(matrix: FloatArray) -> Any:
     if matrix.shape == (3,):
         matrix = np.diag(matrix)
     check_box(matrix)
-    return triclinic_box(*matrix)
+    return dimensions_of(matrix)
 
 
 def _flush_c_streams() -> None:

@@ -8,14 +8,16 @@ import MDAnalysis as mda
 import numpy as np
 import openmm
 import pytest
-from ase import units
+from ase import Atoms, units
 from host_systems import ALANINE, DHFR, VILLIN, quietly, read_universe
+from MDAnalysis.lib.mdamath import triclinic_vectors
 from openmm import app, unit
 
 from kcons.ase import constrain
 from kcons.constraints import CenterOfMass, Distance, LinearRelation, RadiusOfGyration
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis import (
+    TrajectoryWriter,
     ase_to_openmm,
     constraints_of,
     from_ase,
@@ -228,6 +230,20 @@ def ethane_cut(box):
     if box:
         universe.dimensions = [10.0, 10.0, 10.0, 90.0, 90.0, 90.0]
     return universe
+
+
+@pytest.mark.parametrize("turned", [0, 1, 2])
+def test_a_cell_with_a_vector_turned_round_is_the_same_lattice(tmp_path, turned):
+    """Lengths and angles of such vectors are those of the mirror image."""
+    cell = np.array([[10.0, 0, 0], [2, 9, 0], [2, 3, 10]])
+    cell[turned] *= -1
+    atoms = Atoms("N2", [[0, 0, 0], [0, 0, 1.1]], cell=cell, pbc=True)
+    with TrajectoryWriter(tmp_path / "run.trr", 2) as writer:
+        writer.write(atoms.positions, cell=cell)
+    written = mda.coordinates.TRR.TRRReader(str(tmp_path / "run.trr")).ts.dimensions
+    for box in (from_ase(atoms).universe.dimensions, written):
+        steps = cell @ np.linalg.inv(triclinic_vectors(box, dtype=np.float64))
+        np.testing.assert_allclose(steps, np.round(steps), atol=1e-5)
 
 
 def test_molecules_cut_by_a_box_that_is_not_there_are_said():
