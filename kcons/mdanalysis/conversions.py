@@ -349,7 +349,9 @@ def _openmm(
     from kcons.openmm.topology import openmm_topology
 
     rows = all_rescaled(_rows(constraints), NM)
-    sites = constraints.virtual_sites if isinstance(constraints, HeldRows) else None
+    sites = None
+    if isinstance(constraints, HeldRows):
+        sites = constraints.virtual_sites.in_unit(NM / constraints.snapshot.angstrom)
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
     _warn_of_cut(snapshot)
     links = np.concatenate([snapshot.topology.bonds, *(_chained(item) for item in rows if item.translation_invariant)])
@@ -360,7 +362,7 @@ def _openmm(
         rows = list(held.constraints)  # with targets
         x = Motion(held, x).restore_positions(x)
         if sites is not None:
-            x = sites.in_unit(NM).place(x)
+            x = sites.place(x)
         snapshot = replace(snapshot, positions=x)
     topology, positions = openmm_topology(snapshot)
     system = _system(snapshot, topology, sites, force_field, options)
@@ -400,9 +402,8 @@ def _system(
     if topology.getPeriodicBoxVectors() is not None:
         system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors())
     if sites is not None and len(sites):
-        placed = sites.in_unit(NM)
         for site, parents, (a, b, c) in zip(
-            placed.sites.tolist(), placed.parents.tolist(), placed.coefficients.tolist(), strict=True
+            sites.sites.tolist(), sites.parents.tolist(), sites.coefficients.tolist(), strict=True
         ):
             system.setParticleMass(site, 0.0)
             system.setVirtualSite(

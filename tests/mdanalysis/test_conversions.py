@@ -27,6 +27,7 @@ from kcons.mdanalysis import (
     to_ase,
     to_openmm,
 )
+from kcons.openmm import constraints_of as constraints_of_topology
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +184,28 @@ def test_cut_molecules_are_whole_in_openmm(villin, held):
     assert np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1).max() < 2.2
     moved = (x - snapshot_of(villin).positions) / box
     assert np.abs(moved - np.round(moved)).max() < 1e-5
+
+
+def test_sites_out_of_the_plane_stay_where_they_are_whatever_unit_the_rows_are_in():
+    """Coefficients of TIP5P's lone pairs have a unit."""
+    universe = mda.Universe.empty(5, trajectory=True)
+    universe.add_TopologyAttr("names", ["O", "H1", "H2", "L1", "L2"])
+    universe.add_TopologyAttr("elements", ["O", "H", "H", "", ""])
+    universe.add_TopologyAttr("masses", [16.0, 1.008, 1.008, 0.0, 0.0])
+    universe.add_TopologyAttr("resnames", ["SOL"])
+    universe.atoms.positions = [[0, 0, 0], [0.757, 0.586, 0], [-0.757, 0.586, 0], [0, -0.4, 0.57], [0, -0.4, -0.57]]
+    plain = to_openmm(universe)
+    for rows in (
+        constraints_of(universe, "none"),
+        constraints_of_topology(plain.topology, plain.positions, "none", system=plain.system),
+    ):
+        made = to_openmm(universe, rows)
+        context = openmm.Context(made.system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+        context.setPositions(made.positions)
+        context.computeVirtualSites()
+        placed = context.getState(positions=True).getPositions(asNumpy=True)
+        for x in (made.positions, placed):
+            np.testing.assert_allclose(x.value_in_unit(unit.angstrom), universe.atoms.positions, atol=1e-5)
 
 
 def test_targets_that_are_left_out_are_those_of_the_frame():
