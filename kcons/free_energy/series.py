@@ -238,12 +238,24 @@ class Recorder:
     ----------
     series : Series
     last : Sample or None
+
+    Raises
+    ------
+    InputError
+        `series` is of other coordinates.
     """
 
     def __init__(self, system: System, coordinates: HeldCoordinates, series: Series | None = None) -> None:
         self.system = system
         self.coordinates = coordinates
         self.series = Series(coordinates.names, coordinates.periods) if series is None else series
+        mine, its = ((s.names, s.periods.tolist()) for s in (coordinates, self.series))
+        if mine != its:
+            raise InputError(
+                f"the series is of {', '.join(its[0])} with periods {its[1]}, the coordinates are {', '.join(mine[0])} "
+                f"with periods {mine[1]}; go on with a series of the same, or leave it out",
+                item="series",
+            )
         self.last: Sample | None = None
 
     def __call__(self, state: State) -> None:

@@ -43,6 +43,14 @@ def test_a_run_records_by_name():
     assert again.series is series and again.multipliers == {}
 
 
+@pytest.mark.parametrize("other", [Series(["end"], 2 * np.pi), Series(["turn"]), Series(["turn", "end"], 2 * np.pi)])
+def test_a_series_of_other_coordinates_is_not_gone_on_with(other):
+    recorder = recorded({"turn": Dihedral([[0, 1, 2, 3]])}, steps=1)
+    with pytest.raises(InputError, match="the series is of") as caught:
+        Recorder(recorder.system, recorder.coordinates, other)
+    assert caught.value.item == "series"
+
+
 def test_states_of_a_barostat_are_measured_in_their_own_cell():
     """Also those that were kept: across a face the distance was off by what the cell had changed since."""
     x = np.array([[1.0, 5, 5], [9.0, 5, 5], [5.0, 5, 5]])
