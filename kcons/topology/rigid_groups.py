@@ -52,6 +52,8 @@ FLAT = 2e-3
 LARGE = 50
 #: Among how many atoms nearby three are looked for, and what volume of three unit vectors is enough.
 _NEAR, _ENOUGH = 12, 0.2
+#: Waters whose plane is told by less than this are none: |u x w| over the square of the longer arm.
+_LINE = 1e-3
 #: Bases are the first atoms that are this close to the best.
 _AS_GOOD = 1 - 1e-6
 
@@ -91,7 +93,12 @@ def water_rows(triples: IntArray, geometry: tuple[float, float] | None, angstrom
     return Distance(pairs, np.tile(lengths, len(triples)))
 
 
-def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: float = 0.0) -> Waters:
+def find_waters(
+    snapshot: Snapshot,
+    names: frozenset[str] = WATER,
+    model_site: float = 0.0,
+    geometry: tuple[float, float] | None = None,
+) -> Waters:
     """Waters by residue name and composition: one oxygen, two hydrogens, massless sites.
 
     Waters of one oxygen alone, as in crystal structures, are left out.
@@ -102,11 +109,14 @@ def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: f
         Residue names, in capitals.
     model_site : float
         Length O-M in angstrom where the geometry was given by name; 0 takes the sites where they are.
+    geometry : tuple of float, optional
+        O-H length in angstrom and H-O-H angle in degrees at which the waters are held; None as they are.
 
     Raises
     ------
     InputError
-        A residue that is called water and is composed otherwise; it is named.
+        A residue that is called water and is composed otherwise; it is named. Sites that are not at their water, or
+        whose water has no plane.
     """
     topology = snapshot.topology
     kinds, kind = np.unique(topology.residue_names, return_inverse=True)
@@ -145,30 +155,55 @@ def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: f
     rank = np.cumsum(whole) - 1
     sites = atoms[member & site]
     parents = triples[rank[residue[member & site]]]
-    return Waters(triples, _water_sites(snapshot, sites, parents, number[residue[member & site]], model_site))
+    middle = 0.0 if geometry is None else geometry[0] * float(np.cos(np.radians(geometry[1]) / 2))
+    return Waters(triples, _water_sites(snapshot, sites, parents, number[residue[member & site]], model_site, middle))
 
 
 def _water_sites(
-    snapshot: Snapshot, sites: IntArray, parents: IntArray, residue: IntArray, model_site: float
+    snapshot: Snapshot, sites: IntArray, parents: IntArray, residue: IntArray, model_site: float, middle: float
 ) -> VirtualSites:
-    """The sites with one set of coefficients for each name, the median of all molecules, mirrored where it may be."""
+    """The sites with one set of coefficients for each name, the median of all molecules, mirrored where one is.
+
+    `model_site` and `middle` are the lengths from the oxygen to M and to the middle of the hydrogens in the model, in
+    angstrom; 0 where there is none.
+    """
     if not len(sites):
         return VirtualSites(sites, parents, np.zeros((0, 3)))
     r = whole_groups(snapshot, np.column_stack([parents, sites]))
-    found = fitted(sites, parents, r[:, 3], r[:, :3]).coefficients
-    u, w = r[:, 1] - r[:, 0], r[:, 2] - r[:, 0]
+    u, w, to_site = (r[:, k] - r[:, 0] for k in (1, 2, 3))
+    area = np.linalg.norm(np.cross(u, w), axis=1)
+    arms = np.maximum(np.linalg.norm(u, axis=1), np.linalg.norm(w, axis=1))
     topology = snapshot.topology
+    flat = np.flatnonzero(~(area > _LINE * arms**2))
+    if len(flat):
+        raise InputError(
+            f"{topology.atom_name(int(sites[flat[0]]))} has no place: its water has no plane, with atoms on a line, "
+            "at one point or not finite; give positions of a water",
+            item="positions",
+            atoms=parents[flat[0]].tolist(),
+        )
+    found = fitted(sites, parents, r[:, 3], r[:, :3]).coefficients
     key = np.char.add(np.char.add(topology.residue_names[residue], "/"), topology.names[sites])
     for name in np.unique(key):
         these = key == name
-        a, b, c = np.median(found[these], axis=0)
+        away = float(np.median(np.linalg.norm(to_site[these], axis=1)))
+        if not away <= float(np.median(arms[these])):
+            raise InputError(
+                f"{topology.atom_name(int(sites[these][0]))} and sites like it are {away / snapshot.angstrom:.3g} "
+                "angstrom from their oxygens: those of water are nearer than the hydrogens; put them where they belong",
+                item="positions",
+                atoms=sites[these][:1].tolist(),
+            )
+        a, b = np.median(found[these, :2], axis=0)
         a = b = 0.5 * (a + b)
-        height = abs(c) * float(np.median(np.linalg.norm(np.cross(u[these], w[these]), axis=1)))
-        in_plane = height < 0.05 * snapshot.angstrom
+        # One lone pair may have the name of the other in some molecules.
+        c = float(np.median(np.abs(found[these, 2])))
+        in_plane = c * float(np.median(area[these])) < 0.05 * snapshot.angstrom
         if model_site and in_plane:
-            middle = np.linalg.norm(0.5 * (u[these] + w[these]), axis=1)
-            a = b = 0.5 * model_site * snapshot.angstrom / float(np.median(middle))
-        found[these] = (a, b, 0.0 if in_plane else c)
+            measured = float(np.median(np.linalg.norm(0.5 * (u[these] + w[these]), axis=1)))
+            a = b = 0.5 * model_site / (middle or measured / snapshot.angstrom)
+        found[these, :2] = a
+        found[these, 2] = 0.0 if in_plane else np.copysign(c, found[these, 2])
     return VirtualSites(sites, parents, found)
 
 

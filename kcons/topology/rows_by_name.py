@@ -187,14 +187,14 @@ def rows_of(
         Gets what stands in `holding` as a selection, gives atoms as numbers or as a mask.
     """
     kind, topology = holding.kind, snapshot.topology
-    geometry, model_site = holding.geometry()
+    geometry, _ = holding.geometry()
     selected = None
     if not (isinstance(holding.select, str) and holding.select == "all"):
         selected = np.zeros(topology.n_atoms, dtype=bool)
         selected[numbers(holding.select)] = True
     # Words, and AtomGroups.
     bodies = [numbers(b) if isinstance(b, str) or hasattr(b, "atoms") else b for b in holding.bodies]
-    snapshot, waters, guessed = _with_waters(snapshot, holding, model_site, remedy)
+    snapshot, waters, guessed = _with_waters(snapshot, holding, remedy)
     groups = residue_bodies(snapshot, holding.residues)
     if selected is not None:
         waters = waters.among(selected)
@@ -242,18 +242,19 @@ def rows_of(
 # -- bonds ----------------------------------------------------------------------------------------
 
 
-def _with_waters(snapshot: Snapshot, holding: Holding, model_site: float, remedy: str) -> tuple[Snapshot, Waters, int]:
+def _with_waters(snapshot: Snapshot, holding: Holding, remedy: str) -> tuple[Snapshot, Waters, int]:
     """The snapshot with the bonds that are needed, its rigid water, and how many bonds are guessed."""
     nowhere = np.zeros(snapshot.topology.n_atoms, dtype=bool)
     guess, named = holding.guess_bonds, holding.kind != "none"
+    geometry, model_site = holding.geometry()
     if not snapshot.topology.residues_known:
         # Molecules take the place of residues, and bonds make molecules.
         guessed = 0
         if named or holding.rigid_water or holding.residues:
             snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
         snapshot = replace(snapshot, topology=snapshot.topology.with_molecules())
-        return snapshot, find_waters(snapshot, holding.waters, model_site), guessed
-    waters = find_waters(snapshot, holding.waters, model_site)
+        return snapshot, find_waters(snapshot, holding.waters, model_site, geometry), guessed
+    waters = find_waters(snapshot, holding.waters, model_site, geometry)
     if not named:
         return snapshot, waters, 0
     # The bonds of rigid water are known; guessing them would take most of the time.

@@ -11,7 +11,8 @@ from snapshots import WATER, rotations, snapshot
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.topology.rigid_groups import body_rows, find_waters, listed_bodies, residue_bodies
+from kcons.topology.rigid_groups import GEOMETRIES, body_rows, find_waters, listed_bodies, residue_bodies
+from kcons.topology.rows_by_name import held_rows
 
 RNG = np.random.default_rng(11)
 SHAPES = {
@@ -132,6 +133,54 @@ def test_four_site_water_with_its_site_placed():
     placed = exact.sites.place(x)
     np.testing.assert_allclose(np.linalg.norm(placed[3::4] - placed[0::4], axis=1), 0.15, atol=1e-3)
     assert [r.n_rows for r in waters.rows(None, 1.0)] == [9]
+
+
+def lone_pairs(mirrored, n=2):
+    """Waters of TIP5P; in those that are mirrored the lone pairs have each other's names."""
+    behind = -0.35 * (WATER[1] + WATER[2])
+    pairs = np.array([[*behind[:2], 0.57], [*behind[:2], -0.57]])
+    x = np.concatenate([np.vstack([WATER, pairs[::-1] if k in mirrored else pairs]) + 5.0 * k for k in range(n)])
+    names, elements = ["OW", "HW1", "HW2", "LP1", "LP2"] * n, ["O", "H", "H", "", ""] * n
+    return snapshot(elements, x, names=names, residues=np.repeat(range(n), 5), residue_names=["SOL"] * n)
+
+
+@pytest.mark.parametrize("mirrored", [(), (1,), (0, 1, 2), (1, 3)])
+def test_lone_pairs_stay_on_their_sides_in_every_molecule(mirrored):
+    """A median over molecules of both kinds, whose heights are opposite, would put them into the plane."""
+    made = lone_pairs(mirrored, 4)
+    placed = find_waters(made).sites.place(made.positions)
+    height = abs(placed[3::5, 2] - placed[4::5, 2])
+    np.testing.assert_allclose(height, 1.14, atol=1e-12)
+    np.testing.assert_allclose(placed, made.positions, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["tip4p", "tip4p2005", "opc"])
+def test_the_site_of_a_model_is_where_the_model_has_it_in_its_own_geometry(model):
+    m = 0.15 * (WATER[1] + WATER[2]) / np.linalg.norm(WATER[1] + WATER[2])
+    made = snapshot(["O", "H", "H", ""], np.vstack([WATER, m]), names=["O", "H1", "H2", "M"], residue_names=["HOH"])
+    rows = held_rows(made, "none", water_geometry=model)
+    length, angle, away = GEOMETRIES[model]
+    half = np.radians(angle / 2)
+    sides = length * np.array([[np.sin(half), np.cos(half), 0.0], [-np.sin(half), np.cos(half), 0.0]])
+    placed = rows.virtual_sites.place(np.vstack([np.zeros(3), sides, m]))
+    np.testing.assert_allclose(placed[3], [0.0, away, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("atom", "place", "what"),
+    [
+        (1, [0, 0, 0], "no plane"),
+        (2, [np.nan] * 3, "no plane"),
+        (3, [8, 8, 8], "13.9 angstrom"),
+        (4, [np.nan] * 3, "nan"),
+    ],
+)
+def test_sites_that_cannot_be_placed_are_refused(atom, place, what):
+    made = lone_pairs((), 1)
+    made.positions[atom] = place
+    with pytest.raises(InputError, match=what) as caught:
+        find_waters(made)
+    assert caught.value.item == "positions"
 
 
 def test_hydrogens_may_come_before_the_oxygen():
