@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 from kcons.topology.holding import Holding, Options, with_options
@@ -36,6 +36,8 @@ __all__ = ["constraints_of", "selected", "snapshot_of"]
 
 #: Cells narrower than this, in angstrom, are none: files without one have lengths of 1.
 NARROWEST = 2.0
+#: Vectors whose volume is this part of the product of their lengths or less span no cell.
+_FLAT = 1e-6
 _REMEDY = "load a topology that has them (PSF, TPR, PRMTOP, MOL2, ...)"
 
 
@@ -286,6 +288,16 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
     ------
     InputError
     """
+    if cell.shape != (3, 3):
+        raise InputError(f"the cell is {cell.tolist()}; give three vectors as rows", item="cell")
+    if not np.isfinite(cell).all():
+        raise NonFiniteError(f"the cell is not finite: {cell.tolist()}", item="cell")
+    if cell.any() and abs(np.linalg.det(cell)) <= _FLAT * np.prod(np.linalg.norm(cell, axis=1)):
+        raise InputError(
+            f"the cell {cell.tolist()} has no volume; give it a vector in each direction (ase: atoms.center(vacuum=10, "
+            "axis=2)), or none",
+            item="cell",
+        )
     if not np.all(pbc):
         text = "boxes of MDAnalysis are periodic in all directions; this cell is not"
         warnings.warn(text, UserWarning, stacklevel=stacklevel)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
@@ -19,13 +18,18 @@ import MDAnalysis
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import finite_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
+from kcons.mdanalysis.run_units import ASE_UNITS, OPENMM_UNITS, RunUnits
 from kcons.mdanalysis.topology import cell_of, check_box, dimensions_of
+from kcons.mdanalysis.xtc_limits import refuse_beyond_xtc
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 
+#: The largest number in single precision.
+_SINGLE = float(np.finfo(np.float32).max)
 #: Rows up to which an XVG file has a column for each multiplier.
 MOST_COLUMNS = 64
 _H5MD_UNITS = {
@@ -34,41 +38,6 @@ _H5MD_UNITS = {
     "velocityunit": "Angstrom/ps",
     "forceunit": "kJ/(mol*Angstrom)",
 }
-
-
-@dataclass(frozen=True)
-class RunUnits:
-    """What 1 is in a run, in the units of MDAnalysis.
-
-    Attributes
-    ----------
-    length : float
-        In angstrom.
-    time : float
-        In ps.
-    energy : float
-        In kJ/mol.
-    name : str
-        For headers.
-    """
-
-    length: float = 1.0
-    time: float = 1.0
-    energy: float = 1.0
-    name: str = "Å, ps, kJ/mol"
-
-    @property
-    def velocity(self) -> float:
-        return self.length / self.time
-
-    @property
-    def force(self) -> float:
-        return self.energy / self.length
-
-
-#: ASE: Å, Å √(u/eV), eV. OpenMM: nm, ps, kJ/mol.
-ASE_UNITS = RunUnits(1.0, 0.010180505717, 96.4853321233, "Å, Å √(u/eV), eV")
-OPENMM_UNITS = RunUnits(10.0, 1.0, 1.0, "nm, ps, kJ/mol")
 
 
 class TrajectoryWriter:
@@ -129,6 +98,10 @@ class TrajectoryWriter:
         self._side: TextIO | None = None
         self._expects_forces = False
         self._format = self.path.suffix[1:].upper()
+        n_atoms = whole_number(n_atoms, "n_atoms")
+        if interval is not None:
+            interval = abs(finite_number(interval, "interval"))
+        self._decimals = options.get("precision", 3) if self._format == "XTC" else None
         if not self.path.parent.is_dir():
             raise InputError(f"there is no folder {self.path.parent} to write {self.path.name} into", item="path")
         able = self._format in ("TRR", "H5MD", "NC", "NCDF", "TRZ")
@@ -147,9 +120,9 @@ class TrajectoryWriter:
         elif self._format in ("NC", "NCDF"):
             options = {"velocities": self._with_velocities, "forces": forces, **options}
         if interval is not None:
-            self._universe.trajectory.ts.dt = abs(interval) * self.units.time
+            self._universe.trajectory.ts.dt = interval * self.units.time
             if self._format == "DCD":
-                options.setdefault("dt", abs(interval) * self.units.time)
+                options.setdefault("dt", interval * self.units.time)
         try:
             with quiet():
                 self._writer = MDAnalysis.Writer(str(self.path), n_atoms, multiframe=True, **options)
@@ -221,15 +194,19 @@ class TrajectoryWriter:
         Raises
         ------
         InputError
-            A wrong shape; a cell that is not in the form of MDAnalysis; the writer is closed.
+            A wrong shape; numbers that the file cannot hold; a cell that MDAnalysis cannot; the writer is closed.
         NonFiniteError
             A NaN or infinity; nothing was written.
         """
         if self._writer is None:
             raise InputError(f"{self.path} is closed", item="path")
-        x = self._array(positions, "positions")
-        v = None if velocities is None else self._array(velocities, "velocities")
-        f = None if forces is None else self._array(forces, "forces")
+        x = self._array(positions, "positions", self.units.length)
+        if self._decimals is not None:
+            refuse_beyond_xtc(x * self.units.length, self._decimals, self.path.name)
+        v = None if velocities is None else self._array(velocities, "velocities", self.units.velocity)
+        f = None if forces is None else self._array(forces, "forces", self.units.force)
+        box = None if cell is None else _dimensions(np.asarray(cell, dtype=np.float64) * self.units.length)
+        time = finite_number(time, "time")
         extras = self._extras(x, v, f, time)
         ts = self._universe.trajectory.ts
         ts.positions = x * self.units.length
@@ -239,7 +216,7 @@ class TrajectoryWriter:
             ts.forces = (np.zeros_like(x) if f is None else f) * self.units.force
         ts.time, ts.frame = time * self.units.time, self.n_frames
         ts.data["step"] = self.n_frames if step is None else step
-        ts.dimensions = None if cell is None else _dimensions(np.asarray(cell, dtype=np.float64) * self.units.length)
+        ts.dimensions = box
         if self._format == "H5MD":
             ts.data.update(extras)
         with quiet():
@@ -251,7 +228,7 @@ class TrajectoryWriter:
         self._flush()
         self.n_frames += 1
 
-    def _array(self, values: ArrayLike, name: str) -> FloatArray:
+    def _array(self, values: ArrayLike, name: str, unit: float) -> FloatArray:
         array = np.asarray(values, dtype=np.float64)
         n = len(self._universe.atoms)
         if array.shape != (n, 3):
@@ -259,6 +236,12 @@ class TrajectoryWriter:
         if not np.isfinite(array).all():
             atom = int(np.argmin(np.isfinite(array).all(axis=1)))
             raise NonFiniteError(f"{name} of atom {atom}: {array[atom]}; nothing was written", item=name, atom=atom)
+        largest = unit * float(np.abs(array).max())
+        if largest > _SINGLE:
+            raise InputError(
+                f"{name} reach {largest:.3g} in the units of MDAnalysis, beyond single precision; nothing was written",
+                item=name,
+            )
         return array
 
     def _extras(self, x: FloatArray, v: FloatArray | None, f: FloatArray | None, time: float) -> dict[str, FloatArray]:

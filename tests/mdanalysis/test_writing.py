@@ -16,7 +16,14 @@ from water_files import mda
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.mdanalysis import ASE_UNITS, ConstraintCheck, OpenMMReporter, TrajectoryWriter, load_trajectory, write_ase
+from kcons.mdanalysis import (
+    ASE_UNITS,
+    ConstraintCheck,
+    OpenMMReporter,
+    TrajectoryWriter,
+    load_trajectory,
+    write_ase,
+)
 from kcons.motion import Motion
 from kcons.steppers import System, run
 
@@ -366,3 +373,47 @@ def test_cells_that_boxes_of_mdanalysis_are_not(tmp_path):
         dynamics.run(1)
     box = mda.Universe.empty(2, trajectory=True).load_new(str(tmp_path / "c.trr")).trajectory[-1].triclinic_dimensions
     np.testing.assert_allclose(box, slab.cell.array, atol=1e-5)
+
+
+@pytest.mark.parametrize("away", [3e7, -3e7])
+def test_what_a_file_cannot_hold_is_not_written(tmp_path, away):
+    """XTC counts 2^31 steps; the library that packs them writes something else beyond, and goes on."""
+    x = np.linspace(0.0, 12.0, 30).reshape(10, 3)
+    with TrajectoryWriter(tmp_path / "a.xtc", 10) as writer:
+        writer.write(x)
+        for far in (x + away, np.where(np.arange(10)[:, None] < 5, x + 0.5 * away, x - 0.5 * away)):
+            with pytest.raises(InputError, match=r"cannot hold coordinates up to .* nothing was written"):
+                writer.write(far)
+        writer.write(x + 150.0)
+    universe = mda.Universe.empty(10, trajectory=True).load_new(str(tmp_path / "a.xtc"))
+    assert len(universe.trajectory) == 2
+    np.testing.assert_allclose(universe.trajectory[1].positions, x + 150.0, atol=0.006)
+    with TrajectoryWriter(tmp_path / "b.dcd", 10) as writer, pytest.raises(InputError, match="beyond single precision"):
+        writer.write(x * 1e38)
+
+
+def test_cells_that_are_none_are_not_left_out(tmp_path):
+    x = np.zeros((2, 3))
+    with TrajectoryWriter(tmp_path / "a.trr", 2) as writer:
+        for cell, kind, what in (
+            (np.diag([9.0, np.nan, 9.0]), NonFiniteError, "not finite"),
+            (np.diag([9.0, 9.0, 0.0]), InputError, "no volume"),
+            ([9.0, 9.0, 9.0, 90.0, 90.0, 90.0], InputError, "three vectors"),
+        ):
+            with pytest.raises(kind, match=what) as caught:
+                writer.write(x, cell=cell)
+            assert caught.value.item == "cell" and writer.n_frames == 0
+
+
+@pytest.mark.parametrize(
+    ("call", "item"),
+    [
+        (lambda path: TrajectoryWriter(path, -1), "n_atoms"),
+        (lambda path: TrajectoryWriter(path, 2, interval=np.nan), "interval"),
+    ],
+    ids=["atoms", "interval"],
+)
+def test_settings_of_no_use_are_refused(tmp_path, call, item):
+    with pytest.raises(InputError) as caught:
+        call(tmp_path / "a.trr")
+    assert caught.value.item == item and not list(tmp_path.iterdir())
