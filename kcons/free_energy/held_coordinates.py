@@ -147,6 +147,9 @@ class HeldCoordinates:
             row = next(row for row in rows if rows.count(row) > 1)
             twice = [name for name, its in zip(names, rows, strict=True) if its == row]
             raise InputError(f"{' and '.join(twice)} are the same row {row} of the set", item=twice[0])
+        if len(set(names)) < len(names):
+            again = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"two coordinates have the name {again!r}; give each its own", item=again)
         self.names = tuple(names)
         self.rows: IntArray = np.array(rows, dtype=np.int64)
         self._source = held

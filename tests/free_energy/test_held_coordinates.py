@@ -320,6 +320,14 @@ def test_velocity_constraints_beside_are_refused():
     assert len(HeldCoordinates(ConstraintSet([far, edge], CHAIN, MASSES), {"far": far}, CHAIN)) == 1
 
 
+def test_names_of_rows_are_no_names_of_others():
+    """One with two rows is called name[0] and name[1]."""
+    two, third = Distance([[0, 1], [1, 2]]), Distance([[2, 3]])
+    held = ConstraintSet([two, third], CHAIN, MASSES)
+    with pytest.raises(InputError, match=r"two coordinates have the name 'd\[0\]'; give each its own"):
+        HeldCoordinates(held, {"d": two, "d[0]": third}, CHAIN)
+
+
 def test_bad_input():
     r, centre = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5])
     x, m = np.vstack([CHAIN, CHAIN[:2] + 9.0]), np.append(MASSES, [1.0, 2.0])
