@@ -14,6 +14,7 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -136,6 +137,8 @@ class ConstraintCheck(AnalysisBase):
             raise InputError(
                 f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
             )
+        if removed is not None:
+            removed = whole_number(removed, "removed", 0)
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         labels = AtomNames(universe)

@@ -266,6 +266,8 @@ def test_bad_options(water):
         ({"tolerance": -1.0}, "tolerance"),
         ({"precision": 0.0}, "precision"),
         ({"targets": "nowhere.toml"}, "nowhere.toml"),
+        ({"removed": -3}, "removed is -3"),
+        ({"removed": 2.5}, "removed is 2.5"),
         ({"run": {"start": 30}}, "no frames"),
     ):
         with pytest.raises(InputError, match=match):
