@@ -128,7 +128,11 @@ def _parser() -> Parser:
         type=names,
         help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
     )
-    compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SYSTEM)")
+    compare.add_argument(
+        "--out",
+        type=Path,
+        help="folder for compare.json, .png and .txt (default ./compare-SYSTEM, with --fast ./compare-SYSTEM-steps)",
+    )
     compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
     compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
     compare.add_argument(
@@ -202,6 +206,7 @@ def _compare(chosen: argparse.Namespace) -> int:
         def with_forces(forces: str) -> TestSystem:
             return _test_system(argparse.Namespace(**{**vars(chosen), "forces": forces}))
 
+        folder = chosen.out or folder.with_name(f"{folder.name}-steps")  # beside what compares trajectories
         return studies.compare_steps(chosen, budget, folder, with_forces)
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:

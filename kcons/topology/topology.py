@@ -256,9 +256,9 @@ def split_residues(
 ) -> tuple[IntArray, IntArray]:
     """Residue of each atom and the first atom of each residue, from columns with one entry an atom.
 
-    A residue ends where its name, number or chain changes, and where all of its atom names come again in their order
-    (waters that all have one number). Other names that come again, as where atoms have symbols for names, are atoms
-    of one residue; so is one name alone, unless it is that of an ion.
+    A residue ends where its name, number or chain changes, and where all of its atom names come again, the first
+    of them first (waters that all have one number). Other names that come again, as where atoms have symbols for names,
+    are atoms of one residue; so is one name alone, unless it is that of an ion.
     """
     n = len(names)
     if n == 0:
@@ -280,7 +280,7 @@ def split_residues(
         distinct = len(np.unique(once)) == unit and len(atoms) % unit == 0
         if unit == 1:
             distinct = _bare(str(residue_names[atoms[0]]).upper()) in {_bare(str(names[atoms[0]]).upper()), *_IONS}
-        if distinct and np.array_equal(code[atoms], np.tile(once, len(atoms) // unit)):
+        if distinct and (np.sort(code[atoms].reshape(-1, unit)) == np.sort(once)).all():
             begins[atoms[::unit]] = True
     return (np.cumsum(begins) - 1).astype(np.int64), np.flatnonzero(begins).astype(np.int64)
 

@@ -108,6 +108,14 @@ def test_links_within_the_project_lead_somewhere(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_all_of_a_page_is_seen(page):
+    """To MyST a line that begins with % is a comment; the text of a picture loses the ends of its lines."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    assert not re.findall(r"^\s*%.*", text, re.MULTILINE)
+    assert not re.findall(r"!\[[^\]]*\n", text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):

@@ -71,6 +71,8 @@ def test_residues_end_where_a_name_comes_again():
     residues, first = split_residues(names, called, np.array([1, 1, 1, 1, 1, 1, 2, 2, 2, 2]))
     assert residues.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
     assert first.tolist() == [0, 3, 6, 9]
+    turned = split_residues(np.array(["O", "H1", "H2", "O", "H2", "H1"]), np.array(["HOH"] * 6), np.ones(6, int))
+    assert turned[0].tolist() == [0, 0, 0, 1, 1, 1]
     ions = split_residues(np.array(["NA"] * 3 + ["SOD"] * 2), np.array(["NA+"] * 3 + ["SOD"] * 2), np.ones(5, int))
     assert ions[0].tolist() == [0, 1, 2, 3, 4]
 

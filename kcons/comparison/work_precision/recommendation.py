@@ -173,7 +173,7 @@ def recommend(
             if prediction.cost(decides) < 1.5 * limit:
                 found += reach(bench, prediction, target)
     found, _ = bench.timed_again(found)
-    everything = [*(m for curve in curves.values() for m in curve), *found]
+    everything = _sorted([*(m for curve in curves.values() for m in curve), *found])
     able = [m for m in everything if target >= resolution and _reaches(m, target)]
     entry: dict[str, Any] = {"target": target, "decides": COSTS[decides][1], "reached": bool(able)}
     if able:
@@ -407,7 +407,7 @@ def _at(m: Mapping[str, Any], units: Mapping[str, str]) -> str:
 
 
 def _about_default(entry: Mapping[str, Any], default: Mapping[str, Any], units: Mapping[str, str]) -> str:
-    start = f"The default there, {default['title']} {_at(default, units)}, "
+    start = f"To compare: {default['title']} {_at(default, units)}, the default of its MD engine, "
     if default["error"] is None:
         why = ": ".join(word for word in (default["status"], default["note"]) if word)
         return f"{start}has no error to compare with ({why})."

@@ -132,7 +132,7 @@ def test_the_default_itself_may_be_the_cheapest(chain, reference, monkeypatch):
 def test_what_was_found_is_said(found):
     text = recommendation.sentences(found)
     assert f"the cheapest in {found.recommendation['decides']}: kcons BlanesMoan4 at" in text
-    assert "The default there, ASE Verlet + FixBondLengths at 2 fs" in text
+    assert "To compare: ASE Verlet + FixBondLengths at 2 fs, the default of its MD engine" in text
     assert "times the force evaluations" in text
     assert "ConstrainedDynamics" in text
     assert recommendation.sentences(replace(found, recommendation=None)) == ""
