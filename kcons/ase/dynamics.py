@@ -35,7 +35,7 @@ from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import finite_number, numbers
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.errors import InputError, KconsError
 from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
@@ -242,6 +242,9 @@ class ConstrainedDynamics(MolecularDynamics):
             self.atoms.cell[...] = np.frombuffer(self._cell[0]).reshape(3, 3)  # which barostats change
             self._bound.cell = b""  # type: ignore[union-attr]  # the engine takes it again
             name_step(error, self.nsteps + 1)
+            if not isinstance(error, KconsError) and self.atoms.get_number_of_degrees_of_freedom():
+                # Of the calculator; most often it can do nothing with what too long steps have made.
+                error.add_note(f"the kinetic temperature was {self.atoms.get_temperature():.0f} K there")
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
         self.time = after.time

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
-from kcons.cli import check, completion, doctor, freeenergy, scan, studies, warmup
+from kcons.cli import check, completion, doctor, freeenergy, listing, scan, studies, warmup
 from kcons.cli.parser import Parser
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 from kcons.errors import InputError, KconsError, did_you_mean, with_extra
@@ -24,7 +24,6 @@ OF_STEPS_OF_FILES = OF_STEPS_OF_FLUIDS - {"size"} | {"coordinates", "constrain",
 OF_THE_WHOLE = frozenset({"all", "only", "fresh", "out", "quick", "list"})
 
 if TYPE_CHECKING:
-    from kcons.comparison.methods.method import Method
     from kcons.comparison.test_systems import TestSystem
 
 
@@ -187,7 +186,7 @@ def _compare(chosen: argparse.Namespace) -> int:
     if chosen.all or chosen.redraw is not None or chosen.only or chosen.fresh or chosen.into is not None:
         return _compare_all(chosen)
     if chosen.list:
-        return _list()
+        return listing.of_everything()
     from kcons.comparison import test_systems
 
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
@@ -432,12 +431,12 @@ def _test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSyst
     return test_systems.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
 
 
-# -- plan and list ----------------------------------------------------------------------------------
+# -- plan -------------------------------------------------------------------------------------------
 
 
 def _plan(chosen: argparse.Namespace) -> int:
     if chosen.list:
-        return _list()
+        return listing.of_everything()
     from kcons.comparison import test_systems
 
     _check_name(chosen)
@@ -473,32 +472,3 @@ def _plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
         print(f"{sites:,} virtual sites, placed by their molecules")
     print(found.motion.report(found.positions))
     return 0
-
-
-def _list() -> int:
-    from kcons.comparison import test_systems
-    from kcons.comparison.averages import sampling
-    from kcons.comparison.methods import methods
-
-    print("test systems")
-    for name, entry in test_systems.SYSTEMS.items():
-        print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
-    print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
-    print(f"  {'FILE':<16} any topology that MDAnalysis reads; --coordinates, --constrain, --select, --forces")
-    print("methods")
-    for name, method in methods.METHODS.items():
-        print(f"  {name:<27} {method.title}{_when(method)}")
-    print("test systems at a temperature, whose averages are compared")
-    for name, entry in test_systems.FLUIDS.items():
-        print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
-    print("thermostats for these")
-    for name, thermostat in sampling.METHODS.items():
-        print(f"  {name:<21} {thermostat.title}")
-    return 0
-
-
-def _when(method: Method) -> str:
-    """When a method runs."""
-    if not method.usual:
-        return " (only when named)"
-    return "" if method.md_engine != "openmm" or method.guest else " (in OpenMM's test systems, or when named)"

@@ -115,7 +115,7 @@ def test_list(command, capsys):
     text = capsys.readouterr().out
     for word in ("water", "chain-straight", "ethanol", "triple-pendulum", "bead-torus", "slab", "rattle", "dop853"):
         assert word in text
-    for word in ("thermostat-dumbbells", "thermostat-water", "isokinetic-notes", "nose-hoover"):
+    for word in ("thermostat-dumbbells", "thermostat-water", "isokinetic-notes", "nose-hoover", "langevin-halfway"):
         assert f"  {word} " in text
     for word in ("geodesic", "yoshida4", "blanes-moan6a", "projected-verlet", "projected-rk4", "baumgarte"):
         (line,) = (line for line in text.splitlines() if line.startswith(f"  {word} "))

@@ -1,0 +1,41 @@
+"""What `kcons compare --list` and `kcons plan --list` print: all names that can be given."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from kcons.comparison.methods.method import Method
+
+
+def of_everything() -> int:
+    """Print the names of test systems and methods."""
+    from kcons.comparison import test_systems
+    from kcons.comparison.averages import long_steps, sampling
+    from kcons.comparison.methods import methods
+
+    print("test systems")
+    for name, entry in test_systems.SYSTEMS.items():
+        print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
+    print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
+    print(f"  {'FILE':<16} any topology that MDAnalysis reads; --coordinates, --constrain, --select, --forces")
+    print("methods")
+    for name, method in methods.METHODS.items():
+        print(f"  {name:<27} {method.title}{_when(method)}")
+    print("test systems at a temperature, whose averages are compared")
+    for name, entry in test_systems.FLUIDS.items():
+        print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
+    print("thermostats for these")
+    for name, thermostat in sampling.METHODS.items():
+        print(f"  {name:<21} {thermostat.title}")
+    print("long steps (--slow, --fast)")
+    for name, method_of_steps in long_steps.METHODS.items():
+        print(f"  {name:<21} {method_of_steps.title}")
+    return 0
+
+
+def _when(method: Method) -> str:
+    """When a method runs."""
+    if not method.usual:
+        return " (only when named)"
+    return "" if method.md_engine != "openmm" or method.guest else " (in OpenMM's test systems, or when named)"
