@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.cli.terminal import console, rendered, say_written
+from kcons.constraints.arguments import positive
 from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 
 if TYPE_CHECKING:
@@ -50,6 +51,9 @@ def add(commands: Any) -> None:
         "--forces",
         help="also the temperatures of the configurations, by forces as for compare (amber14-all,amber14/tip3p, gfn2)",
     )
+    check.add_argument(
+        "--temperature", type=float, metavar="K", help="with --forces: say whether the temperatures are this one"
+    )
     check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
     check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")
     check.set_defaults(run=_check)
@@ -70,6 +74,10 @@ def _check(chosen: argparse.Namespace) -> int:
         if chosen.forces is not None and getattr(chosen, name):
             option = name.replace("_", "-")
             raise InputError(f"--forces does not go with --{option}; leave one of them out", item="forces")
+    if chosen.temperature is not None:
+        if chosen.forces is None:
+            raise InputError("--temperature needs --forces, from which temperatures are found", item="temperature")
+        positive(chosen.temperature, "temperature")
     try:
         result = _result(chosen, check_trajectory)
     except UnreadableError as error:
@@ -104,7 +112,7 @@ def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
         return ["no temperatures of the configurations: frames are off the constraints; say what the run held"]
     options = {"constrain": chosen.constrain, "select": chosen.select, "rigid_residues": list(chosen.rigid_residues)}
     found = trajectory_temperatures.along(chosen.trajectory, chosen.topology, chosen.forces, result.frames, **options)
-    return trajectory_temperatures.sentences(found)
+    return trajectory_temperatures.sentences(found, chosen.temperature)
 
 
 def _put(chosen: argparse.Namespace, write: Callable[[Path], list[Path]]) -> list[Path]:

@@ -332,5 +332,9 @@ def test_temperatures_of_configurations(folder, capsys, monkeypatch):
     told = "shifts of whole clusters 300.6 ± 1.2 K, turns of whole clusters 309.8 ± 2.3 K"
     assert told in " ".join(capsys.readouterr().out.split()) and asked == [("lj", [0, 1, 2, 3, 4], "none")]
     assert any(told in line for line in json.loads((folder / "out-good.xtc" / "check.json").read_text())["remarks"])
+    assert command(folder, "good.xtc", "--forces", "lj", "--temperature", "300") == 0
+    assert "not 300 K: turns of whole clusters 3.3% too warm" in " ".join(capsys.readouterr().out.split())
+    assert command(folder, "good.xtc", "--temperature", "300") == 2
+    assert "--temperature needs --forces" in capsys.readouterr().err
     assert command(folder, "good.xtc", "--forces", "lj", "--no-rigid-water") == 2
     assert "--forces does not go with --no-rigid-water" in capsys.readouterr().err

@@ -22,6 +22,8 @@ from kcons.thermostats import Estimate, SplitTemperatures, TemperatureSplit
 FEWEST = 32
 #: Change of the box, relative, above which the forces are those of another system.
 CHANGED = 1e-3
+#: Standard errors beyond which a temperature is another one; error of one that is enough for most purposes.
+SURE, USUAL = 3, 0.01
 #: Spread of a length, relative, below which something may hold it: at 300 K bonds vibrate by 2 %, and XTC files round
 #: by 0.3 %.
 STIFF = 5e-3
@@ -103,8 +105,8 @@ def _along(
     return replace(found, left_out=(*found.left_out, held))
 
 
-def sentences(found: SplitTemperatures) -> list[str]:
-    """The same in kelvin, for a person."""
+def sentences(found: SplitTemperatures, asked: float | None = None) -> list[str]:
+    """The same in kelvin, for a person; with `asked`, the temperature of the thermostat, whether it is the same."""
     kinds: tuple[tuple[str, Estimate | None], ...] = (
         ("shifts of whole clusters", found.shift),
         ("turns of whole clusters", found.turn),
@@ -112,4 +114,23 @@ def sentences(found: SplitTemperatures) -> list[str]:
     )
     told = [f"{what} {e.value / kB:.1f} ± {e.error / kB:.1f} K" for what, e in kinds if e is not None]
     lines = [f"temperatures of the configurations, of {found.samples} frames: {', '.join(told)}"]
+    if asked is not None:
+        lines.append(_beside(asked, [(what, e) for what, e in kinds if e is not None]))
+    unknown = max((e.error / abs(e.value) for _, e in kinds if e is not None), default=0.0)
+    if unknown > USUAL:
+        frames = float(f"{found.samples * (unknown / USUAL) ** 2:.1g}")
+        lines.append(f"errors of {USUAL:.0%} take some {frames:,.0f} frames as far apart as these")
     return [*lines, *found.left_out]
+
+
+def _beside(asked: float, found: list[tuple[str, Estimate]]) -> str:
+    """Whether temperatures are the one that was asked for, in kelvin."""
+    off = [(what, e.value / kB / asked - 1, e.off(kB * asked)) for what, e in found]
+    wrong = [
+        f"{what} {abs(part):.1%} too {'warm' if part > 0 else 'cold'} ({abs(errors):.1f} standard errors)"
+        for what, part, errors in off
+        if abs(errors) > SURE
+    ]
+    if not wrong:
+        return f"none can be told from {asked:g} K: all are within {SURE} standard errors"
+    return f"not {asked:g} K: {', '.join(wrong)}; the step is too long, or the thermostat keeps another temperature"
