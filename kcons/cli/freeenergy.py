@@ -39,8 +39,11 @@ def _free_energy(chosen: argparse.Namespace) -> int:
         plan = replace(plan, scheduler=chosen.scheduler)
     sides = 2 if plan.options.get("both_sides", True) else 1
     if chosen.list:
-        steps = plan.settings.pull + plan.settings.equilibration + plan.settings.production
-        print(f"{len(plan.targets)} windows of {', '.join(plan.sampler.names)}, {sides} runs of {steps:,} steps each")
+        parts = {name: getattr(plan.settings, name) for name in ("pull", "equilibration", "production")}
+        told = ", ".join(f"{name} {steps:,}" for name, steps in parts.items())
+        runs = f"{sides} runs" if sides > 1 else "a run"
+        print(f"{len(plan.targets)} windows of {', '.join(plan.sampler.names)}, {runs} each")
+        print(f"{sum(parts.values()):,} steps a run: {told}; a sample every {plan.settings.every}")
         if plan.pulls:
             ways = "both ways" if plan.pulls.get("both_ways", True) else "one way"
             print(f"{plan.pulls.get('count', 20)} pulls {ways} of {plan.pull_steps:,} steps each")

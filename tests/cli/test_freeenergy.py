@@ -39,7 +39,9 @@ def test_a_plan_runs_and_goes_on(tmp_path, capsys, monkeypatch):
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
     (tmp_path / "plan.toml").write_text(PLAN)
     assert main(["freeenergy", "plan.toml", "--list"]) == 0
-    assert capsys.readouterr().out == "4 windows of turn, 1 runs of 84 steps each\n"
+    assert capsys.readouterr().out == (
+        "4 windows of turn, a run each\n84 steps a run: pull 10, equilibration 10, production 64; a sample every 2\n"
+    )
     assert main(["freeenergy", "plan.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr()
     assert "turn (degrees)" in shown.out and "wrote plan/profile.png" in shown.out
