@@ -51,3 +51,7 @@ def __getattr__(name: str) -> Any:
                 raise with_extra(error, f"{__name__}.{name}") from error
             return found if module.endswith(f".{name}") else getattr(found, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -28,6 +28,13 @@ def test_the_reference_has_every_package_with_public_names():
     assert len(described()) == len(set(described()))
 
 
+def test_the_reference_finds_all_public_names():
+    """What is imported when it is asked for is found by `dir`, of which the reference is made."""
+    for name in described():
+        module = import_module(name)
+        assert set(getattr(module, "__all__", ())) <= set(dir(module)), name
+
+
 def test_what_the_front_door_hands_on_is_described_where_it_lives():
     for name in kcons.__all__:
         thing = getattr(kcons, name)
