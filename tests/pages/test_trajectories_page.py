@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from kcons.comparison import processor_of
+
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = json.loads((DOCS / "results" / "trajectory_check.json").read_text(encoding="utf-8"))
 CASES, COLD = RESULTS["cases"], RESULTS["cold"]["cases"]
@@ -28,11 +30,12 @@ def test_committed_memory_where_nothing_is_compiled_yet():
         assert case["bytes"] > 0.99e9
         for key in ("peak", "peak_of_others", "peak_of_command"):
             assert 100 < case[key] <= 300, (case, key)
-    assert RESULTS["cold"]["environment"]["commit"]
+    assert RESULTS["cold"]["environment"]["commit"] == RESULTS["environment"]["commit"]
 
 
 def test_the_page_shows_them():
     page = (DOCS / "trajectories.md").read_text(encoding="utf-8")
+    assert f"one core of {processor_of(RESULTS['environment'])}, CPU times" in page
     for case in CASES:
         row = (
             f"| {case['format'].upper()}, {case['frames']} frames of {case['atoms']:,} atoms "
