@@ -89,6 +89,14 @@ def test_halfway_between_slow_kicks_langevin_has_both_temperatures_right_at_16_f
     assert known["slow_per_turning"] >= 8 * row["slow_per_turning"]
 
 
+def test_what_spheres_gain_by_the_energy_alone():
+    """Read halfway at 48 fs; turns are wrong there."""
+    spheres, langevin = WATER["split 5/ps, 48 fs, halfway"], WATER["langevin 5/ps, 16 fs, halfway"]
+    assert abs(spheres["bias"][0]) <= 0.25 and spheres["bias"][1] <= 0.15 < langevin["bias"][0]
+    found = [round(row[kind]) for row in (spheres, langevin) for kind in ("slow_per_turning", "slow_per_sample")]
+    assert found == [73, 17, 147, 57] and spheres["turn"][0] == pytest.approx(1.22, abs=0.005)
+
+
 def test_the_share_of_the_stiffness_foretells_how_hot_turns_are():
     """At 24 fs and 20/ps, halfway; the direct part of an Ewald sum, whose slow rest is as stiff as any, explodes."""
     found = {}
