@@ -79,7 +79,7 @@ TABLE = {
     "constant_pressure.json": Measurement(
         (*BATHS, "ase"),
         (*script("34_constant_pressure", "--full"), *script("38_constant_pressure_water", "--full")),
-        60,
+        45,
     ),
     "engine_speed.json": Measurement(CORE, script("03_engine_speed"), 4),
     "error_budget.json": Measurement(CORE, script("18_error_budget"), 1),
@@ -102,7 +102,7 @@ TABLE = {
     "long_runs.json": Measurement(
         CORE,
         ("env KCONS_LONG_RUNS=F python -m pytest -m validation tests/contracts/test_long_runs.py",),
-        None,
+        5,
     ),
     "long_steps.json": Measurement(
         (*BATHS, "ase"),
@@ -161,11 +161,11 @@ TABLE = {
         ("kcons stability --out stability", f'python -c "{SUMMED}" F'),
         8,
     ),
-    "step_length.json": Measurement((*BATHS, "comparison/averages"), script("33_step_length"), None),
+    "step_length.json": Measurement((*BATHS, "comparison/averages"), script("33_step_length"), 16),
     "thermostat_cost.json": Measurement((*BATHS, "ase"), script("22_thermostat_cost"), 1),
     "thermostats.json": Measurement((*BATHS, "ase"), script("10_thermostats"), 20),
     "trajectory_check.json": Measurement(
-        (*CORE, "mdanalysis"), script("21_check_speed", "--full --out F", "--full --cold --out F"), None
+        (*CORE, "mdanalysis"), script("21_check_speed", "--full --out F", "--full --cold --out F"), 6
     ),
 }
 
