@@ -113,9 +113,8 @@ class Constraints(FixConstraint):
             bound = self._bind(atoms)
         else:
             bound.follow_cell(atoms, atoms.cell.array)
-        present = atoms.constraints
-        if len(present) > 1:
-            check_company(present, self, bound)
+        if len(atoms.constraints) > 1:
+            check_company(atoms.constraints, self, bound)
         return bound
 
     def _bind(self, atoms: Atoms) -> Binding:
@@ -187,8 +186,7 @@ class Constraints(FixConstraint):
             # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
             still = KICK_ROUNDING * float(np.abs(velocities).max(initial=0.0)) if due else 0.0
             bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
-            if due:
-                # Positions may be as a file gave them, off by less than START_TOLERANCE.
+            if due:  # positions may be as a file gave them, off by less than START_TOLERANCE
                 bound.motion.certify(atoms.arrays["positions"], velocities, still=still, moved=False)
                 self._momenta_due = CHECK_EVERY
             self._momenta_due -= 1
@@ -202,11 +200,10 @@ class Constraints(FixConstraint):
         """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
 
         z is the instantaneous constraint force at the present positions, momenta and forces, so that
-        ``get_stress(include_ideal_gas=True)`` is the full pressure (an ideal gas of rigid molecules gives
-        N k T / V). Without momenta, or where they are zero, it is the static part, which makes the stress the
-        derivative of the energy under a strain after which the constraints are restored. Rows with a place
-        in space count as external forces and have no part.
-        Refused where atoms are off the constraints.
+        ``get_stress(include_ideal_gas=True)`` is the full pressure (an ideal gas of rigid molecules gives N k T / V).
+        Without momenta, or where they are zero, it is the static part, which makes the stress the derivative of the
+        energy under a strain after which the constraints are restored. Rows with a place in space count as external
+        forces and have no part. Refused where atoms are off the constraints.
         """
         virial = virial_of(self._bound(atoms).motion, atoms, applied_forces(atoms))
         stress -= virial[VOIGT] / atoms.get_volume()
@@ -216,9 +213,8 @@ class Constraints(FixConstraint):
         bound = self._binding
         if bound is not None and bound.fits(atoms):
             new = numbers(cell, "cell")
-            if not bound.serves(self, atoms.cell.array, new):
-                bound = self._bind(atoms)
-            bound.follow_cell(atoms, new)
+            mine = bound if bound.serves(self, atoms.cell.array, new) else self._bind(atoms)
+            mine.follow_cell(atoms, new)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
@@ -226,9 +222,7 @@ class Constraints(FixConstraint):
         self._project_covector(atoms, forces)
 
     def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:
-        motion = self._bound(atoms).motion
-        x = atoms.arrays["positions"]
-        _in_place(motion.project_forces, values, x, values)
+        _in_place(self._bound(atoms).motion.project_forces, values, atoms.arrays["positions"], values)
 
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""

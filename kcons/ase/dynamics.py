@@ -136,8 +136,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
-        before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
-        try:
+        with _changed_only_if_all_is_well(atoms):
             self._prepare(atoms, timestep, state)
             # Files last: to open one for writing ends what an older run left there.
             steps, logfile = self.nsteps, kwargs.pop("logfile", None)
@@ -146,11 +145,6 @@ class ConstrainedDynamics(MolecularDynamics):
             if logfile:
                 log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
                 self.attach(log, kwargs.get("loginterval", 1))
-        except BaseException:
-            atoms.set_positions(before[0], apply_constraint=False)
-            atoms.set_momenta(before[1], apply_constraint=False)
-            atoms.cell[...] = before[2]
-            raise
 
     def _prepare(self, atoms: Atoms, timestep: float, state: State | None) -> None:
         """Whatever can be refused, and what the first step needs."""
@@ -242,11 +236,9 @@ class ConstrainedDynamics(MolecularDynamics):
             self.atoms.cell[...] = np.frombuffer(self._cell[0]).reshape(3, 3)  # which barostats change
             self._bound.cell = b""  # type: ignore[union-attr]  # the engine takes it again
             name_step(error, self.nsteps + 1)
-            if not isinstance(error, KconsError) and self.atoms.get_number_of_degrees_of_freedom():
-                # Of the calculator; most often it can do nothing with what too long steps have made.
-                error.add_note(f"the kinetic temperature was {self.atoms.get_temperature():.0f} K there")
+            _tell_temperature(error, self.atoms)
             raise
-        self._momenta, v = self._put(after.positions, after.velocities)
+        self._momenta, v = put(self.atoms, self._weights, after.positions, after.velocities)
         self.time = after.time
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
@@ -261,23 +253,6 @@ class ConstrainedDynamics(MolecularDynamics):
             with in_step(self.nsteps):
                 self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
             self._answers.note()
-
-    def _put(self, positions: FloatArray, velocities: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Give the atoms positions and momenta; returns the momenta, and the velocities that belong to them.
-
-        Velocities always come from the momenta, as after a restart from a file.
-        """
-        arrays = self.atoms.arrays
-        x, p = arrays["positions"], arrays["momenta"]
-        masses, divisors = self._weights
-        momenta, v = np.empty_like(velocities), np.empty_like(velocities)
-        if _plain(x) and _plain(p):
-            write_back(positions, velocities, masses, divisors, x, p, momenta, v)
-        else:
-            np.multiply(velocities, masses, out=momenta)
-            np.divide(momenta, divisors, out=v)
-            x[...], p[...] = positions, momenta
-        return momenta, v
 
     def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
@@ -307,7 +282,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._momenta = p.copy()
             x[...] = state.positions
         else:
-            self._momenta, v = self._put(state.positions, state.velocities)
+            self._momenta, v = put(self.atoms, self._weights, state.positions, state.velocities)
         carried = state.remainder, 0.0, thermostat, None if last is None else in_cell(last.barostat, atoms.cell.array)
         self._state = State(state.positions, v, self.time, forces, self.nsteps, *carried)
         self._cell = cell
@@ -325,7 +300,7 @@ class ConstrainedDynamics(MolecularDynamics):
                 message = f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?"
                 raise InputError(message, item="state")
             self.time, self.nsteps = float(state.time), int(state.step)
-            self._momenta, _ = self._put(x, v)
+            self._momenta, _ = put(self.atoms, self._weights, x, v)
             self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
             self._cell = surroundings(self.atoms)
 
@@ -436,6 +411,45 @@ def write_back(positions, velocities, masses, divisors, x, p, momenta, v):  # ty
         e[i] = momentum
         f[i] = momentum
         g[i] = momentum / d[i]
+
+
+def put(
+    atoms: Atoms, weights: tuple[FloatArray, FloatArray], positions: FloatArray, velocities: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Give the atoms positions and momenta; returns the momenta, and the velocities that belong to them.
+
+    Velocities always come from the momenta, as after a restart from a file. `weights` are the masses to multiply with
+    and to divide by.
+    """
+    x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
+    masses, divisors = weights
+    momenta, v = np.empty_like(velocities), np.empty_like(velocities)
+    if _plain(x) and _plain(p):
+        write_back(positions, velocities, masses, divisors, x, p, momenta, v)
+    else:
+        np.multiply(velocities, masses, out=momenta)
+        np.divide(momenta, divisors, out=v)
+        x[...], p[...] = positions, momenta
+    return momenta, v
+
+
+@contextmanager
+def _changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
+    """Put the atoms back where something is refused."""
+    before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
+    try:
+        yield
+    except BaseException:
+        atoms.set_positions(before[0], apply_constraint=False)
+        atoms.set_momenta(before[1], apply_constraint=False)
+        atoms.cell[...] = before[2]
+        raise
+
+
+def _tell_temperature(error: BaseException, atoms: Atoms) -> None:
+    """Note how warm the atoms were when a calculator failed: it can do nothing with what too long steps have made."""
+    if not isinstance(error, KconsError) and atoms.get_number_of_degrees_of_freedom():
+        error.add_note(f"the kinetic temperature was {atoms.get_temperature():.0f} K there")
 
 
 def _check_timestep(timestep: float) -> None:

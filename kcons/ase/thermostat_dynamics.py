@@ -12,7 +12,7 @@ import numpy as np
 from ase import Atoms, units
 from numpy.typing import ArrayLike
 
-from kcons.ase.dynamics import FAR, ConstrainedDynamics
+from kcons.ase.dynamics import FAR, ConstrainedDynamics, put
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
@@ -76,7 +76,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         finally:  # forces were asked for elsewhere too
             arrays["positions"][...], arrays["momenta"][...] = state.positions, momenta
         if begun.velocities is not state.velocities:
-            momenta, v = self._put(state.positions, begun.velocities)
+            momenta, v = put(self.atoms, self._weights, state.positions, begun.velocities)
             begun = replace(begun, velocities=v)
         self._momenta, self._state = momenta, begun
 

@@ -4,6 +4,7 @@
 - `parser`: what is said of names that are not known
 - `check`, `completion`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names
 - `compiled_systems`: what `kcons warmup` runs
+- `listing`: what `--list` prints
 - `studies`: `kcons hardcases`, `kcons stability`
 - `main`: all others
 """

@@ -109,19 +109,6 @@ def test_plan_prints_clusters_rank_and_solver(capsys):
     assert "solver" in text
 
 
-@pytest.mark.parametrize("command", ["compare", "plan"])
-def test_list(command, capsys):
-    assert run(command, "--list") == 0
-    text = capsys.readouterr().out
-    for word in ("water", "chain-straight", "ethanol", "triple-pendulum", "bead-torus", "slab", "rattle", "dop853"):
-        assert word in text
-    for word in ("thermostat-dumbbells", "thermostat-water", "isokinetic-notes", "nose-hoover", "langevin-halfway"):
-        assert f"  {word} " in text
-    for word in ("geodesic", "yoshida4", "blanes-moan6a", "projected-verlet", "projected-rk4", "baumgarte"):
-        (line,) = (line for line in text.splitlines() if line.startswith(f"  {word} "))
-        assert line.endswith("(only when named)")
-
-
 def test_without_command_prints_help(capsys):
     assert run() == 0
     assert "compare" in capsys.readouterr().out

@@ -251,7 +251,7 @@ MUTANTS = [
     ),
     (
         "motion/motion.py",
-        "            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still)",
+        "            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still, moved=moved)",
         "            pass",
         "tests/motion/test_certificate.py::test_rows_that_were_converted_are_looked_at_as_they_were_given",
     ),
