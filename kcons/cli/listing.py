@@ -25,12 +25,12 @@ def of_everything() -> int:
     print("test systems at a temperature, whose averages are compared")
     for name, entry in test_systems.FLUIDS.items():
         print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
-    print("thermostats for these")
-    for name, thermostat in sampling.METHODS.items():
-        print(f"  {name:<21} {thermostat.title}")
-    print("long steps (--slow, --fast)")
-    for name, method_of_steps in long_steps.METHODS.items():
-        print(f"  {name:<21} {method_of_steps.title}")
+    titles = {name: thermostat.title for name, thermostat in sampling.METHODS.items()}
+    steps = {name: method_of_steps.title for name, method_of_steps in long_steps.METHODS.items()}
+    for heading, named in (("thermostats for these", titles), ("long steps (--slow, --fast)", steps)):
+        print(heading)
+        for name, title in named.items():
+            print(f"  {name:<21} {title}")
     return 0
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kcons.comparison.averages.long_steps import METHODS, StepComparison, Stepped, best
+from kcons.comparison.averages.long_steps import DOUBT, METHODS, StepComparison, Stepped, best
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw
 from kcons.comparison.study.tables import Marked, Table, footnotes, numbered, verdict
@@ -24,8 +24,6 @@ STYLES: dict[str, tuple[str, str]] = {
     "hmc": ("#CC79A7", "D"),
 }
 KINDS = {"shift": "T of shifts\n%", "turn": "T of turns\n%", "internal": "T inside\n%"}
-#: Errors in standard errors beyond which a cell is marked.
-MARKED = 3.0
 
 
 def table(runs: Sequence[Stepped], units: Units, title: str = "") -> Table:
@@ -69,12 +67,12 @@ def _percent(run: Stepped, kind: str) -> str:
         return ""
     value, error = run.kinds[kind]
     text = f"{100 * value:+.1f} ± {100 * error:.1f}"
-    return Marked(text, "yellow") if abs(value) > MARKED * error else text
+    return Marked(text, "yellow") if abs(value) > DOUBT * error else text
 
 
 def _pair(value: float, error: float, signed: bool) -> str:
     text = f"{value:+.4f} ± {error:.4f}" if signed else f"{value:.4f} ± {error:.4f}"
-    return Marked(text, "yellow") if signed and abs(value) > MARKED * error else text
+    return Marked(text, "yellow") if signed and abs(value) > DOUBT * error else text
 
 
 def explanation(runs: Sequence[Stepped]) -> str:

@@ -12,6 +12,8 @@ import numpy as np
 from ase.units import kB
 from scipy.sparse.csgraph import connected_components
 
+from kcons.comparison.averages.long_steps import DOUBT
+from kcons.comparison.averages.sampling import GOAL
 from kcons.comparison.test_systems import any_file
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.errors import InputError, UnsupportedError
@@ -22,8 +24,6 @@ from kcons.thermostats import Estimate, SplitTemperatures, TemperatureSplit
 FEWEST = 32
 #: Change of the box, relative, above which the forces are those of another system.
 CHANGED = 1e-3
-#: Standard errors beyond which a temperature is another one; error of one that is enough for most purposes.
-SURE, USUAL = 3, 0.01
 #: Spread of a length, relative, below which something may hold it: at 300 K bonds vibrate by 2 %, and XTC files round
 #: by 0.3 %.
 STIFF = 5e-3
@@ -117,9 +117,9 @@ def sentences(found: SplitTemperatures, asked: float | None = None) -> list[str]
     if asked is not None:
         lines.append(_beside(asked, [(what, e) for what, e in kinds if e is not None]))
     unknown = max((e.error / abs(e.value) for _, e in kinds if e is not None), default=0.0)
-    if unknown > USUAL:
-        frames = float(f"{found.samples * (unknown / USUAL) ** 2:.1g}")
-        lines.append(f"errors of {USUAL:.0%} take some {frames:,.0f} frames as far apart as these")
+    if unknown > GOAL:
+        frames = float(f"{found.samples * (unknown / GOAL) ** 2:.1g}")
+        lines.append(f"errors of {GOAL:.0%} take some {frames:,.0f} frames as far apart as these")
     return [*lines, *found.left_out]
 
 
@@ -129,8 +129,8 @@ def _beside(asked: float, found: list[tuple[str, Estimate]]) -> str:
     wrong = [
         f"{what} {abs(part):.1%} too {'warm' if part > 0 else 'cold'} ({abs(errors):.1f} standard errors)"
         for what, part, errors in off
-        if abs(errors) > SURE
+        if abs(errors) > DOUBT
     ]
     if not wrong:
-        return f"none can be told from {asked:g} K: all are within {SURE} standard errors"
+        return f"none can be told from {asked:g} K: all are within {DOUBT:g} standard errors"
     return f"not {asked:g} K: {', '.join(wrong)}; the step is too long, or the thermostat keeps another temperature"
