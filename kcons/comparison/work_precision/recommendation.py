@@ -420,6 +420,11 @@ def _about_default(entry: Mapping[str, Any], default: Mapping[str, Any], units: 
     at = _at({**needs, "adaptive": default["adaptive"]}, units)
     how = "measured" if needs["measured"] else "extrapolated"
     return (
-        f"{start}; it needs {at.removeprefix('at ')} for this error ({how}): {gain['wall']:.2g} times the wall time "
-        f"and {gain['evaluations']:.2g} times the force evaluations."
+        f"{start}; it needs {at.removeprefix('at ')} for this error ({how}): {_times(gain['wall'])} times the wall "
+        f"time and {_times(gain['evaluations'])} times the force evaluations."
     )
+
+
+def _times(ratio: float) -> str:
+    """Two digits, and no exponent."""
+    return f"{float(f'{ratio:.2g}'):,.12g}"
