@@ -12,11 +12,7 @@
 - `comparison`, `cli`: which method and which step; the command
 """
 
-import sys
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -54,45 +50,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-#: Where modules are that scripts may still import by the names they had at the top of the package.
-MOVED = {
-    "compare": "comparison.work_precision.measure",
-    "constraint_set": "constraints.constraint_set",
-    "flows": "models.flows",
-    "fronts": "comparison.work_precision.fronts",
-    "growth": "models.growth",
-    "hard_cases": "comparison.hard_cases",
-    "projection": "constraints.projection",
-    "recommendation": "comparison.work_precision.recommendation",
-    "report": "comparison.work_precision.report",
-    "sampling": "comparison.averages.sampling",
-    "scenes": "comparison.test_systems",
-    "stability": "comparison.stability",
-}
-
-
-class _Moved(MetaPathFinder, Loader):
-    """Gives the modules of `MOVED`, and what is in them, under both names."""
-
-    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        package, _, inside = name.partition(".")
-        if package != __name__ or inside.partition(".")[0] not in MOVED:
-            return None
-        return ModuleSpec(name, self)
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        first, dot, rest = spec.name.partition(".")[2].partition(".")
-        module = import_module(f"{__name__}.{MOVED[first]}{dot}{rest}")
-        spec.loader_state = module.__spec__
-        return module
-
-    def exec_module(self, module: ModuleType) -> None:
-        spec = module.__spec__
-        if spec is not None and spec.loader is self:
-            module.__spec__ = spec.loader_state  # one module, that of its new name
-
-
-# Before the finder of files, which would load what lies in a moved folder a second time.
-sys.meta_path.insert(0, _Moved())
