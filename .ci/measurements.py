@@ -62,11 +62,6 @@ def script(name: str, *more: str) -> tuple[str, ...]:
     return tuple(f"python examples/{name}.py {words}" for words in more or ("--full --out F",))
 
 
-SUMMED = (
-    "import sys; from kcons.comparison import json_files; from kcons.comparison.stability.study import digest; "
-    "json_files.write(sys.argv[1], digest(json_files.read('stability/stability.json')))"
-)
-HARD = (*OPENMM, "ase", "comparison/hard_cases")
 TABLE = {
     "ase_dynamics.json": Measurement(ASE, script("05_ase_dynamics"), 2),
     "butane.json": Measurement((*BATHS, "ase", "free_energy"), script("30_butane_torsion", "--full"), 12),
@@ -96,7 +91,6 @@ TABLE = {
         95,
     ),
     "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), 5),
-    "hard_cases.json": Measurement(HARD, ("kcons hardcases --out hardcases", "cp hardcases/hard_cases.json F"), 6),
     "high_order.json": Measurement(CORE, script("04_high_order"), 18),
     "killed_runs.json": Measurement(("free_energy",), ("python tests/contracts/killed_runs.py",), 3),
     "long_runs.json": Measurement(
@@ -116,7 +110,7 @@ TABLE = {
         ),
         300,
     ),
-    "long_steps_xtb.json": Measurement((*BATHS, "ase", "comparison/averages"), script("36_xtb_steps"), 30),
+    "long_steps_xtb.json": Measurement((*BATHS, "ase", "comparison/averages"), script("studies/xtb_steps"), 30),
     "monte_carlo.json": Measurement(
         (*BATHS, "openmm", "ase"),
         script(
@@ -156,11 +150,6 @@ TABLE = {
     "report": Measurement((*ASE, "openmm", "comparison"), ("kcons compare --all --out F",), 90),
     "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), 4),
     "solvated_peptide.json": Measurement((*BATHS, "comparison/averages"), script("40_peptide_steps"), 30),
-    "stability.json": Measurement(
-        (*CORE, "comparison/stability"),
-        ("kcons stability --out stability", f'python -c "{SUMMED}" F'),
-        8,
-    ),
     "step_length.json": Measurement((*BATHS, "comparison/averages"), script("33_step_length"), 16),
     "thermostat_cost.json": Measurement((*BATHS, "ase"), script("22_thermostat_cost"), 1),
     "thermostats.json": Measurement((*BATHS, "ase"), script("10_thermostats"), 20),

@@ -29,7 +29,7 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons import ConstraintSet
-from kcons.comparison import json_files, processor_of, ring, scripts, system_of
+from kcons.comparison import json_files, processor_of, scripts, system_of
 from kcons.comparison import measure as compare
 from kcons.constraints import Distance
 from kcons.errors import KconsError
@@ -279,7 +279,8 @@ def steps_in_dhfr(name: str, tolerance: float, steps: int, repeats: int, **optio
 
 
 def polygon(n: int) -> np.ndarray:
-    return ring(n, 0.14 / (2 * np.sin(np.pi / n)))
+    angle = 2 * np.pi * np.arange(n) / n
+    return 0.07 / np.sin(np.pi / n) * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
 
 
 def honeycomb(m: int, n: int) -> tuple[np.ndarray, list[tuple[int, int]]]:

@@ -5,6 +5,6 @@
 - `check`, `completion`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names
 - `compiled_systems`: what `kcons warmup` runs
 - `listing`: what `--list` prints
-- `studies`: `kcons hardcases`, `kcons stability`
+- `long_steps`: `kcons compare --slow --fast`
 - `main`: all others
 """

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
-from kcons.cli import check, completion, doctor, freeenergy, listing, scan, studies, warmup
+from kcons.cli import check, completion, doctor, freeenergy, listing, long_steps, scan, warmup
 from kcons.cli.parser import Parser
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 from kcons.errors import InputError, KconsError, did_you_mean, with_extra
@@ -140,7 +140,7 @@ def _parser() -> Parser:
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
-    studies.add_steps(compare)
+    long_steps.add(compare)
     compare.add_argument(
         "--criterion",
         choices=("error", "drift", "temperature"),
@@ -173,7 +173,6 @@ def _parser() -> Parser:
     doctor.add(commands)
     freeenergy.add(commands)
     scan.add(commands)
-    studies.add(commands)
     warmup.add(commands)
 
     return parser
@@ -206,7 +205,7 @@ def _compare(chosen: argparse.Namespace) -> int:
             return _test_system(argparse.Namespace(**{**vars(chosen), "forces": forces}))
 
         folder = chosen.out or folder.with_name(f"{folder.name}-steps")  # beside what compares trajectories
-        return studies.compare_steps(chosen, budget, folder, with_forces)
+        return long_steps.run(chosen, budget, folder, with_forces)
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")

@@ -5,8 +5,6 @@
 - `methods`: everything that runs them
 - `work_precision`: cost against error, and what follows from it
 - `averages`: thermostats and the averages they give
-- `solvers_alone`: constraint solvers without dynamics
-- `hard_cases`, `stability`: where constraints are difficult, and how far steps can be pushed
 """
 
 from importlib import import_module
@@ -18,14 +16,11 @@ from kcons.errors import with_extra
 _MODULES = {
     "averages": ("layers", "long_steps", "long_steps_report", "sampling", "volumes"),
     "test_systems": ("fluid",),
-    "solvers_alone": ("scaling", "solver_precision"),
     "study": ("json_files", "scripts"),
     "work_precision": ("answer", "fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
-    "averages.fitted_forces": ("FittedForces",),
     "averages.step_zero": ("extrapolate",),
-    "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),
     "test_systems": ("Reference", "TestSystem"),
     "test_systems.fluid": ("Fluid",),

@@ -33,7 +33,6 @@ def test_wrong_words_of_the_command_line(words, meant, capsys):
         (["compare", "water", "--methods", "ratle"], "'rattle'"),
         (["compare", "--all", "--only", "rotr"], "'rotor'"),
         (["warmup", "protein"], "'proteins'"),
-        (["stability", "--scenes", "buthane"], "'butane'"),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
 )

@@ -7,28 +7,21 @@ import re
 import shlex
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 from committed_pages import said
 
 from kcons.cli import main
-from kcons.comparison import scaling, solver_precision
 from kcons.constraints import Constraint, projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), ROOT / "examples" / "studies" / "xtb_steps.py"]
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
-#: Studies that have tests of their own: what a script does with their results is seen of a part of them.
-PARTS = {
-    "15_solver_precision.py": (solver_precision, {"systems": ["chain-small"]}),
-    "16_scaling.py": (scaling, {"sizes": {"chain": (20, 100)}, "solvers": ["kcons"]}),
-}
 #: Between the cells of a table.
 BAR = re.compile(r"(?<!\\)\|")
 
@@ -77,9 +70,6 @@ def test_console_snippets_run(page, text, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
 def test_example_runs(script, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if script.name in PARTS:
-        study, part = PARTS[script.name]
-        monkeypatch.setattr(study, "measure", partial(study.measure, **part))
     assert said(script).strip()
 
 

@@ -29,7 +29,7 @@ def averages(run):
 
 def test_page_shows_the_committed_results():
     assert RESULT["full"]
-    assert printed("36_xtb_steps.py", "long_steps_xtb.json") in page("step_length.md")
+    assert printed("studies/xtb_steps.py", "long_steps_xtb.json") in page("step_length.md")
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

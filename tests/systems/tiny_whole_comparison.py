@@ -1,4 +1,4 @@
-"""A small whole comparison: a chain and a sphere, one test system and one part that are not there."""
+"""A small whole comparison: a chain and a sphere, and one test system that is not there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ TINY = (
     Item("chain-3", "Chain of 3 bonds", "chain", 3, budget=5, seconds=1, quick_seconds=1),
     Item("gone", "A later test system", "no such scene", seconds=1),
     Item("sphere", "Spheres", "sphere", 1, budget=5, seconds=1, quick_seconds=0),
-    Item("later", "A part of the future", module="kcons.no_such_module", seconds=1),
 )
 METHODS = ["rattle", "blanes-moan4", "dop853", "verlet"]
 #: No test looks at its times, but two are needed to say how well they repeat.

@@ -1,7 +1,6 @@
 """Averages of thermostats, and how far they are off after how much time.
 
 - `sampling`: fluids run and measured
-- `fitted_forces`: cheap forces fitted to expensive ones
 - `layers`: systems with expensive and cheap forces
 - `long_steps`, `long_steps_report`: bias against evaluations of expensive forces
 - `step_zero`: averages at step zero

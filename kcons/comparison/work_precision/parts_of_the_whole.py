@@ -19,7 +19,7 @@ class Item:
         Name of its files.
     heading : str
     scene : str
-        A key of `test_systems.SYSTEMS`; '' for a part with a module of its own.
+        A key of `test_systems.SYSTEMS`.
     size : int or None
     options : mapping
         For the test system.
@@ -39,8 +39,6 @@ class Item:
         The same in a quick run; 0 where it is left out of it.
     quick_size : int or None
         Size in a quick run, by default what the test system says.
-    module : str
-        Where `measure`, `figure` and `table` are, for a part that is no test system.
     """
 
     key: str
@@ -56,7 +54,6 @@ class Item:
     seconds: float = 30.0
     quick_seconds: float = 6.0
     quick_size: int | None = None
-    module: str = ""
 
 
 def _molecule(structure: str, text: str, constrain: str, title: str, **more: Any) -> Item:
@@ -169,20 +166,6 @@ PLAN: tuple[Item, ...] = (
         seconds=200,
         quick_seconds=0,
         budget=75,
-    ),
-    Item(
-        "solver-precision",
-        "The solvers alone: residual against time a constraint",
-        module="kcons.comparison.solvers_alone.solver_precision",
-        seconds=125,
-        quick_seconds=25,
-    ),
-    Item(
-        "scaling",
-        "Scaling: cost and memory against size",
-        module="kcons.comparison.solvers_alone.scaling",
-        seconds=440,
-        quick_seconds=25,
     ),
 )
 

@@ -10,7 +10,6 @@ import gc
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -71,7 +70,7 @@ def run(
     pending = []
     for item in items:
         old = _kept(folder, item, quick).earlier()
-        if not fresh and old and not {"failed", "unfinished"} & set(old):
+        if not fresh and old and "failed" not in old:
             watching.overall(f"{item.key}: measured already", 0.0, sum(expected.values()))
             expected.pop(item.key)
         else:
@@ -85,7 +84,7 @@ def run(
             watching.overall(f"{number} of {len(pending)}: {item.heading}", elapsed, elapsed + left)
             share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
             started = time.perf_counter()
-            found = _part(item, quick, share, watching, folder, fresh)
+            found = _part(item, quick, share, watching)
             _kept(folder, item, quick).put(found)
             whole_page.write_part(folder, _part_of(item, read(folder, item.key) or {}))
             if "seconds" in found:
@@ -110,40 +109,23 @@ def _kept(folder: Path, item: Item, quick: bool) -> Kept:
     return Kept(folder / f"{item.key}.json", key_of(item, quick), form=FORMAT, under="key", pack=packed)
 
 
-def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
+def _part(item: Item, quick: bool, share: float, watcher: Watcher) -> dict[str, Any]:
     """Measure one part; what keeps it from being measured is its result."""
     reason = _excluded(item, quick) or ("the time of a quick run was over" if share < 0.05 else "")
     if reason:
         return {"not run": reason}
     begun = time.perf_counter()
     try:
-        if item.module:
-            found = {"result": _by_module(item, quick, watcher, folder, fresh)}
-        else:
-            found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
+        found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
     except (KconsError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
         return {"failed": f"{type(error).__name__}: {error}"}
     return {**found, "seconds": time.perf_counter() - begun}
-
-
-def _by_module(item: Item, quick: bool, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
-    """A part with a module of its own; what it has measured is kept from time to time."""
-    kept = _kept(folder, item, quick)
-    result: dict[str, Any] = import_module(item.module).measure(
-        quick=quick,
-        keep=lambda result: kept.put({"unfinished": True, "result": result}),
-        watcher=watcher,
-        earlier=None if fresh else kept.earlier().get("result"),
-    )
-    return result
 
 
 def _excluded(item: Item, quick: bool) -> str:
     """Why a part is not measured here; '' if it is."""
     if quick and not item.quick_seconds:
         return "in the full run only"
-    if item.module and find_spec(item.module) is None:
-        return f"this version of kcons has no {item.module}"
     if item.scene and item.scene not in test_systems.SYSTEMS:
         return f"this version of kcons has no test system {item.scene!r}"
     if item.needs and find_spec(item.needs) is None:
@@ -267,7 +249,7 @@ def parts(folder: Path) -> list[whole_page.Part]:
 
 
 def _part_of(item: Item, data: Mapping[str, Any]) -> whole_page.Part:
-    return whole_page.Part(item.key, item.heading, item.module, data)
+    return whole_page.Part(item.key, item.heading, data)
 
 
 def _page(folder: Path) -> Path:

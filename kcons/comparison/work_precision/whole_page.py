@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +54,6 @@ class Part:
 
     key: str
     heading: str
-    module: str
     data: Mapping[str, Any]
 
     @cached_property
@@ -129,9 +126,6 @@ def shown(part: Part) -> tuple[Figure | None, Table | None, str]:
     found = part.comparison
     if found is not None:
         return report.figure(found), report.page_table(found), report.explanation(found)
-    if "result" in part.data and find_spec(part.module) is not None:
-        module = import_module(part.module)
-        return module.figure(part.data["result"]), module.table(part.data["result"]), ""
     return None, None, ""
 
 
@@ -248,10 +242,7 @@ def winners(parts: Sequence[Part]) -> Table:
 WINNERS_PICTURE = "who-wins-where.png"
 #: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
-PICTURES = (
-    *("dumbbells", "rotor", "water-216", "chain-1e3", "alanine-allbonds", "dhfr-allbonds", "ethanol"),
-    *("solver-precision", "scaling"),
-)
+PICTURES = ("dumbbells", "rotor", "water-216", "chain-1e3", "alanine-allbonds", "dhfr-allbonds", "ethanol")
 #: Columns of the table of winners that go there.
 SHORT = (0, 1, 2, 3, 4, 5, 6)
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from unittest.mock import Mock
-
 import pytest
 from matplotlib.figure import Figure
 from tiny_whole_comparison import METHODS, TINY, TWICE, Page, measured_once, plan_tiny
@@ -49,38 +46,11 @@ def empty_pictures(monkeypatch):
 
 def test_files_of_every_part(finished):
     names = {path.name for path in finished.iterdir()}
-    assert names >= {"index.html", "gone.json", "later.json"}
+    assert names >= {"index.html", "gone.json"}
     for key in ("chain-3", "sphere"):
         assert names >= {f"{key}.json", f"{key}.png", f"{key}.txt"}
     assert not [name for name in names if name.endswith(".unfinished")]
     assert "kcons RATTLE" in (finished / "sphere.txt").read_text(encoding="utf-8")
-
-
-def test_a_part_of_a_module_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
-    measured = []
-
-    def measure(*, quick, keep, watcher, earlier=None):
-        found = {"points": list(earlier["points"]) if earlier else []}
-        for point in range(len(found["points"]), 3):
-            if point == 2 and len(measured) == 2:
-                measured.append("interrupted")
-                raise KeyboardInterrupt
-            measured.append(point)
-            found["points"].append(point)
-            keep(found)
-        return found
-
-    monkeypatch.setattr(whole, "import_module", lambda name: SimpleNamespace(measure=measure))
-    monkeypatch.setattr(whole, "find_spec", lambda name: True)
-    monkeypatch.setattr(whole, "whole_page", Mock())
-    items = [Item("alone", "A module", module="kcons.some_module", seconds=1)]
-    with pytest.raises(KeyboardInterrupt):
-        whole.run(items, tmp_path)
-    assert whole.read(tmp_path, "alone")["result"] == {"points": [0, 1]}
-    whole.run(items, tmp_path)
-    whole.run(items, tmp_path)
-    assert measured == [0, 1, "interrupted", 2]
-    assert whole.read(tmp_path, "alone")["result"] == {"points": [0, 1, 2]}
 
 
 def test_numbers_come_back_as_they_were(finished):
@@ -99,7 +69,6 @@ def test_numbers_come_back_as_they_were(finished):
 
 def test_what_cannot_be_run_is_said(finished):
     assert whole.read(finished, "gone")["not run"] == "this version of kcons has no test system 'no such scene'"
-    assert "kcons.no_such_module" in whole.read(finished, "later")["not run"]
 
 
 @pytest.mark.usefixtures("empty_pictures")

@@ -1,0 +1,168 @@
+"""Chains: mass ratios, length, and how straight they are."""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+
+import numpy as np
+
+from hard_cases import truths
+from hard_cases.case import Outcome, case, outcome
+from hard_cases.contract import Program, together
+from hard_cases.motions import Seen, energy_off, move
+from hard_cases.problem import Array, Problem
+from hard_cases.programs import Core
+
+
+def zigzag(n: int, degrees: float = 110.0, length: float = 1.0) -> Array:
+    """A planar chain of n atoms with equal bonds and angles."""
+    half = np.radians(degrees / 2)
+    k = np.arange(n)
+    return length * np.stack([k * np.sin(half), (k % 2) * np.cos(half), 0.0 * k], axis=1)
+
+
+def bonds(n: int) -> list[tuple[int, int]]:
+    """Bonds of a chain of n atoms."""
+    return [(k, k + 1) for k in range(n - 1)]
+
+
+def _mass_ratio(program: Program, ratio: float, quick: bool) -> Outcome:
+    n = 20
+    x = truths.rotated(zigzag(n, 156.0, 0.15))
+    masses = np.where(np.arange(n) % 2 == 0, 1.0, ratio)
+    # In the frame of the centre of mass: rounding of large coordinates would be seen otherwise.
+    x -= masses @ x / masses.sum()
+    v = 0.0075 * np.random.default_rng(0).standard_normal((n, 3)) / np.sqrt(masses)[:, None]
+    v -= masses @ v / masses.sum()
+    problem = Problem(x, masses, bonds(n))
+    problem = problem.but(velocities=problem.tangent(v))
+    seen = Seen(problem)
+    centres: list[Array] = []
+    steps = program.length(quick, 500, 10_000)
+    watch = together(seen, lambda frame: centres.append(masses @ frame.x / masses.sum()))
+    program.run(problem, 0.01, steps, watch, every=5)
+    return outcome(
+        ("residual", seen.residual, 1e-10),
+        ("centre of mass", np.abs(np.array(centres) - centres[0]).max(), 1e-12),
+        ("energy", energy_off(seen.energies), 1e-3),
+        remark=f"{steps} steps",
+    )
+
+
+@case(
+    "H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; centre of mass 1e-12 over 1e4 steps; |J a| 1e-14"
+)
+def mass_ratio_12(program: Program, quick: bool) -> Outcome:
+    found = _mass_ratio(program, 1e12, quick)
+    if not isinstance(program, Core):
+        return found
+    # The acceleration itself, against the rows of the dense theory.
+    x = truths.rotated(zigzag(20, 156.0))
+    masses = np.where(np.arange(20) % 2 == 0, 1.0, 1e12)
+    problem = Problem(x, masses, bonds(20))
+    motion = program.system(problem).motion
+    rng = np.random.default_rng(0)
+    v = problem.tangent(rng.standard_normal((20, 3)) / np.sqrt(masses)[:, None])
+    a = motion.acceleration(x, v, rng.standard_normal((20, 3)))
+    held = problem.oracle()
+    rows = held.jacobian(x).toarray()
+    miss = np.abs(rows @ a.ravel() - held.acceleration_target(x, v)) / np.linalg.norm(rows, axis=1)
+    checks = [(check.name, check.value, check.limit) for check in found.checks]
+    return outcome(*checks, ("|J a - b|", miss.max() / np.linalg.norm(a), 1e-14), remark=found.remark)
+
+
+def _register_ratios() -> None:
+    for number, power in (("X20", 3), ("X21", 6), ("X22", 8)):
+
+        def run(program: Program, quick: bool, power: int = power) -> Outcome:
+            return _mass_ratio(program, 10.0**power, quick)
+
+        case(
+            number,
+            f"Chain of 20, masses 1 and 1e{power} in turn",
+            "residual 1e-10; centre of mass 1e-12; energy 1e-3 over 1e4 steps",
+        )(run)
+
+
+_register_ratios()
+
+
+@case(
+    "H16",
+    "Chains of 1e5 bonds, random and straight",
+    "residual 1e-12 (or what positions of 5e4 can store), 0.5 s a solve, < 1 GB",
+)
+def long_chain(program: Program, quick: bool) -> Outcome:
+    n = (10_000 if quick else 100_000) + 1
+    if program.name == "ASE":
+        # ASE needs seconds for a hundred bonds.
+        n = 101
+    rng = np.random.default_rng(0)
+    found: list[tuple[str, float, float]] = []
+    for shape in ("random", "straight"):
+        if shape == "straight":
+            x = np.zeros((n, 3))
+            x[:, 0] = np.arange(n)
+        else:
+            d = rng.standard_normal((n, 3))
+            x = np.cumsum(d / np.linalg.norm(d, axis=1, keepdims=True), axis=0)
+        x -= x[n // 2]
+        v = rng.standard_normal((n, 3))
+        problem = Problem(x, np.ones(n), bonds(n), np.ones(n - 1), velocities=v)
+        limit = max(1e-12, 4 * float(np.spacing(np.abs(x).max())))
+        if isinstance(program, Core):
+            tracemalloc.start()
+            motion = program.system(problem).motion
+            motion.project_velocities(x, v)
+            motion.project_positions(x + 0.02 * v, x)
+            start = time.perf_counter()
+            tangent = motion.project_velocities(x, v)
+            spent = time.perf_counter() - start
+            start = time.perf_counter()
+            y = motion.project_positions(x + 0.02 * v, x)
+            spent = max(spent, time.perf_counter() - start)
+            peak = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            rows = problem.oracle().jacobian(x)
+            found += [
+                (f"{shape}: |A v|", float(np.abs(rows @ tangent.ravel()).max()), 1e-12),
+                (f"{shape}: seconds a solve", spent, 0.5),
+                (f"{shape}: memory (GB)", peak / 1e9, 1.0),
+            ]
+            worst = problem.residual(y)
+        else:
+            seen = Seen(problem)
+            program.run(problem, 0.02, 1, seen, project=True)
+            worst = seen.residual
+        found.append((f"{shape}: residual", worst, limit))
+    return outcome(*found, remark=f"{n - 1} bonds")
+
+
+@case(
+    "X23",
+    "Near-straight chains (179 and 180 degrees) of 100 bonds",
+    "residual 1e-10; momentum and energy of free flight",
+)
+def near_straight(program: Program, quick: bool) -> Outcome:
+    found: list[tuple[str, float, float]] = []
+    steps = program.length(quick, 20, 500)
+    for degrees in (179.0, 180.0):
+        x = truths.rotated(zigzag(101, degrees))
+        masses = np.full(101, 12.0)
+        problem = Problem(x, masses, bonds(101))
+        problem = problem.but(velocities=problem.tangent(0.1 * np.random.default_rng(4).standard_normal(x.shape)))
+        seen = Seen(problem)
+        program.run(problem, 0.005, steps, seen)
+        off = energy_off(seen.energies)
+        found += [(f"{degrees:g}: residual", seen.residual, 1e-10), (f"{degrees:g}: energy", off, 1e-3)]
+    return outcome(*found, remark=f"{steps} steps each")
+
+
+@case("X24", "Puckered ring of six bonds", "10 x the error of RATTLE; residual 1e-10")
+def puckered_ring(program: Program, quick: bool) -> Outcome:
+    angle = 2 * np.pi * np.arange(6) / 6
+    x = truths.rotated(np.stack([np.cos(angle), np.sin(angle), 0.35 * (-1.0) ** np.arange(6)], axis=1))
+    v = 0.4 * np.random.default_rng(5).standard_normal((6, 3))
+    pairs = [*bonds(6), (0, 5)]
+    return move(program, Problem(x, np.full(6, 14.0), pairs, velocities=v), 0.005, program.length(quick, 100, 1000))

@@ -1,0 +1,76 @@
+"""Long runs: drift of the energy and of the residual."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hard_cases.case import Outcome, case, outcome
+from hard_cases.contract import Program
+from hard_cases.motions import Seen
+from hard_cases.problem import Array, Problem
+from hard_cases.programs import Core
+from kcons.errors import KconsError
+
+#: Steps of the pendulum for each program: quick and full.
+STEPS = {
+    "kcons": (20_000, 10_000_000),
+    "kcons in ASE": (3_000, 300_000),
+    "kcons in OpenMM": (2_000, 200_000),
+    "ASE": (500, 20_000),
+    "OpenMM": (2_000, 500_000),
+}
+
+
+def pendulum(angle: float) -> Problem:
+    """Mass 1 on a rod of length 1 about a fixed atom, gravity 1, released at `angle` from below."""
+    x = np.array([[0.0, 0.0, 0.0], [np.sin(angle), 0.0, -np.cos(angle)]])
+    return Problem(x, [1.0, 1.0], [(0, 1)], [1.0], fixed=[0], push=np.array([[0, 0, 0], [0, 0, -1.0]]))
+
+
+def secular_drift(energies: Array) -> float:
+    """Difference of the means over both halves under a smooth window: the oscillation cancels."""
+    n = len(energies) // 2
+    window = np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 4
+    return float((energies[n : 2 * n] @ window - energies[:n] @ window) / window.sum())
+
+
+@case("H14", "Pendulum at 2 rad, 1e7 steps", "secular energy 1e-6 over 1e7 steps of 0.01 (rms 2.1e-5); residual 1e-14")
+def long_pendulum(program: Program, quick: bool) -> Outcome:
+    steps = STEPS[program.name][0 if quick else 1]
+    problem = pendulum(2.0)
+    seen = Seen(problem)
+    program.run(problem, 0.01, steps, seen, every=5)
+    drift = 2 * abs(secular_drift(np.array(seen.energies)))
+    # The windowed mean of few periods knows the drift no better than the oscillation allows.
+    limit = 1e-6 if steps >= 1_000_000 else 1e-6 + 2.1e-5 * 10_000 / steps
+    return outcome(
+        ("secular drift of the energy", drift, limit),
+        ("residual", seen.residual, 1e-14 if isinstance(program, Core) else 1e-12),
+        remark=f"{steps:g} steps, rms {np.std(seen.energies):.2g}",
+    )
+
+
+@case(
+    "H15",
+    "Accelerations alone, no projection",
+    "not what is done by default: residual 1e-12 at t = 200 for dt 0.005 to 0.04",
+)
+def no_projection(program: Program, quick: bool) -> Outcome:
+    found: list[tuple[str, float, float]] = []
+    problem = pendulum(2.0)
+    horizon = program.pace * (20.0 if quick else 200.0)
+    for dt in (0.005, 0.04):
+        seen = Seen(problem)
+        program.run(problem, dt, round(horizon / dt), seen, every=20)
+        found.append((f"dt {dt:g}: residual", seen.residual, 1e-12))
+    remark = f"t = {horizon:g}"
+    if isinstance(program, Core):
+        from kcons.steppers import ProjectedVerlet
+
+        seen = Seen(problem)
+        try:
+            program.run(problem, 0.04, round(horizon / 0.04), seen, stepper=ProjectedVerlet(project=False))
+            remark += f"; on request, without projection: residual {seen.residual:.2g}"
+        except KconsError as error:
+            remark += f"; on request, without projection: {type(error).__name__} at residual {seen.residual:.2g}"
+    return outcome(*found, remark=remark)

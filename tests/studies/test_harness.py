@@ -1,0 +1,40 @@
+"""Studies write one row a measurement, go on where they were cut off, and refuse files of other runs."""
+
+from __future__ import annotations
+
+import harness
+import pytest
+
+from kcons.errors import InputError
+
+
+def test_a_study_that_was_cut_off_goes_on(tmp_path):
+    path, asked = tmp_path / "out" / "study.csv", []
+
+    def piece(name):
+        asked.append(name)
+        if name == "b" and asked.count("b") == 1:
+            raise KeyboardInterrupt
+        return [{"value": 0.1 + len(name), "words": "a, 'b'"}, {"value": 1e-300, "more": None}]
+
+    pieces = {name: lambda name=name: piece(name) for name in "abc"}
+    with pytest.raises(KeyboardInterrupt):
+        harness.run(path, pieces, quick=True)
+    head, kept = harness.read(path)
+    assert list(kept.piece) == ["a", "a"] and head["settings"] == "quick=True"
+    assert {"commit", "machine", "versions", "date"} <= set(head)
+    table = harness.run(path, pieces, quick=True)
+    assert asked == ["a", "b", "b", "c"]
+    assert list(table.piece) == list("aabbcc")
+    again = harness.read(path)[1]
+    assert list(again.value) == [1.1, 1e-300] * 3 and again.words[0] == "a, 'b'"
+    assert [file.name for file in path.parent.iterdir()] == ["study.csv"]
+
+
+def test_files_of_other_runs_are_refused(tmp_path):
+    path = tmp_path / "study.csv"
+    harness.run(path, {"a": lambda: [{"value": 1}]}, quick=True)
+    before = path.read_text()
+    with pytest.raises(InputError, match=r"settings 'quick=True', not 'quick=False': give another --out"):
+        harness.run(path, {"b": lambda: [{"value": 1}]}, quick=False)
+    assert path.read_text() == before

@@ -1,0 +1,63 @@
+"""Solvers alone: precision and scaling of the engine and of sweeps, and solvers that fail or take too long."""
+
+from __future__ import annotations
+
+import harness
+import pandas as pd
+import pytest
+import solvers_alone
+from bare_solvers import CANDIDATES
+
+SWEEPS = next(c for c in CANDIDATES if c.name == "sweeps")
+
+
+def test_the_study(tmp_path, capsys):
+    solvers_alone.main(["--quick", "--systems", "chain-small", "--solvers", "kcons,sweeps", "--out", str(tmp_path)])
+    head, table = harness.read(tmp_path / "precision.csv")
+    assert "commit" in head and (table.status == "ok").all()
+    assert set(table.stage) == {"P", "V"}
+    sweeps = table[(table.solver == "sweeps") & (table.stage == "P")]
+    assert (sweeps.residual < 1.5 * sweeps.tolerance).all()
+    assert table[table.solver == "kcons"].residual.max() < 1e-13
+    assert len(solvers_alone.figures(table)["report-solver-precision"].axes) == 2
+    assert "ns a row" in capsys.readouterr().out
+
+
+def test_points_of_the_scaling_come_from_processes_of_their_own():
+    rows = list(solvers_alone.scaling("chain", "kcons", (20, 3000), 300.0))
+    assert [row["status"] for row in rows] == ["ok", "ok"]
+    assert rows[1]["rows"] == 3000 and rows[1]["P residual"] < 1e-12
+    (late,) = solvers_alone.scaling("chain", "ase", (20, 30), 0.01)
+    assert late["status"] == "stopped"
+    figure = solvers_alone.figures(pd.DataFrame(rows))["report-scaling"]
+    assert len(figure.axes) == 3
+
+
+def test_exponents_are_fitted_beyond_the_cost_of_a_call():
+    sizes = (100, 1000, 10_000, 100_000)
+    rows = [
+        {"kind": "chain", "size": n, "solver": solver, "status": "ok", "P seconds": 1e-8 * max(n, 1000) ** power}
+        for solver, power in (("kcons", 1.0), ("sweeps", 1.5))
+        for n in sizes
+    ]
+    table = pd.DataFrame(rows).assign(**{"V seconds": None, "memory": None})
+    fitted = solvers_alone.exponents(table)
+    assert fitted["chain", "kcons", "P seconds"] == pytest.approx(1.0)
+    assert fitted["chain", "sweeps", "P seconds"] == pytest.approx(1.5)
+    assert ("chain", "kcons", "V seconds") not in fitted
+
+
+def test_what_solvers_of_others_raise_is_a_result(monkeypatch):
+    system = solvers_alone.chain(5)
+
+    class Failing:
+        def __init__(self, *_):
+            pass
+
+        def timing(self, stage):
+            raise RuntimeError("did not converge")
+
+    candidate = type("Made", (), {"make": Failing, "name": "made"})
+    assert solvers_alone.timed(system, candidate, 0.0) == {
+        "P": {"status": "failed", "words": "RuntimeError: did not converge"}
+    }
