@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison import json_files, measure, processor_of
+from kcons.comparison import environment, json_files, processor_of
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")
@@ -360,7 +360,7 @@ def main() -> None:
         result = json_files.read(options.out)
         result[options.part] = parts[options.part]()
     else:
-        result = {"machine": measure.environment(), "full": full} | {name: part() for name, part in parts.items()}
+        result = {"machine": environment(), "full": full} | {name: part() for name, part in parts.items()}
     if options.out:
         json_files.write(options.out, result)
     show(result)

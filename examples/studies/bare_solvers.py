@@ -20,10 +20,10 @@ import numpy as np
 from ase import Atoms
 from ase.constraints import FixBondLengths
 from bare_systems import STEP, BareSystem
+from peers import lammps_shake
+from peers.gauss_seidel import GaussSeidel
 
-from kcons.comparison.methods.engines import seen
-from kcons.comparison.methods.peers import lammps_shake
-from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel
+from kcons.comparison.runs import seen
 from kcons.comparison.test_systems.openmm_engine import system_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError

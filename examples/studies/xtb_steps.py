@@ -1,9 +1,9 @@
 """GFN2-xTB seldom, a cheap force that is fitted to it often: bias and cost of averages against calls of GFN2-xTB.
 
-    python examples/studies/xtb_steps.py                  a short run of each kind, seconds: large errors
-    python examples/studies/xtb_steps.py --full --out F   the committed results, half an hour; goes on
-    python examples/studies/xtb_steps.py --show F         the tables of an earlier result
-    python examples/studies/xtb_steps.py --show F --draw P   and its curves, into the picture P
+    python xtb_steps.py                  a short run of each kind, seconds: large errors
+    python xtb_steps.py --full --out F   the committed results, half an hour; goes on
+    python xtb_steps.py --show F         the tables of an earlier result
+    python xtb_steps.py --show F --draw P   and its curves, into the picture P
 
 Four rigid waters in a weak trap, and ethanol with its bonds to hydrogen held. The cheap force is a polynomial of second
 order in powers of inverse distances, the same for atoms that are of one kind; it is linear in what is fitted, to forces

@@ -2,9 +2,10 @@
 
 - `terminal`, `progress`: what is written to the terminal
 - `parser`: what is said of names that are not known
-- `check`, `completion`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names
+- `systems`: the test system or file that a command is asked for
+- `check`, `compare`, `doctor`, `freeenergy`, `plan`, `scan`, `warmup`: the commands of these names
+- `long_steps`: `kcons compare --slow --fast`
 - `compiled_systems`: what `kcons warmup` runs
 - `listing`: what `--list` prints
-- `long_steps`: `kcons compare --slow --fast`
-- `main`: all others
+- `main`: the command itself
 """

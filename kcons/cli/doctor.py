@@ -83,7 +83,7 @@ def machine() -> dict[str, str]:
     """Processor, the width of its registers, and threads."""
     import numba
 
-    from kcons.comparison.study.machine import processor, simd_width
+    from kcons.comparison.machine import processor, simd_width
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     set_by = {
@@ -155,7 +155,7 @@ def _first_line(text: str) -> str:
 
 def caches(wrong: list[str]) -> dict[str, str]:
     """Where compiled kernels are kept, and whether they can be."""
-    from kcons.comparison.study.machine import kernels_cached
+    from kcons.comparison.machine import kernels_cached
     from kcons.constraints import compilation
 
     here = Path(compilation.__file__).parent / "__pycache__"

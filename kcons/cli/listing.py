@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from kcons.comparison.methods.method import Method
+    from kcons.comparison.methods import Method
 
 
 def of_everything() -> int:
     """Print the names of test systems and methods."""
-    from kcons.comparison import test_systems
+    from kcons.comparison import methods, test_systems
     from kcons.comparison.averages import long_steps, sampling
-    from kcons.comparison.methods import methods
 
     print("test systems")
     for name, entry in test_systems.SYSTEMS.items():
@@ -38,4 +37,6 @@ def _when(method: Method) -> str:
     """When a method runs."""
     if not method.usual:
         return " (only when named)"
-    return "" if method.md_engine != "openmm" or method.guest else " (in OpenMM's test systems, or when named)"
+    from kcons.comparison.methods import GUESTS
+
+    return "" if method.engine != "OpenMM" or method.name in GUESTS else " (in OpenMM's test systems, or when named)"

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kcons.cli.systems import test_system
 from kcons.cli.terminal import console, rendered, say_written, show
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
     from kcons.comparison.averages.layers import Layers
-    from kcons.comparison.test_systems import TestSystem
 
 
 def add(compare: argparse.ArgumentParser) -> None:
@@ -25,8 +24,8 @@ def add(compare: argparse.ArgumentParser) -> None:
     layers.add_argument("--fast", metavar="FORCES", help="the cheap ones")
 
 
-def run(chosen: argparse.Namespace, budget: float, folder: Path, with_forces: Callable[[str], TestSystem]) -> int:
-    """Bias against evaluations of the expensive forces; `with_forces` makes the test system of a file."""
+def run(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
+    """Bias against evaluations of the expensive forces."""
     from kcons.cli.progress import Bars
     from kcons.comparison.averages import long_steps
     from kcons.comparison.averages import long_steps_report as report
@@ -38,7 +37,7 @@ def run(chosen: argparse.Namespace, budget: float, folder: Path, with_forces: Ca
         raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
     with Bars() as watcher:
         with watcher.piece("building the system", 1):
-            layers = _layers(chosen, with_forces)
+            layers = _layers(chosen)
         unit = layers.units.time_unit
         steps = None if chosen.dt is None else [dt * unit for dt in chosen.dt]
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
@@ -62,7 +61,7 @@ def run(chosen: argparse.Namespace, budget: float, folder: Path, with_forces: Ca
     return 130 if stopped else 0
 
 
-def _layers(chosen: argparse.Namespace, with_forces: Callable[[str], TestSystem]) -> Layers:
+def _layers(chosen: argparse.Namespace) -> Layers:
     """The system with both forces."""
     from kcons.comparison import test_systems
     from kcons.comparison.averages import layers
@@ -84,4 +83,5 @@ def _layers(chosen: argparse.Namespace, with_forces: Callable[[str], TestSystem]
         raise InputError(f"--slow and --fast are for {known} and for files, not {chosen.scene!r}", item="scene")
     if chosen.slow is None:
         raise InputError("a file needs --slow and --fast, the expensive and the cheap forces", item="slow")
-    return layers.of_test_systems(with_forces(chosen.slow), with_forces(chosen.fast))
+    slow, fast = (argparse.Namespace(**{**vars(chosen), "forces": name}) for name in (chosen.slow, chosen.fast))
+    return layers.of_test_systems(test_system(slow), test_system(fast))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
-from kcons.errors import did_you_mean
+from kcons.errors import InputError, did_you_mean
 
 
 class Parser(argparse.ArgumentParser):
@@ -21,6 +21,17 @@ class Parser(argparse.ArgumentParser):
         """Options that are not what they are by default: where they are kept, and how they are written."""
         options = [action for action in self._actions if action.option_strings and hasattr(chosen, action.dest)]
         return {a.dest: a.option_strings[0] for a in options if getattr(chosen, a.dest) != a.default}
+
+    def take_only(self, chosen: argparse.Namespace, known: Collection[str], why: str) -> None:
+        """Complain of an option that would say nothing.
+
+        Raises
+        ------
+        InputError
+        """
+        for name, option in self.given(chosen).items():
+            if name not in known:
+                raise InputError(f"{option} {why}", item=name)
 
     def parse_fully(self, arguments: Sequence[str] | None = None) -> argparse.Namespace:
         """As `parse_args`."""

@@ -8,7 +8,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from kcons.comparison.study.study import Watcher
+from kcons.comparison.progress import Watcher
 from kcons.comparison.study.tables import duration
 
 

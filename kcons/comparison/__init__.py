@@ -1,10 +1,13 @@
 """Which method, and which step? Measured on test systems and on the user's own.
 
-- `study`: pages, machines and progress of all studies
+- `machine`, `progress`: where something was measured, and how far it is
 - `test_systems`: the test systems
-- `methods`: everything that runs them
-- `work_precision`: cost against error, and what follows from it
+- `runs`, `methods`: everything that runs them
+- `measure`: a test system through methods, a row a method and setting
+- `ranking`, `report`: what follows from the table, and what is shown of it
 - `averages`: thermostats and the averages they give
+- `production`: which step is right for averages
+- `study`: files and tables of averages
 """
 
 from importlib import import_module
@@ -12,44 +15,42 @@ from typing import Any
 
 from kcons.errors import with_extra
 
-#: What documents and examples use, by the module that has it; imported when it is asked for.
-_MODULES = {
-    "averages": ("layers", "long_steps", "long_steps_report", "sampling", "volumes"),
-    "test_systems": ("fluid",),
-    "study": ("json_files", "scripts"),
-    "work_precision": ("answer", "fronts", "measure", "recommendation", "report"),
-}
+#: Names by the module that has them, or that they are; imported when they are asked for.
 _NAMES = {
+    "averages.layers": ("layers",),
+    "averages.long_steps": ("long_steps",),
+    "averages.long_steps_report": ("long_steps_report",),
+    "averages.sampling": ("sampling",),
     "averages.step_zero": ("extrapolate",),
-    "methods.methods": ("METHODS", "CoreStepper"),
+    "averages.volumes": ("volumes",),
+    "machine": ("environment", "processor_of"),
+    "measure": ("COLUMNS", "compare"),
+    "methods": ("METHODS", "Method", "add_method", "code"),
+    "ranking": ("Ranking", "find_steps", "observed_orders", "rank"),
+    "report": ("figure", "read_csv", "text", "write_csv"),
+    "runs": ("Run",),
+    "study.json_files": ("json_files",),
+    "study.scripts": ("scripts",),
+    "study.study": ("work_off",),
     "test_systems": ("Reference", "TestSystem"),
-    "test_systems.fluid": ("Fluid",),
+    "test_systems.fluid": ("Fluid", "fluid"),
     "test_systems.lennard_jones": ("LennardJones",),
     "test_systems.openmm_engine": ("system_of",),
-    "test_systems.system": ("ASE_UNITS",),
     "test_systems.potential": ("Potential", "PotentialCalculator"),
-    "study.machine": ("environment", "processor_of"),
-    "study.study": ("work_off",),
-    "work_precision.measurement": ("Comparison", "Measurement"),
+    "test_systems.system": ("ASE_UNITS",),
 }
 
-__all__ = sorted(name for names in (*_MODULES.values(), *_NAMES.values()) for name in names)
+__all__ = sorted(name for names in _NAMES.values() for name in names)
 
 
 def __getattr__(name: str) -> Any:
-    try:
-        return _found(name)
-    except ModuleNotFoundError as error:
-        raise with_extra(error, f"{__name__}.{name}") from error
-
-
-def _found(name: str) -> Any:
-    for folder, modules in _MODULES.items():
-        if name in modules:
-            return import_module(f"{__name__}.{folder}.{name}")
     for module, names in _NAMES.items():
         if name in names:
-            return getattr(import_module(f"{__name__}.{module}"), name)
+            try:
+                found = import_module(f"{__name__}.{module}")
+            except ModuleNotFoundError as error:
+                raise with_extra(error, f"{__name__}.{name}") from error
+            return found if module.rpartition(".")[2] == name else getattr(found, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from kcons.cli import main
+from kcons.cli import main, plan
 
 needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 
@@ -21,43 +21,6 @@ ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 
 def run(*arguments):
     return main.main([str(a) for a in arguments])
-
-
-def test_compare_writes_table_plot_and_json(tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run("compare", "chain", "--size", 4, "--methods", "rattle,verlet", "--dt", "10,5", "--out", out) == 0
-    printed = capsys.readouterr()
-    assert "chain of 4 rigid bonds" in printed.out
-    assert "kcons RATTLE" in printed.out
-    lines = printed.out.splitlines()
-    assert lines[0].startswith("Use kcons RATTLE at ") and "for an error of at most" in lines[0]
-    assert lines[2].split() == ["method", "at", "error", "cost", "times"]
-    assert printed.out.index("Use kcons") < printed.out.index("chain of 4 rigid bonds")
-    assert "error: root-mean-square distance" in printed.out
-    assert "In Python:" in lines and "dynamics = ConstrainedDynamics(atoms, " in printed.out  # how to use the answer
-    assert f"wrote {out / 'compare.json'}" in printed.out
-    assert "reference solution" in printed.err  # progress goes to the other stream
-    data = json.loads((out / "compare.json").read_text())
-    assert data["scene"]["atoms"] == 5
-    assert data["scene"]["rank"] == 4
-    assert data["settings"] == {
-        "methods": ["rattle", "verlet"],
-        "budget_seconds": 20.0,
-        "size": 4,
-        "seed": 1,
-        "quick": False,
-        "dt": [10.0, 5.0],
-    }
-    assert [(m["method"], m["setting"]) for m in data["measurements"]] == [
-        ("rattle", 10.0),
-        ("rattle", 5.0),
-        ("verlet", 10.0),
-        ("verlet", 5.0),
-    ]
-    assert data["observed_order"]["rattle"] == pytest.approx(2.0, abs=0.1)
-    assert data["environment"]["cpu"]
-    assert "max |Av|" in (out / "compare.txt").read_text(encoding="utf-8")
-    assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_compare_samples_fluids(tmp_path, capsys):
@@ -80,25 +43,6 @@ def test_plan_of_a_fluid(capsys):
     assert run("plan", "thermostat-water") == 0
     text = capsys.readouterr().out
     assert "27 rigid TIP3P waters" in text and "rank 81" in text
-
-
-def test_default_folder_is_named_after_the_system(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert run("compare", "sphere", "--quick", "--methods", "rattle") == 0
-    assert (tmp_path / "compare-sphere" / "compare.json").exists()
-    data = json.loads((tmp_path / "compare-sphere" / "compare.json").read_text())
-    assert data["settings"]["quick"] is True
-    assert data["settings"]["budget_seconds"] == 5.0
-    assert data["scene"]["atoms"] == 2
-
-
-def test_seed_changes_the_trajectory(tmp_path, capsys):
-    errors = []
-    for seed in (1, 1, 2):
-        out = tmp_path / "out"
-        assert run("compare", "chain", "--size", 3, "--methods", "rattle", "--seed", seed, "--out", out) == 0
-        errors.append(json.loads((out / "compare.json").read_text())["measurements"][0]["error"])
-    assert errors[0] == errors[1] != errors[2]
 
 
 def test_plan_prints_clusters_rank_and_solver(capsys):
@@ -137,11 +81,6 @@ def test_version(capsys):
         (["compare", "chain", "--seed", "-1"], "non-negative"),
         (["compare", "chain", "--size", "3", "--budget", "-1"], "positive number of seconds"),
         (["compare", "chain", "--size", "3", "--out", "/dev/null/x"], "/dev/null"),
-        (["compare", "--all", "--dt", "4"], "--dt does not go with --all"),
-        (["compare", "--all", "--seed", "2"], "--seed does not go with --all"),
-        (["compare", "--only", "rotor", "--fast", "3"], "--fast does not go with --all"),
-        (["compare", "--redraw", ".", "--only", "rotor"], "--only does not go with --redraw"),
-        (["compare", "--into", "page.md", "--methods", "rattle"], "--into goes with --redraw DIR"),
         (["compare", "thermostat", "--forces", "lj"], "--forces is not for fluids"),
         (["plan", str(ALANINE), "--constrain", "none"], "none with kcons compare --forces"),
         (["plan", "thermostat", "--constrain", "hbonds"], "--constrain is not for fluids"),
@@ -154,7 +93,7 @@ def test_mistakes_give_one_line_and_status_2(arguments, text, capsys, tmp_path, 
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("kcons: ")]
     assert len(lines) == 1
     assert text in lines[0]
-    assert not list(tmp_path.glob("**/compare.json"))
+    assert not list(tmp_path.glob("**/compare.*"))
 
 
 @pytest.mark.parametrize("arguments", [["frobnicate"], ["compare", "chain", "--dt", "a,b"], ["compare", "--size", "x"]])
@@ -176,7 +115,7 @@ def test_interrupt(monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(main, "_test_system", stop)
+    monkeypatch.setattr(plan, "test_system", stop)
     assert run("plan", "chain") == 130
     assert capsys.readouterr().err == "kcons: interrupted\n"
 
@@ -191,39 +130,6 @@ def test_importing_the_command_imports_no_md_engine():
 
 
 # -- molecules in OpenMM ----------------------------------------------------------------------------
-
-
-@needs_openmm
-def test_own_file_in_openmm(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    names = "openmm-verlet,openmm-kcons-rattle"
-    assert run("compare", ALANINE, "--constrain", "allbonds", "--methods", names, "--dt", "2,1") == 0
-    printed = capsys.readouterr().out
-    assert "AllBonds: 21 distances" in printed
-    assert "OpenMM + kcons rattle" in printed
-    data = json.loads((tmp_path / f"compare-{ALANINE.stem}" / "compare.json").read_text())
-    assert data["settings"]["constrain"] == "allbonds"
-    assert data["observed_order"]["openmm-kcons-rattle"] == pytest.approx(2.0, abs=0.2)
-    assert data["remarks"]
-
-
-def test_own_topology_with_coordinates(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("MDAnalysis")
-    monkeypatch.chdir(tmp_path)
-    lines = ["3", "water", "O 0 0 0", "H 0.9572 0 0", "H -0.2400 0.9266 0"]
-    for name in ("water.xyz", "start.xyz"):
-        Path(name).write_text("\n".join(lines) + "\n")
-    words = ["--coordinates", "start.xyz", "--forces", "tip3p", "--methods", "rattle", "--dt", "4"]
-    assert run("compare", "water.xyz", *words) == 0
-    data = json.loads(Path("compare-water/compare.json").read_text())
-    assert data["settings"]["coordinates"] == "start.xyz"
-    printed = capsys.readouterr().out
-    start = printed.index("from ase import units")
-    code = printed[start : printed.index(")\n", printed.index("dynamics.run(", start)) + 1]
-    made: dict[str, object] = {}
-    with pytest.warns(UserWarning, match="were guessed"):
-        exec(code, made)  # the lines of Python run as they are
-    assert len(made["atoms"]) == 3
 
 
 @needs_openmm
@@ -250,39 +156,10 @@ def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, 
     assert text in capsys.readouterr().err
 
 
-def test_ctrl_c_writes_what_is_done(tmp_path, monkeypatch, capsys):
-    from kcons.comparison.work_precision.measure import Bench
-
-    whole = Bench.all_settings
-
-    def stopped(self, method):
-        if method.name == "verlet":
-            raise KeyboardInterrupt
-        return whole(self, method)
-
-    monkeypatch.setattr(Bench, "all_settings", stopped)
-    words = ["compare", "chain", "--size", 4, "--methods", "rattle,verlet", "--dt", "10,5", "--out", tmp_path]
-    assert run(*words) == 130
-    assert "interrupted: 1 of 2 methods were measured" in capsys.readouterr().out
-    data = json.loads((tmp_path / "compare.json").read_text())
-    assert [m["method"] for m in data["measurements"]] == ["rattle", "rattle"]
-
-
-def test_ctrl_c_before_anything_is_done(tmp_path, monkeypatch, capsys):
-    from kcons.comparison.work_precision.measure import Bench
-
-    def stopped(self, method):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Bench, "all_settings", stopped)
-    assert run("compare", "chain", "--size", 4, "--methods", "rattle", "--dt", "10", "--out", tmp_path) == 130
-    assert not (tmp_path / "compare.json").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["chain", "--criterion", "temperature"], "ask kcons check TRAJECTORY --topology FILE --forces"),
+        (["chain", "--criterion", "temperature"], "kcons check TRAJECTORY --topology FILE"),
         (["thermostat", "--criterion", "drift"], "is for trajectories"),
         (["chain", "--criterion", "drift", "--target-error", "1e-3"], "leave --criterion drift out"),
     ],

@@ -31,7 +31,6 @@ def test_wrong_words_of_the_command_line(words, meant, capsys):
         (["compare", "watr"], "'water'"),
         (["compare", "termostat"], "'thermostat'"),
         (["compare", "water", "--methods", "ratle"], "'rattle'"),
-        (["compare", "--all", "--only", "rotr"], "'rotor'"),
         (["warmup", "protein"], "'proteins'"),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),

@@ -69,7 +69,7 @@ def test_no_circle_of_imports():
 
 
 def test_documents_and_examples_import_public_names():
-    """`kcons` and `kcons.X`; of what is deeper the folders that are a subject of their own. Studies measure anything."""
+    """`kcons` and `kcons.X`; of what is deeper the folders that are a subject of their own, and all in studies."""
     own = {"cli.progress", "models.flows", "models.growth"}
     deep = []
     for path in [

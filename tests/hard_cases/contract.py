@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hard_cases.problem import Array, Problem
-from kcons.comparison.methods.method import Run
+from kcons.comparison.runs import Run
 from kcons.steppers import Stepper
 
 
@@ -112,10 +112,10 @@ class Program:
         done = 0
         while done < steps:
             block = 1 if wrap else min(every, steps - done)
-            run.march(block)
+            run.advance(block)
             done += block
             if wrap:
-                run.put(wrapped(run.positions, problem.cell))
+                run.put(wrapped(run.observe()[0], problem.cell))
             if watch and done % every == 0:
                 watch(seen := frame())
                 if not np.all(np.isfinite(seen.x)):

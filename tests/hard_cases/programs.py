@@ -20,8 +20,7 @@ from hard_cases.contract import (
     Program,
 )
 from hard_cases.problem import Array, Problem
-from kcons.comparison.methods.engines import InAse, InOpenMM, OnArrays, ase_constraints
-from kcons.comparison.methods.method import Run
+from kcons.comparison.runs import InAse, InOpenMM, OnArrays, Run, ase_constraints
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
@@ -56,7 +55,7 @@ class Core(Program):
         stepper = Rattle() if course.stepper is None else course.stepper
         stepper.check(system)
         start = system.initial_state(problem.x, problem.v, project=course.project)
-        return _Intact(system, start, stepper, course.dt, course.steps)
+        return _Intact(system, start, stepper, course.dt)
 
     def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
         return run.system.kinetic_energy(v)
@@ -68,19 +67,15 @@ class Core(Program):
 class _Intact(OnArrays):
     """Each step by itself; one that fails must leave the state before it as it was."""
 
-    @property
-    def system(self) -> System:
-        return self._system
-
-    def march(self, steps: int) -> None:
+    def advance(self, steps: int = 1) -> None:
         for _ in range(steps):
             x, v = self.observe()
             kept = (x.tobytes(), v.tobytes()) if len(x) < 100 else None
             try:
-                self.advance()
+                super().advance()
             except KconsError as error:
                 if kept and (x.tobytes(), v.tobytes()) != kept:
-                    raise NotIntactError(f"the state before step {self._done + 1} was changed") from error
+                    raise NotIntactError(f"the state before step {self.done + 1} was changed") from error
                 raise
 
 
@@ -138,7 +133,7 @@ class PlainAse(Program):
         if course.stepper is not None:
             raise CannotExpressError("one scheme only")
         atoms = self.atoms(problem, project=course.project)
-        return _AsRun(atoms, self.dynamics(atoms, course.dt), course.dt, course.steps)
+        return _AsRun(atoms, self.dynamics(atoms, course.dt), course.dt)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         return int(self.atoms(problem).get_number_of_degrees_of_freedom())
@@ -147,10 +142,10 @@ class PlainAse(Program):
 class _AsRun(InAse):
     """As a person does who looks at every step."""
 
-    def march(self, steps: int) -> None:
+    def advance(self, steps: int = 1) -> None:
         for _ in range(steps):
-            self._dynamics.run(1)
-        self._done += steps
+            self.dynamics.run(1)
+        self.done += steps
 
 
 class KconsInAse(PlainAse):
@@ -283,7 +278,7 @@ class PlainOpenMM(Program):
         system, integrator, part = self.build(problem, course.dt)
         context = self.context(system, integrator)
         self.start(problem, context, part, course.dt, course.project)
-        return InOpenMM(context, integrator, course.dt, course.steps)
+        return InOpenMM(context, integrator, course.dt)
 
     def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
         return float(run.context.getState(energy=True).getKineticEnergy()._value)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-SCRIPT = Path(__file__).parent.parent.parent / "examples" / "08_openmm_constraints.py"
+SCRIPT = Path(__file__).parent.parent.parent / "examples" / "studies" / "openmm_constraints.py"
 
 
 def _example():

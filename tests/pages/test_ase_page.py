@@ -16,7 +16,7 @@ def results():
 
 
 def test_page_shows_the_committed_results():
-    assert printed("05_ase_dynamics.py", "ase_dynamics.json") in page("ase.md")
+    assert printed("studies/ase_dynamics.py", "ase_dynamics.json") in page("ase.md")
 
 
 def test_all_of_it_was_measured(results):

@@ -37,7 +37,7 @@ def agree(pairs, most=3.5):
 
 def test_the_page_shows_them():
     text = page("constant_pressure.md")
-    for script in ("34_constant_pressure.py", "38_constant_pressure_water.py"):
+    for script in ("studies/constant_pressure.py", "studies/constant_pressure_water.py"):
         for line in printed(script, "constant_pressure.json").split("\n"):
             assert line in text, line
 
@@ -115,7 +115,7 @@ def test_the_crystal_is_the_same_along_all_axes():
 @pytest.mark.validation
 def test_a_fluid_anew():
     """Against the committed volume."""
-    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "34_constant_pressure.py")
+    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "studies/constant_pressure.py")
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
     found = example.run_fluid("dumbbells", "Monte Carlo", "isokinetic", 20_000, seed=9)

@@ -11,7 +11,7 @@ RESULTS = FOLDER / "openmm_four_femtoseconds.json"
 
 
 def test_page_shows_the_committed_results():
-    assert printed("24_openmm_four_femtoseconds.py", RESULTS.name) in page("openmm_platforms.md")
+    assert printed("studies/openmm_four_femtoseconds.py", RESULTS.name) in page("openmm_platforms.md")
 
 
 def test_rows_stay_and_energy_is_what_the_page_says():

@@ -15,7 +15,7 @@ RESULTS = FOLDER / "openmm_heavy_hydrogens.json"
 
 @pytest.fixture(scope="module")
 def example():
-    return runpy.run_path(str(ROOT / "examples" / "25_openmm_heavy_hydrogens.py"))
+    return runpy.run_path(str(ROOT / "examples" / "studies/openmm_heavy_hydrogens.py"))
 
 
 def test_langevin_reports_what_harmonic_vibrations_say_and_300_k_half_a_kick_later(example):
@@ -64,7 +64,7 @@ def off(part, name, fs, key):
 
 
 def test_page_shows_the_committed_results():
-    assert printed("25_openmm_heavy_hydrogens.py", RESULTS.name) in page("openmm_models.md")
+    assert printed("studies/openmm_heavy_hydrogens.py", RESULTS.name) in page("openmm_models.md")
 
 
 @pytest.mark.parametrize("constraints", ["HBonds", "AllBonds"])

@@ -23,10 +23,10 @@ FAR = {row["name"]: row for row in REACH["pairs to 7 A, long waves"]["water"]}
 
 
 def test_page_shows_the_committed_results():
-    small, cost = printed("31_long_steps.py", "long_steps.json").split("\n\n")
-    for part in (small, cost, *printed("39_long_steps_water.py", "long_steps.json").split("\n\n")):
+    small, cost = printed("studies/long_steps.py", "long_steps.json").split("\n\n")
+    for part in (small, cost, *printed("studies/long_steps_water.py", "long_steps.json").split("\n\n")):
         assert part in page("long_steps.md")
-    assert printed("41_long_steps_reach.py", "long_steps.json") in page("long_steps.md")
+    assert printed("studies/long_steps_reach.py", "long_steps.json") in page("long_steps.md")
 
 
 @pytest.mark.parametrize("key", [key for key in SMALL if not key[2]], ids=lambda key: f"{key[0]} {key[1]}")
@@ -156,7 +156,7 @@ def test_spheres_at_32_fs_are_right_with_long_waves_inside():
 )
 def test_spheres_with_inner_steps_of_2_fs_are_right(splitting, name, seeds, energy):
     """Means over seeds: the energy as near as must be, both temperatures within 1 %, and errors that can tell."""
-    means = script("41_long_steps_reach").over_seeds(REACH[splitting]["water"], RESULT["reach"]["reference"])
+    means = script("studies/long_steps_reach").over_seeds(REACH[splitting]["water"], RESULT["reach"]["reference"])
     (row,) = (row for row in means if row["name"].startswith(f"{name}, inner 2"))
     assert row["seeds"] == seeds and abs(row["bias"][0]) <= energy and row["bias"][1] <= 0.15
     for kind in ("shift", "turn"):
@@ -173,7 +173,7 @@ def test_inner_steps_of_2_fs_cool_turns_a_little():
         for (inner, *rest), fine in turns.items():
             coarse = turns.get((4, *rest), [])
             if inner == 2 and coarse:
-                (new, doubt), (old, more) = map(script("41_long_steps_reach").mean, (fine, coarse))
+                (new, doubt), (old, more) = map(script("studies/long_steps_reach").mean, (fine, coarse))
                 pairs.append((new - old, math.hypot(doubt, more)))
     weights = [1 / error**2 for _, error in pairs]
     mean = sum(w * off for w, (off, _) in zip(weights, pairs, strict=True)) / sum(weights)
@@ -207,7 +207,7 @@ def script(name):
 
 def test_long_waves_are_what_pairs_leave():
     """Of all the stiffness: less than a twentieth is left by both, a tenth and more by damped pairs alone."""
-    example = script("41_long_steps_reach")
+    example = script("studies/long_steps_reach")
     left = []
     for waves in (0, 14):
         method = example.Method("langevin", 5, 16, waters=64, switch=(4.0, 6.0), damp=0.4, waves=waves)
@@ -220,7 +220,7 @@ def test_long_waves_are_what_pairs_leave():
 @pytest.mark.parametrize("kind", ["split", "axes", "cluster"])
 def test_spheres_against_metropolis(kind):
     """As the example does, shorter; the wrong radius is far off."""
-    example = script("31_long_steps")
+    example = script("studies/long_steps")
     known = example.metropolis(1000, 2000)
     for wrong in (False, True):
         found = example.small_run(kind, 1, 64, wrong, 6000)

@@ -11,7 +11,7 @@ RESULT = json.loads((FOLDER / "monte_carlo.json").read_text(encoding="utf-8"))
 
 
 def test_the_page_shows_them():
-    assert printed("32_hamiltonian_monte_carlo.py", "monte_carlo.json") in page("monte_carlo.md")
+    assert printed("studies/hamiltonian_monte_carlo.py", "monte_carlo.json") in page("monte_carlo.md")
 
 
 def test_distributions_are_those_of_quadrature_and_of_metropolis():

@@ -6,4 +6,4 @@ from committed_pages import page, printed
 
 
 def test_page_shows_the_committed_results():
-    assert printed("08_openmm_constraints.py", "openmm_constraints.json") in page("openmm_constraints.md")
+    assert printed("studies/openmm_constraints.py", "openmm_constraints.json") in page("openmm_constraints.md")

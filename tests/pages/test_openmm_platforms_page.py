@@ -12,7 +12,7 @@ RESULT = json.loads(FILE.read_text(encoding="utf-8"))
 
 
 def test_page_shows_the_committed_results():
-    assert printed("23_openmm_platforms.py", FILE.name) in page("openmm_platforms.md")
+    assert printed("studies/openmm_platforms.py", FILE.name) in page("openmm_platforms.md")
 
 
 def test_rattle_has_the_speed_of_verlet_and_drifts_no_more():
@@ -34,7 +34,7 @@ def test_rattle_has_the_speed_of_verlet_and_drifts_no_more():
 
 def test_rattle_drifts_no_more_than_verlet_on_opencl():
     file = FILE.with_name("openmm_mixed_drift.json")
-    assert printed("23_openmm_platforms.py", file.name) in page("openmm_platforms.md")
+    assert printed("studies/openmm_platforms.py", file.name) in page("openmm_platforms.md")
     (part,) = json.loads(file.read_text(encoding="utf-8"))["measurements"]
     assert "Villin in water" in part["title"] and "OpenCL, mixed precision" in part["title"]
     verlet = part["rows"]["VerletIntegrator"]["drift"]

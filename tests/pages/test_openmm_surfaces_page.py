@@ -6,4 +6,4 @@ from committed_pages import page, printed
 
 
 def test_page_shows_the_committed_results():
-    assert printed("09_openmm_surfaces.py", "openmm_surfaces.json") in page("openmm_surfaces.md")
+    assert printed("studies/openmm_surfaces.py", "openmm_surfaces.json") in page("openmm_surfaces.md")

@@ -14,7 +14,7 @@ RESULTS = FOLDER / "openmm_thermostats.json"
 
 def test_page_shows_the_committed_results():
     shown = page("openmm.md")
-    for line in printed("12_openmm_thermostats.py", "openmm_thermostats.json").splitlines():
+    for line in printed("studies/openmm_thermostats.py", "openmm_thermostats.json").splitlines():
         assert line in shown
 
 
@@ -60,5 +60,5 @@ def test_kinetic_energies_under_a_chain_are_those_of_the_degrees_of_freedom():
 @pytest.mark.validation
 def test_kinetic_energies_anew():
     """The committed runs once more, three minutes."""
-    example = runpy.run_path(str(ROOT / "examples" / "12_openmm_thermostats.py"))
+    example = runpy.run_path(str(ROOT / "examples" / "studies/openmm_thermostats.py"))
     _within_three_errors(example["kinetic"](True)["rows"])

@@ -21,7 +21,7 @@ def off(method, step, friction, kind="turn"):
 
 def test_page_shows_the_committed_results():
     assert RESULT["full"]
-    assert printed("40_peptide_steps.py", "solvated_peptide.json") in page("step_length.md")
+    assert printed("studies/peptide_steps.py", "solvated_peptide.json") in page("step_length.md")
 
 
 def test_nothing_stops_and_shifts_are_right_up_to_16_fs():

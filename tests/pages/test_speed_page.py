@@ -8,8 +8,8 @@ from committed_pages import FOLDER, page, printed
 
 
 def test_page_shows_the_committed_results():
-    assert printed("03_engine_speed.py", "engine_speed.json") in page("speed.md")
-    assert printed("03_engine_speed.py", "certificate.json") in page("speed.md")
+    assert printed("studies/engine_speed.py", "engine_speed.json") in page("speed.md")
+    assert printed("studies/engine_speed.py", "certificate.json") in page("speed.md")
 
 
 def test_certificates_take_no_more_than_one_per_cent():

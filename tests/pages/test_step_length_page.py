@@ -22,7 +22,7 @@ RUNS = {(run["method"], run["step"], round(1000 * run["friction"])): run for run
 
 def test_page_shows_the_committed_results():
     assert RESULT["full"]
-    assert printed("33_step_length.py", FILE.name) in page("step_length.md")
+    assert printed("studies/step_length.py", FILE.name) in page("step_length.md")
 
 
 @pytest.mark.parametrize("run", of_group("velocities"), ids=lambda run: f"{run['step']:g} fs")

@@ -25,7 +25,7 @@ ENERGIES = {m["fluid"]: m["energy"] for m in of_group("metropolis")}
 
 
 @pytest.mark.parametrize(
-    "script, file", [("10_thermostats.py", FILE), ("22_thermostat_cost.py", COST)], ids=["sampling", "cost"]
+    "script, file", [("studies/thermostats.py", FILE), ("studies/thermostat_cost.py", COST)], ids=["sampling", "cost"]
 )
 def test_page_shows_the_committed_results(script, file):
     assert printed(script, file.name) in page("thermostats.md")
@@ -109,7 +109,7 @@ def test_nothing_is_missing():
 @pytest.mark.parametrize("system", ["rigid water", "chains"])
 def test_physical_validation_anew(system, thermostat):
     """The committed runs once more; needs the package physical_validation."""
-    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "10_thermostats.py")
+    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "studies/thermostats.py")
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
     judged(example.judged(system, thermostat, 100_000))

@@ -2,11 +2,12 @@
 
 from importlib.util import find_spec
 
+import peers
 import pytest
 
-from kcons.comparison import test_systems
-from kcons.comparison.work_precision import measure
+from kcons.comparison import compare, observed_orders, test_systems
 
+peers.add_all()
 PACKAGES = {"mici": "mici", "mici-tight": "mici", "dae-radau": "scipy_dae", "dae-ida": "sksundae"}
 
 
@@ -20,17 +21,15 @@ def need(name):
 
 def measured(system, name):
     need(name)
-    found = measure.compare(system, methods=[name], budget=60)
-    assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
+    found = compare(system, [name], budget=60, rounds=0)
+    assert set(found.status) == {"ok"}, list(found.note)
     return found
 
 
 def check_order_two(name, system):
     """RATTLE, whoever does it: order two, and the same trajectory to the last digits that are asked for."""
     built = test_systems.build(system, {"chain": 6, "sphere": 2}.get(system)).shortened(2)
-    found = measured(built, name)
-    assert found.observed_order(name) == pytest.approx(2.0, abs=0.1)
-    ours = measure.compare(built, methods=["rattle"]).of("rattle")
-    for mine, theirs in zip(ours, found.of(name), strict=True):
-        assert theirs.error == pytest.approx(mine.error, rel=1e-5)
-        assert theirs.evaluations_per_time == pytest.approx(mine.evaluations_per_time)
+    found, ours = measured(built, name), measured(built, "rattle")
+    assert list(observed_orders(found).values()) == pytest.approx([2.0], abs=0.1)
+    assert list(found.error) == pytest.approx(list(ours.error), rel=1e-5)
+    assert list(found.evaluations) == pytest.approx(list(ours.evaluations))

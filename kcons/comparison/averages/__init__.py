@@ -6,5 +6,5 @@
 - `step_zero`: averages at step zero
 - `trajectory_temperatures`: those of a trajectory of any engine
 - `volumes`: series at constant pressure, and what a barostat costs
-- `report`: tables, plots and files
+- `ranking`, `report`: which thermostat; tables, plots and files
 """

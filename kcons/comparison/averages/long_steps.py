@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from kcons.comparison.averages.layers import Layers
-from kcons.comparison.study.machine import environment
+from kcons.comparison.machine import environment
 from kcons.comparison.study.study import Watcher, interruptible, picked
 from kcons.comparison.test_systems.system import Units
 from kcons.constraints.arguments import positive

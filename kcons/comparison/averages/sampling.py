@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kcons.comparison.averages.step_zero import Extrapolated, extrapolate
-from kcons.comparison.study.machine import environment
+from kcons.comparison.machine import environment
 from kcons.comparison.study.study import Watcher, interruptible, picked
 from kcons.comparison.test_systems.fluid import Fluid
 from kcons.constraints.compilation import clock

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.study import json_files
-from kcons.comparison.study.machine import processor_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,14 +21,3 @@ def write(folder: Path, name: str, data: Mapping[str, Any], figure: Figure, tabl
         written.append(folder / f"{name}.txt")
         written[2].write_text("\n".join(tables) + "\n", encoding="utf-8")
     return written
-
-
-def made_by(result: Mapping[str, Any]) -> str:
-    """Where, when and with what a study was made, in words."""
-    about = result["environment"]
-    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items() if version)
-    return (
-        f"{about['date']}, commit {about['commit']}, kcons {result['made_by']['version']}\n"
-        f"{processor_of(about)}, {about['cores']} cores, one thread; Python {about['python']}\n{versions}\n"
-        + ("quick: shortened runs" if result["made_by"]["quick"] else "full runs")
-    )

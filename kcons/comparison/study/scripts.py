@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console
 
+from kcons.comparison.machine import environment
 from kcons.comparison.study import json_files
-from kcons.comparison.study.machine import environment, stamp
 from kcons.comparison.study.study import Kept, picked
 from kcons.comparison.study.tables import Table, terminal
 from kcons.constraints.target import FloatArray
@@ -144,7 +144,7 @@ def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick
         Gets `quick`, `keep`, which takes what has been measured so far, and `earlier`, what the file has or None.
     quick : bool
     """
-    kept = Kept(out, stamp(quick=quick))
+    kept = Kept(out, {"commit": environment()["commit"], "quick": quick})
     earlier = {name: value for name, value in kept.earlier().items() if name not in kept.head}
     return measure(quick=quick, keep=kept.put, earlier=earlier or None)
 

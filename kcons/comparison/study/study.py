@@ -11,37 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from kcons.comparison.machine import environment
+from kcons.comparison.progress import Watcher
 from kcons.comparison.study import json_files
-from kcons.comparison.study.machine import environment
 from kcons.errors import InputError, did_you_mean
 
 Name = TypeVar("Name")
 Found = TypeVar("Found")
-
-
-class Watcher:
-    """Receives progress. This one shows nothing; that of the command line shows progress bars."""
-
-    def begin(self, what: str, total: float) -> None:
-        """A piece of work of `total` units starts."""
-
-    def advance(self, done: float) -> None:
-        """So much of it is done."""
-
-    def end(self) -> None:
-        """It is over."""
-
-    def overall(self, what: str, done: float, total: float) -> None:
-        """A part of a longer run starts; `done` of the `total` expected seconds of the run have passed."""
-
-    @contextmanager
-    def piece(self, what: str, total: float) -> Iterator[None]:
-        """A piece of work of `total` units, which is over at the end of the block."""
-        self.begin(what, total)
-        try:
-            yield
-        finally:
-            self.end()
 
 
 @contextmanager
@@ -70,7 +46,7 @@ class Kept:
     path : Path or None
         None: nothing is kept.
     made_by : mapping
-        From `kcons.comparison.study.machine.stamp`.
+        Code and settings.
     form : str, optional
         The entry 'format' of the file.
     under : str

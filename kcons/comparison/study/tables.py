@@ -1,4 +1,4 @@
-"""A table, and what writes it: to the terminal, as plain text, in Markdown. `html_page` puts it into a page."""
+"""A table, and what writes it: to the terminal, as plain text, in Markdown."""
 
 from __future__ import annotations
 

@@ -59,5 +59,5 @@ def test_results_are_written_here_alone():
     files = [*(root / "kcons" / "comparison").rglob("*.py"), *(root / "kcons" / "cli").rglob("*.py")]
     files += [*(root / "kcons" / "mdanalysis").rglob("*.py"), *(root / "examples").rglob("*.py")]
     found = {path.name for path in files if "json.dump" in path.read_text(encoding="utf-8")}
-    assert found == {"scaling.py", "main.py", "21_check_speed.py", "doctor.py", "interactive.py"}
+    assert found == {"scaling.py", "main.py", "studies/check_speed.py", "doctor.py", "interactive.py"}
     assert not [path.name for path in files if "write_text(json" in path.read_text(encoding="utf-8")]

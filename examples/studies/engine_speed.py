@@ -1,0 +1,560 @@
+"""How fast is the engine, and how exact? Every shape it has a solver for, against the MD engines' own constraints.
+
+    python engine_speed.py                  small systems, a minute
+    python engine_speed.py --full --out F   all sizes and slow peers, four minutes; F receives JSON
+    python engine_speed.py --certificates   only what certificates take of a run
+
+Times are medians of repeats in one process, one thread, warm. P is the position projection, V the velocity
+projection, both through the public calls of `Motion`, checks included; each P starts from a fresh thermal
+displacement of 2 fs at 300 K. 'bare' is a plain velocity-Verlet update of the same arrays, compiled by Numba, in
+the same run: kick and drift, then kick.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from ase import Atoms
+from ase.calculators.calculator import Calculator, all_changes
+from ase.constraints import FixBondLengths
+from ase.md.verlet import VelocityVerlet
+from rich.console import Console
+
+import kcons
+from kcons import ConstraintSet, State, System
+from kcons.ase import constrain
+from kcons.comparison import environment, processor_of, scripts, system_of
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
+from kcons.motion import Motion
+from kcons.plan import make_plan
+from kcons.solvers import SparseDistances
+
+KT = 2.494e-4  # 300 K in amu Å²/fs²
+STEP = 2.0  # fs
+DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+
+
+# -- systems: positions (Å), masses (amu), pairs --------------------------------------------------
+
+
+def scattered(molecule: np.ndarray, n: int, spacing: float, seed: int) -> np.ndarray:
+    """Copies of a molecule on a lattice, turned at random."""
+    turns = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, 3, 3)))[0]
+    edge = int(np.ceil(n ** (1 / 3)))
+    grid = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), -1).reshape(-1, 3)[:n] * spacing
+    return np.ascontiguousarray((np.einsum("nij,kj->nki", turns, molecule) + grid[:, None]).reshape(-1, 3))
+
+
+def water(n: int) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
+    """Rigid TIP3P molecules."""
+    x = scattered(np.array([[0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]]), n, 3.1, 1)
+    o = 3 * np.arange(n)
+    pairs = np.concatenate([np.c_[o, o + 1], np.c_[o, o + 2], np.c_[o + 1, o + 2]])
+    return x, np.tile([15.999, 1.008, 1.008], n), [Distance(pairs)]
+
+
+def groups(n: int, hydrogens: int) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
+    """X-H, CH2 or CH3 groups with their C-H bonds held."""
+    ends = 1.09 * np.array([[0.943, 0, 0.333], [-0.471, 0.816, 0.333], [-0.471, -0.816, 0.333]])[:hydrogens]
+    x = scattered(np.vstack([np.zeros(3), ends]), n, 4.0, 2)
+    first = (hydrogens + 1) * np.arange(n)
+    pairs = np.concatenate([np.c_[first, first + h] for h in range(1, hydrogens + 1)])
+    return x, np.tile([12.011, *[1.008] * hydrogens], n), [Distance(pairs)]
+
+
+def chain(bonds: int, kind: str) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
+    """Open chain of equal bonds."""
+    rng = np.random.default_rng(3)
+    if kind == "freely jointed":
+        u = rng.normal(size=(bonds, 3))
+        u /= np.linalg.norm(u, axis=1)[:, None]
+    elif kind == "straight":
+        u = np.tile([1.0, 0, 0], (bonds, 1))
+    else:
+        half = np.deg2rad({"zigzag": 111.0, "175 degrees": 175.0}[kind] / 2)
+        u = np.zeros((bonds, 3))
+        u[:, 0] = np.sin(half)
+        u[::2, 1], u[1::2, 1] = np.cos(half), -np.cos(half)
+    x = np.vstack([np.zeros(3), np.cumsum(1.53 * u, axis=0)])
+    x -= x.mean(axis=0)
+    return x, np.full(bonds + 1, 14.0), [Distance(np.c_[np.arange(bonds), np.arange(1, bonds + 1)])]
+
+
+def tree(carbons: int) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
+    """Polymethylene with all its bonds held: a tree."""
+    spine, _, _ = chain(carbons - 1, "zigzag")
+    side = np.where(np.arange(carbons) % 2 == 0, 0.6, -0.6)
+    x = np.empty((3 * carbons, 3))
+    x[0::3] = spine
+    x[1::3] = spine + np.c_[0 * side, -side, np.full(carbons, 0.9)]
+    x[2::3] = spine + np.c_[0 * side, -side, np.full(carbons, -0.9)]
+    c = 3 * np.arange(carbons)
+    pairs = np.concatenate([np.c_[c, c + 1], np.c_[c, c + 2], np.c_[c[:-1], c[1:]]])
+    return x, np.tile([12.011, 1.008, 1.008], carbons), [Distance(pairs)]
+
+
+def protein(held: str) -> tuple[np.ndarray, np.ndarray, list[Constraint], Any]:
+    """Dihydrofolate reductase (5DFR, 2489 atoms) under amber99sb; also its OpenMM System."""
+    import openmm.unit as unit
+    from openmm import app
+
+    pdb = app.PDBFile(str(DATA / "5dfr_minimized.pdb"))
+    choice = {"all bonds": app.AllBonds, "bonds and H angles": app.HAngles, "mixed": app.AllBonds}[held]
+    system = app.ForceField("amber99sb.xml").createSystem(pdb.topology, constraints=choice, rigidWater=False)
+    table = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    pairs = np.array([[i, j] for i, j, _ in table])
+    lengths = np.array([d.value_in_unit(unit.angstrom) for _, _, d in table])
+    masses = np.array([system.getParticleMass(i).value_in_unit(unit.dalton) for i in range(system.getNumParticles())])
+    x = np.ascontiguousarray(pdb.getPositions(asNumpy=True).value_in_unit(unit.angstrom))
+    constraints: list[Constraint] = [Distance(pairs, lengths)]
+    if held == "mixed":
+        constraints += _more_rows(pairs, masses)
+    return x, masses, constraints, system
+
+
+def _more_rows(pairs: np.ndarray, masses: np.ndarray) -> list[Constraint]:
+    """Angles at CH2 groups outside of rings, dihedrals about their bonds, and some atoms held in planes."""
+    neighbours: dict[int, list[int]] = {}
+    for i, j in pairs.tolist():
+        neighbours.setdefault(i, []).append(j)
+        neighbours.setdefault(j, []).append(i)
+    heavy = {a: [b for b in bonded if masses[b] > 2] for a, bonded in neighbours.items() if masses[a] > 2}
+    centres = [
+        a for a, bonded in heavy.items() if len(bonded) == 2 and len(neighbours[a]) == 4 and not _in_ring(a, heavy)
+    ]
+    angles = [(heavy[a][0], a, heavy[a][1]) for a in centres]
+    angles += [(next(b for b in neighbours[a] if masses[b] < 2), a, heavy[a][0]) for a in centres]
+    dihedrals = [
+        (heavy[a][0], a, b, next(c for c in heavy[b] if c != a))
+        for a in centres[::2]
+        for b in heavy[a][1:]
+        if len(heavy[b]) > 1 and heavy[a][0] not in heavy[b]
+    ]
+    planes = list(range(0, len(masses), 15))
+    return [Angle(angles), Dihedral(dihedrals), Plane(planes, [0.0, 0.0, 1.0])]
+
+
+def _in_ring(centre: int, heavy: dict[int, list[int]]) -> bool:
+    """Whether one neighbour of the centre is reached from the other in five bonds without it."""
+    first, goal = heavy[centre]
+    reached = {first}
+    for _ in range(5):
+        reached |= {b for a in reached for b in heavy[a] if b != centre}
+    return goal in reached
+
+
+# -- measuring ------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True)
+def _kick_and_drift(x, v, f, w, dt):  # type: ignore[no-untyped-def]
+    for i in range(x.shape[0]):
+        for axis in range(3):
+            v[i, axis] += 0.5 * dt * w[i] * f[i, axis]
+            x[i, axis] += dt * v[i, axis]
+
+
+@numba.njit(cache=True)
+def _kick(v, f, w, dt):  # type: ignore[no-untyped-def]
+    for i in range(v.shape[0]):
+        for axis in range(3):
+            v[i, axis] += 0.5 * dt * w[i] * f[i, axis]
+
+
+def median(call: Callable[[], Any], reset: Callable[[], Any], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        reset()
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def bare(n_atoms: int, repeats: int = 60) -> float:
+    """Seconds of a velocity-Verlet update of n_atoms atoms."""
+    x = np.random.default_rng(0).random((n_atoms, 3))
+    v, f, w = 0.01 * x, x.copy(), np.ones(n_atoms)
+
+    def update() -> None:
+        _kick_and_drift(x, v, f, w, 1e-9)
+        _kick(v, f, w, 1e-9)
+
+    update()
+    return median(update, lambda: None, repeats)
+
+
+def measure(name: str, x: np.ndarray, masses: np.ndarray, constraints: list[Constraint], path: str = "") -> dict:
+    """P and V of one system through `Motion`; `path='generic'` puts chains on the sparse solver."""
+    start = time.perf_counter()
+    held = ConstraintSet(constraints, x, masses)
+    motion = Motion(held, x)
+    setup = time.perf_counter() - start
+    held = motion.constraint_set
+    if path == "generic":
+        _use_sparse(motion, x)
+    x = motion.restore_positions(x)
+    thermal = np.random.default_rng(5).normal(size=x.shape) * np.sqrt(KT / masses)[:, None]
+    fresh = x + STEP * motion.project_velocities(x, thermal)
+    moved = motion.project_positions(fresh, x)
+    tangent = motion.project_velocities(moved, thermal)
+    sigma = np.abs(held.value(moved))
+    jacobian = held.jacobian(moved)
+    norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
+    rms = np.sqrt(np.mean(np.sum(tangent**2, axis=1)))
+    repeats = int(np.clip(3e6 / held.n_rows, 7, 200))
+    work, speed = fresh.copy(), thermal.copy()
+    p = median(lambda: motion.project_positions(work, x, out=work), lambda: np.copyto(work, fresh), repeats)
+    v = median(lambda: motion.project_velocities(moved, speed, out=speed), lambda: np.copyto(speed, thermal), repeats)
+    plain = bare(len(x), repeats)
+    return {
+        "name": name,
+        "rows": held.n_rows,
+        "atoms": len(x),
+        "solvers": sorted({kind.solver for kind in motion.plan.kinds}),
+        "setup_s": setup,
+        "p_ns": p / held.n_rows * 1e9,
+        "v_ns": v / held.n_rows * 1e9,
+        "bare_ns_atom": plain / len(x) * 1e9,
+        "ratio_to_bare": (p + v) / plain,
+        "sigma_over_tolerance": float(np.max(sigma / held.tolerance(moved))),
+        "relative_error": float(np.max(sigma / held.scale)),
+        "velocity_error": float(np.max(np.abs(jacobian @ tangent.ravel()) / norms) / rms),
+    }
+
+
+def _use_sparse(motion: Motion, x: np.ndarray) -> None:
+    """Replace the chain solver of a plan by the sparse one."""
+    held = motion.constraint_set
+    (item,) = held.constraints
+    plan = make_plan(held, x, 0.0)
+    sparse = SparseDistances(np.arange(held.n_rows), item.atoms, held.target(), plan.inverse_masses)
+    motion.plan.solvers[:] = [sparse]
+    motion.plan.kinds[:] = [type(k)("sparse", k.clusters, k.rows, k.rank, k.example) for k in plan.kinds]
+
+
+# -- peers ----------------------------------------------------------------------------------------
+
+
+def openmm_constraints(x: np.ndarray, masses: np.ndarray, system: Any, tolerance: float, repeats: int) -> dict:
+    """Time of OpenMM's own constraint algorithms alone: a CustomIntegrator with and without them, CPU platform."""
+    import openmm
+    from openmm import unit
+
+    from kcons.openmm import positions_of, velocities_of
+
+    table = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    pairs = [(i, j) for i, j, _ in table]
+    angles = []
+    for force in system.getForces():
+        if isinstance(force, openmm.HarmonicAngleForce):  # CCMA takes its coupling from it
+            angles.append(openmm.HarmonicAngleForce())
+            angles[-1].setForceGroup(1)
+            for k in range(force.getNumAngles()):
+                angles[-1].addAngle(*force.getAngleParameters(k))
+    lengths = np.array([d.value_in_unit(unit.nanometer) for _, _, d in table])
+    bare_system = system_of(masses, *angles, pairs=pairs, lengths=lengths)
+    integrators, contexts = {}, {}
+    for what in ("neither", "positions", "velocities"):
+        integrator = openmm.CustomIntegrator(0.001 * STEP)
+        integrator.setConstraintTolerance(tolerance)
+        integrator.setIntegrationForceGroups({0})
+        integrator.addPerDofVariable("x0", 0)
+        integrator.addPerDofVariable("v0", 0)
+        integrator.addComputePerDof("x", "x0 + dt*v0")
+        integrator.addComputePerDof("v", "v0")
+        if what == "positions":
+            integrator.addConstrainPositions()
+        if what == "velocities":
+            integrator.addConstrainVelocities()
+        platform = openmm.Platform.getPlatformByName("CPU")
+        context = openmm.Context(bare_system, integrator, platform, {"Threads": "1"})
+        context.setPositions(x * 0.1)
+        context.applyConstraints(1e-12)
+        start = positions_of(context)
+        thermal = np.random.default_rng(5).normal(size=x.shape) * np.sqrt(KT / masses)[:, None] * 100
+        context.setVelocities(thermal)
+        context.applyVelocityConstraints(1e-12)
+        tangent = velocities_of(context)
+        integrator.setPerDofVariableByName("x0", start)
+        # Velocities are drawn back onto the surface at the start, positions from a step along it.
+        integrator.setPerDofVariableByName("v0", thermal if what == "velocities" else tangent)
+        if what == "velocities":
+            integrator.setStepSize(0.0)
+        integrator.step(repeats)
+        integrators[what], contexts[what] = integrator, context
+    samples: dict[str, list[float]] = {what: [] for what in integrators}
+    for _ in range(15):
+        for what, integrator in integrators.items():
+            begin = time.perf_counter()
+            integrator.step(repeats)
+            samples[what].append((time.perf_counter() - begin) / repeats)
+    times = {what: float(np.median(values)) for what, values in samples.items()}
+    i, j = np.array(pairs).T
+    reached = positions_of(contexts["positions"])
+    n = len(pairs)
+    return {
+        "tolerance": tolerance,
+        "p_ns": (times["positions"] - times["neither"]) / n * 1e9,
+        "v_ns": (times["velocities"] - times["neither"]) / n * 1e9,
+        "relative_error": float(np.max(np.abs(np.linalg.norm(reached[i] - reached[j], axis=1) / lengths - 1))),
+    }
+
+
+def settle(n: int, repeats: int) -> dict:
+    """OpenMM's SETTLE on n rigid waters."""
+    x, masses, (rows,) = water(n)
+    i, j = rows.atoms.T
+    system = system_of(masses, pairs=rows.atoms, lengths=np.linalg.norm(x[i] - x[j], axis=1) * 0.1)
+    return openmm_constraints(x, masses, system, 1e-12, repeats)
+
+
+class Nothing(Calculator):
+    """No forces, in no time."""
+
+    implemented_properties = ("energy", "forces")
+
+    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):  # type: ignore[no-untyped-def]
+        super().calculate(atoms, properties, system_changes)
+        self.results = {"energy": 0.0, "forces": np.zeros((len(atoms), 3))}
+
+
+def ase_water(n: int, how: str) -> Atoms:
+    x, masses, (rows,) = water(n)
+    atoms = Atoms("OHH" * n, positions=x, masses=masses)
+    atoms.calc = Nothing()
+    speeds = np.random.default_rng(6).normal(size=x.shape) * np.sqrt(0.02585 / masses)[:, None]
+    if how == "kcons":
+        constrain(atoms, [rows])
+    elif how == "ase":
+        atoms.set_constraint(FixBondLengths(rows.atoms.tolist()))
+    atoms.set_velocities(speeds)
+    return atoms
+
+
+def ase_step(n: int, how: str, steps: int, repeats: int = 7) -> float:
+    """Seconds of a step of ASE's VelocityVerlet with a null calculator."""
+    dynamics = VelocityVerlet(ase_water(n, how), 0.1)
+    if steps > 1:
+        dynamics.run(steps)
+    return median(lambda: dynamics.run(steps), lambda: None, repeats) / steps
+
+
+def fix_bond_lengths(n: int) -> dict:
+    """P and V of ASE's FixBondLengths on n waters, once."""
+    free = ase_water(n, "free")
+    start = free.positions.copy()
+    held = free.copy()
+    constrain(held, [water(n)[2][0]])
+    held.set_momenta(free.get_momenta())
+    new = start + 0.2 * held.get_velocities()  # about 2 fs in ASE's unit
+    theirs = FixBondLengths(water(n)[2][0].atoms.tolist())
+    begin = time.perf_counter()
+    theirs.adjust_positions(free, new)
+    p = time.perf_counter() - begin
+    momenta = free.get_momenta()
+    begin = time.perf_counter()
+    theirs.adjust_momenta(free, momenta)
+    v = time.perf_counter() - begin
+    return {"waters": n, "p_s": p, "v_s": v, "p_plus_v_s": p + v}
+
+
+def one_bond(n_atoms: int) -> dict:
+    """One held bond among many free atoms: the engine's share of a step."""
+    rng = np.random.default_rng(7)
+    x = rng.random((n_atoms, 3)) * 100
+    x[1] = x[0] + [1.0, 0, 0]
+    v = rng.normal(size=x.shape) * 1e-3
+    motion = Motion(ConstraintSet(Distance([0, 1]), x, np.full(n_atoms, 12.0)), x)
+    new = x + v
+
+    def both() -> None:
+        motion.project_positions(new, x, out=new)
+        motion.project_velocities(new, v, out=v)
+
+    both()
+    return {"atoms": n_atoms, "p_plus_v_us": median(both, lambda: None, 300) * 1e6}
+
+
+def first_call() -> dict:
+    """Import, and the first call of a fresh installation (kernels compiled), each in a process of its own."""
+    script = (
+        "import time; t = time.perf_counter(); import kcons; a = time.perf_counter() - t\n"
+        "import numpy as np; from kcons.constraints import Distance\n"
+        "x = np.array([[0, 0, 0], [0.9572, 0, 0], [-0.24, 0.9266, 0]]); t = time.perf_counter()\n"
+        "m = kcons.Motion(kcons.ConstraintSet(Distance([(0, 1), (0, 2), (1, 2)]), x, [16.0, 1.0, 1.0]), x)\n"
+        "m.project_positions(x + 0.01 * x**2, x); m.project_velocities(x, x[::-1]); print(a, time.perf_counter() - t)\n"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
+        times = []
+        for _ in range(6):
+            done = subprocess.run(
+                [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+            )
+            times.append([float(word) for word in done.stdout.split()])
+    imports, first = np.array(times).T
+    return {
+        "import_s": float(np.median(imports[1:])),
+        "first_call_s": float(first[0]),
+        "first_call_cached_s": float(np.median(first[1:])),
+    }
+
+
+def certificate(name: str, x: np.ndarray, masses: np.ndarray, constraints: list[Constraint], seconds: float) -> dict:
+    """What certificates take of a run without forces, by RATTLE with the default of `check_every`."""
+    motion = Motion(ConstraintSet(constraints, x, masses), x)
+    certify, spent = motion.certify, []
+
+    def timed(*args: Any) -> None:
+        begin = time.perf_counter()
+        certify(*args)
+        spent.append(time.perf_counter() - begin)
+
+    motion.certify = timed  # type: ignore[method-assign]
+    v = motion.project_velocities(x, 1e-3 * np.random.default_rng(3).normal(size=x.shape))
+    system, state = System(motion), State(x, v)
+    state = kcons.run(system, state, 0.5, 1001)  # the first is not representative: caches are cold
+    spent.clear()
+    done, begin = 0, time.perf_counter()
+    while (passed := time.perf_counter() - begin) < seconds:
+        state = kcons.run(system, state, 0.5, 2000)
+        done += 2000
+    return {
+        "name": name, "rows": motion.constraint_set.n_rows, "steps": done, "step_us": passed / done * 1e6,
+        "certificates": len(spent), "certificate_us": float(np.median(spent)) * 1e6, "share": sum(spent) / passed,
+    }  # fmt: skip
+
+
+def certificates(full: bool) -> dict:
+    seconds = 10.0 if full else 0.2
+    bent = np.array([[0.0, 0, 0], [1.1, 0.2, 0], [1.5, 1.3, 0.3], [2.6, 1.5, 1.1]])
+    angles = [Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2], [1, 2, 3]])]
+    rows = [
+        certificate("one bond", bent[:2], np.array([12.0, 16.0]), [Distance([[0, 1]])], seconds),
+        certificate("four atoms, bonds and angles", bent, np.full(4, 12.0), angles, seconds),
+        certificate("rigid water, 100 molecules", *water(100), seconds),
+        certificate("chain, zigzag, 1000 bonds", *chain(1000, "zigzag"), seconds),
+    ]
+    if full:
+        rows.append(certificate("rigid water, 10000 molecules", *water(10_000), seconds))
+    return {"machine": environment(), "full": full, "certificates": rows}
+
+
+def show_certificates(result: dict, console: Console) -> None:
+    headings = ("system", "rows", "steps", "step", "certificates", "each", "share")
+    table = scripts.table("Certificates in a run without forces", headings, {"system"})
+    table.add_row("", "", "", "µs", "", "µs", "%", end_section=True)
+    for r in result["certificates"]:
+        table.add_row(
+            r["name"], f"{r['rows']:,}", f"{r['steps']:,}", f"{r['step_us']:.1f}", f"{r['certificates']:,}",
+            f"{r['certificate_us']:.0f}", f"{100 * r['share']:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    machine = result["machine"]
+    console.print(f"{processor_of(machine)}, one thread; commit {machine['commit']}, {machine['date']}")
+
+
+# -- the run --------------------------------------------------------------------------------------
+
+
+def run(full: bool, console: Console) -> dict:
+    result: dict[str, Any] = {"machine": environment(), "full": full, "engine": [], "peers": {}}
+
+    def add(*args: Any, **kwargs: Any) -> None:
+        row = measure(*args, **kwargs)
+        result["engine"].append(row)
+        console.print(
+            f"{row['name']}: {row['p_ns']:.1f} + {row['v_ns']:.1f} ns a row, {row['ratio_to_bare']:.2f} × bare"
+        )
+
+    for n in (1_000, 10_000, 100_000) if full else (1_000,):
+        add(f"rigid water, {n} molecules", *water(n))
+    n = 10_000 if full else 1_000
+    for hydrogens, label in ((1, "X-H"), (2, "CH2"), (3, "CH3")):
+        add(f"{label}, {n} groups", *groups(n, hydrogens))
+    sizes = (1_000, 10_000, 100_000, 1_000_000) if full else (1_000,)
+    for kind in ("zigzag", "straight", "175 degrees", "freely jointed"):
+        for n in sizes:
+            add(f"chain, {kind}, {n} bonds", *chain(n, kind))
+    for n in sizes:
+        add(f"chain by the generic path, zigzag, {n} bonds", *chain(n, "zigzag"), path="generic")
+        add(f"tree (polymethylene), {n} bonds", *tree(n // 3))
+    if find_spec("openmm") is not None:
+        for held in ("all bonds", "bonds and H angles", "mixed") if full else ("all bonds",):
+            x, masses, constraints, system = protein(held)
+            add(f"DHFR, {held}", x, masses, constraints)
+            if held != "mixed" and full:
+                for tolerance in (1e-6, 1e-12):
+                    peer = openmm_constraints(x, masses, system, tolerance, 20)
+                    result["peers"][f"OpenMM CCMA, DHFR, {held}, {tolerance:g}"] = peer
+        result["peers"]["OpenMM SETTLE"] = settle(10_000 if full else 1_000, 20)
+    result["peers"]["ASE FixBondLengths"] = fix_bond_lengths(1_000 if full else 10)
+    result["ase_step"] = {
+        f"{n} waters": {how: ase_step(n, how, 50) for how in ("free", "kcons")}
+        for n in ((100, 1000) if full else (100,))
+    }
+    result["one_bond"] = one_bond(1_000_000 if full else 100_000)
+    if full:
+        result["first_call"] = first_call()
+    return result
+
+
+def exponent(rows: list[dict], start: str) -> float:
+    """Fitted exponent of P + V against the number of rows."""
+    points = [(r["rows"], r["rows"] * (r["p_ns"] + r["v_ns"])) for r in rows if r["name"].startswith(start)]
+    n, t = np.log(np.array(points)).T
+    return float(np.polyfit(n, t, 1)[0])
+
+
+def show(result: dict, console: Console) -> None:
+    headings = ("system", "solver", "rows", "P", "V", "P + V", "bare", "P + V", "σ/tol", "|Av|/v", "set-up")
+    table = scripts.table("Engine: time and error", headings, {"system", "solver"})
+    table.add_row("", "", "", "ns/row", "ns/row", "ns/row", "ns/atom", "× bare", "", "", "s", end_section=True)
+    for r in result["engine"]:
+        table.add_row(
+            r["name"], "+".join(r["solvers"]), f"{r['rows']:,}", f"{r['p_ns']:.1f}", f"{r['v_ns']:.1f}",
+            f"{r['p_ns'] + r['v_ns']:.1f}", f"{r['bare_ns_atom']:.2f}", f"{r['ratio_to_bare']:.2f}",
+            f"{r['sigma_over_tolerance']:.2f}", f"{r['velocity_error']:.0e}", f"{r['setup_s']:.3f}",
+        )  # fmt: skip
+    console.print(table)
+    machine = result["machine"]
+    versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "ase", "openmm"))
+    console.print(f"{processor_of(machine)}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
+    for name, peer in result["peers"].items():
+        console.print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in peer.items()))
+    for name, times in result["ase_step"].items():
+        console.print(
+            f"ASE VelocityVerlet, {name}: free {times['free'] * 1e6:.0f} µs, kcons {times['kcons'] * 1e6:.0f} µs, "
+            f"ratio {times['kcons'] / times['free']:.2f}"
+        )
+    console.print(f"one bond among {result['one_bond']['atoms']:,} atoms: {result['one_bond']['p_plus_v_us']:.1f} µs")
+    if result["full"]:
+        for start in ("chain, zigzag", "chain by the generic", "tree"):
+            console.print(f"exponent, {start}: {exponent(result['engine'], start):.3f}")
+        console.print(f"import and first call: {result['first_call']}")
+
+
+def main() -> None:
+    console = Console(width=150)
+    parser = scripts.options(__doc__, full="all sizes and the slow peers")
+    parser.add_argument("--certificates", action="store_true", help="only what certificates take of a run")
+    scripts.script(
+        parser,
+        lambda options: certificates(options.full) if options.certificates else run(options.full, console),
+        lambda result: (show_certificates if "certificates" in result else show)(result, console),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""`kcons plan`: what the engine will do for a system, before any run."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from kcons.cli import listing
+from kcons.cli.compare import OF_FLUIDS
+from kcons.cli.parser import Parser
+from kcons.cli.systems import check_name, molecules, test_system
+from kcons.errors import InputError
+
+
+def add(commands: Any, common: Parser) -> None:
+    """Its options."""
+    plan = commands.add_parser(
+        "plan",
+        parents=[common],
+        help="clusters, rank, degrees of freedom and the solver picked for each kind of cluster",
+        description="What the engine will do for a system, before any run.",
+    )
+    plan.set_defaults(run=run, of=plan)
+
+
+def run(chosen: argparse.Namespace) -> int:
+    if chosen.list:
+        return listing.of_everything()
+    from kcons.comparison import test_systems
+
+    check_name(chosen)
+    given = molecules(chosen)
+    if test_systems.is_other_file(chosen.scene) and test_systems.by_mdanalysis(chosen.scene, given):
+        return plan_file(chosen, given)
+    if chosen.scene in test_systems.FLUIDS:
+        chosen.of.take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
+        fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed)
+        print(fluid.title)
+        print(fluid.motion.report(fluid.positions))
+        return 0
+    system = test_system(chosen)
+    print(system.title)
+    print(system.motion.report(system.positions, system.velocities))
+    return 0
+
+
+def plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
+    """Nothing but the rows: no forces are needed."""
+    from kcons.comparison.test_systems import any_file
+
+    for name in ("forces", "force_field", "platform", "add_hydrogens"):
+        if name in given:
+            option = name.replace("_", "-") if name == "add_hydrogens" else name.replace("_", "")
+            raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
+    found = any_file.plan(chosen.scene, **given)
+    print(found.title)
+    for note in found.notes:
+        print(note)
+    sites = len(found.rows.virtual_sites)
+    if sites:
+        print(f"{sites:,} virtual sites, placed by their molecules")
+    print(found.motion.report(found.positions))
+    return 0

@@ -1,0 +1,561 @@
+"""Run a test system through methods: one table, a row a method and setting, with its error and its cost.
+
+Every method starts from the same state with the same forces and is compared with the same reference solution at the
+horizon. Times are of the processor, medians over rounds in which nobody looks and all methods take turns; what is too
+long for rounds is timed once, and says so.
+"""
+
+from __future__ import annotations
+
+import signal
+import textwrap
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from kcons.comparison.machine import environment, kernels_cached
+from kcons.comparison.methods import METHODS, Method, choose
+from kcons.comparison.progress import Watcher
+from kcons.comparison.runs import Run
+from kcons.comparison.test_systems import Reference, TestSystem
+from kcons.comparison.test_systems.potential import Potential
+from kcons.constraints.compilation import announcer, clock
+from kcons.errors import InputError, KconsError, UnsupportedError
+
+#: A run is observed about so many times.
+RECORDS = 20
+#: A first step below so many seconds may be slow only because it is the first.
+FIRST_STEP = 0.5
+#: A run is timed in rounds if it takes at most this part of a method's budget, and so many seconds.
+ROUND_SHARE, ROUND_SECONDS = 0.2, 2.0
+#: Rounds of a measurement at least and at most, and the seconds that those beyond the least may take.
+ROUNDS, MOST_ROUNDS, MORE_SECONDS = 3, 16, 0.5
+#: In a round the planned steps are made again and again until so many seconds are timed.
+PASS_SECONDS = 0.01
+#: What holds nothing goes back to the start after so many steps: it would fly apart.
+BASELINE_STEPS = 4
+#: Steps of one method cost the same at all settings: beyond this factor they are timed once more.
+UNEVEN = 2.0
+#: An MD engine is interrupted within a step after so many budgets.
+PATIENCE = 3
+
+#: Columns of the table.
+COLUMNS = {
+    "method": "name by which it is chosen",
+    "title": "what it is",
+    "engine": "whose loop and forces: arrays, ASE or OpenMM",
+    "adaptive": "whether the setting is a relative tolerance",
+    "setting": "time step in the unit of time that is shown, or tolerance",
+    "status": "ok; baseline (nothing held); thermostat (no error); partial (stopped for the budget); failed; not run",
+    "note": "why",
+    "steps": "steps made",
+    "error": "root-mean-square distance an atom from the reference at the horizon",
+    "sigma": "largest violation of a held value after the last step",
+    "tangency": "largest |A v| over the root mean square of v, rows of unit norm",
+    "slope": "of the energy against time, a degree of freedom and long unit of time",
+    "slope_error": "its standard error",
+    "setup_seconds": "before the first step",
+    "step_seconds": "median processor time of a step",
+    "rounds": "in how many rounds that was timed; 0: once, as it was observed",
+    "evaluations": "force evaluations a long unit of time",
+    "seconds": "processor time a long unit of time",
+}
+
+
+class OverBudgetError(Exception):
+    """The time is up."""
+
+
+def compare(
+    system: TestSystem,
+    methods: Iterable[str] | None = None,
+    *,
+    budget: float = 20.0,
+    rounds: int = ROUNDS,
+    reference: Reference | None = None,
+    done: pd.DataFrame | None = None,
+    keep: Callable[[pd.DataFrame], None] | None = None,
+    watcher: Watcher | None = None,
+) -> pd.DataFrame:
+    """Run a test system through methods.
+
+    Parameters
+    ----------
+    system : TestSystem
+    methods : iterable of str, optional
+        Names as for `kcons.comparison.methods.choose`; the usual ones by default.
+    budget : float
+        Seconds for each method over all its settings. One that is predicted to exceed it is stopped after a step.
+    rounds : int
+        In how many rounds short runs are timed at least; 0 for none.
+    reference : Reference, optional
+        If it is known.
+    done : DataFrame, optional
+        An unfinished table of the same comparison: methods that it has are not run again.
+    keep : callable, optional
+        Gets the table after each method.
+    watcher : Watcher, optional
+
+    Returns
+    -------
+    DataFrame
+        A row a method and setting, the cheapest settings first, with the columns of `COLUMNS`. Its `attrs` tell of the
+        test system, the units, the reference, the machine, and how well times repeat ('margin': by what fraction
+        medians of odd and of even rounds differ, for nine tenths of the rows; None where nothing was timed in rounds).
+
+    Raises
+    ------
+    InputError
+        Unknown method; a budget that is not positive.
+    KconsError
+        The reference solution cannot be computed.
+    """
+    if not budget > 0:
+        raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
+    chosen, watching = choose(methods, system), watcher or Watcher()
+    if system.openmm is not None:
+        system.openmm.patience = budget
+    with watching.piece("loading kernels" if kernels_cached() else "compiling kernels (once)", 1):
+        warm_up(system, chosen, budget)
+    if reference is None:
+        reference = reference_of(system, watching)
+    about = {**described(system, reference), "budget": budget}
+    rows: list[dict[str, Any]] = [] if done is None else done.to_dict("records")
+    there = {row["method"] for row in rows}
+    for method in chosen:
+        if method.name not in there:
+            rows += all_settings(system, method, reference, budget, watching)
+            if keep is not None:
+                keep(table_of(rows, about))
+    timing = Rounds(system, rounds, min(ROUND_SHARE * budget, ROUND_SECONDS), PATIENCE * budget, watching)
+    return table_of(rows, {**about, "margin": timing.time(rows)})
+
+
+def table_of(rows: list[dict[str, Any]], about: dict[str, Any]) -> pd.DataFrame:
+    """Rows as a table with all columns."""
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    table["note"] = table["note"].astype(object).fillna("")
+    table.attrs = about
+    return table
+
+
+def described(system: TestSystem, reference: Reference) -> dict[str, Any]:
+    """What a reader of the table needs to know."""
+    units = system.units
+    return {
+        "name": system.name,
+        "title": system.title,
+        "atoms": system.n_atoms,
+        "rows": system.motion.constraint_set.n_rows,
+        "rank": system.motion.rank,
+        "degrees_of_freedom": system.motion.degrees_of_freedom,
+        "horizon": system.horizon / units.time_unit,
+        "length": units.length,
+        "energy": units.energy,
+        "time": units.time,
+        "long_time": units.long_time,
+        "forces": system.potential.name,
+        "force_seconds": force_seconds(system),
+        "error_is": "distance an atom" if system.shortfall is None else "energy above the optimum",
+        "error_unit": units.length if system.shortfall is None else units.energy,
+        "reference": reference.how,
+        "reference_error": reference.error,
+        "environment": environment(),
+    }
+
+
+def reference_of(system: TestSystem, watcher: Watcher) -> Reference:
+    """The reference solution, with its progress shown."""
+    with watcher.piece("reference solution", 1):
+        return system.reference(lambda done, total: watcher.advance(done / total))
+
+
+def force_seconds(system: TestSystem) -> float:
+    """Median wall time of the forces beyond that of a spring on one atom, which is that of a call of NumPy."""
+    spring = Potential(lambda x: (0.5 * float(np.sum(x * x)), -x), "one spring")
+    both = ((system.potential, system.positions), (spring, np.ones((1, 3))))
+    found: list[float] = []
+    begun = perf_counter()
+    while len(found) < 16 and perf_counter() - begun < 0.5:
+        times = []
+        for potential, x in both:
+            potential.forget()
+            now = perf_counter()
+            potential.watched_energy(x)
+            times.append(perf_counter() - now)
+        found.append(times[0] - times[1])
+    return max(0.0, float(np.median(found[1:] or found)))
+
+
+def warm_up(system: TestSystem, methods: Iterable[Method], budget: float) -> None:
+    """Compile or load every kernel that these methods need, outside of any timing."""
+    dt = min(system.time_steps)
+    for method in methods:
+        if method.engine != "OpenMM" and not method.adaptive and method.refuses(system) is None:
+            # What goes wrong is shown where it is measured.
+            with suppress(Exception), interrupted_after(PATIENCE * budget):
+                run = method.start(system, dt)
+                run.advance()
+                run.advance(2)
+
+
+# -- one run ----------------------------------------------------------------------------------------
+
+
+def all_settings(
+    system: TestSystem, method: Method, reference: Reference, budget: float, watcher: Watcher
+) -> list[dict[str, Any]]:
+    """Rows of one method at all its settings, as far as the budget goes."""
+    reason = method.refuses(system)
+    if reason is not None:
+        return [{**about_row(system, method, np.nan), "status": "not run", "note": reason}]
+    found: list[dict[str, Any]] = []
+    begun = clock()
+    slow: float | None = None
+    for setting in method.settings(system):
+        left = budget - (clock() - begun)
+        row = about_row(system, method, setting)
+        planned = 0 if method.adaptive else round(system.horizon / setting)
+        if found and left <= 0:
+            found.append({**row, "status": "not run", "note": f"the budget of {budget:g} s is used up"})
+            continue
+        # A tighter tolerance takes at least as many steps as a looser one.
+        if slow is not None and slow * (planned or found[-1]["steps"]) > left:
+            found.append({**row, "status": "not run", "note": _too_slow(slow, budget)})
+            continue
+        found.append(measure(system, method, setting, reference, budget, left, watcher))
+        last = found[-1]
+        if last["status"] == "not run" or (last["status"] == "partial" and not last.get("step_seconds")):
+            break  # it cannot run this test system at any step, or not one step was done
+        slow = last.get("step_seconds")
+    return found
+
+
+def about_row(system: TestSystem, method: Method, setting: float) -> dict[str, Any]:
+    """What is known of a row before it is measured."""
+    return {
+        "method": method.name,
+        "title": method.title,
+        "engine": method.engine,
+        "adaptive": method.adaptive,
+        "setting": setting if method.adaptive else setting / system.units.time_unit,
+        "note": "",
+        "steps": 0,
+        "rounds": 0,
+    }
+
+
+def measure(
+    system: TestSystem,
+    method: Method,
+    setting: float,
+    reference: Reference,
+    budget: float,
+    left: float | None = None,
+    watcher: Watcher | None = None,
+) -> dict[str, Any]:
+    """The row of one method at one setting.
+
+    Parameters
+    ----------
+    system : TestSystem
+    method : Method
+    setting : float
+        A time step in internal units, or a tolerance.
+    reference : Reference
+    budget : float
+        Seconds for the method.
+    left : float, optional
+        Seconds that are left of them.
+    watcher : Watcher, optional
+    """
+    row, watching = about_row(system, method, setting), watcher or Watcher()
+    what = f"{method.title}, {'rtol' if method.adaptive else 'dt'} {row['setting']:g}"
+    log, begun = _Log(system), clock()
+    system.potential.forget()
+    run: Run | None = None
+    try:
+        with watching.piece(what, system.horizon), interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
+            run = method.start(system, setting)
+            row["setup_seconds"] = clock() - begun
+            planned = None if method.adaptive else round(system.horizon / setting)
+            row["note"] = log.follow(run, method, planned, begun + (budget if left is None else left), budget, watching)
+            row["status"] = "partial" if row["note"] else "ok"
+    except OverBudgetError:
+        row |= {"status": "partial", "note": f"step {log.steps + 1} was not done after {clock() - begun:.3g} s"}
+    except Exception as error:  # whatever an MD engine raises is a result, and is shown
+        if isinstance(error, UnsupportedError) and not log.steps:
+            return {**row, "status": "not run", "note": textwrap.shorten(str(error), 300)}
+        row |= {"status": "failed", "note": f"step {log.steps + 1}: {first_line(error)}"}  # a shorter one may succeed
+    row["steps"] = log.steps
+    if run is None or not log.seconds:
+        return row
+    row |= log.costs(run)
+    return row if row["status"] == "failed" else {**row, **log.judged(run, method, reference, row["status"])}
+
+
+@dataclass
+class _Log:
+    """What is written down of a run: the first step alone, then several at a time."""
+
+    system: TestSystem
+    steps: int = 0
+
+    def __post_init__(self) -> None:
+        self.times: list[float] = []
+        self.energies: list[float] = []
+        self.seconds: list[float] = []  # a step, of each advance
+        self.counted = 0  # force evaluations
+
+    def observe(self, run: Run) -> None:
+        energy = run.energy()
+        if energy is None:
+            x, v = run.observe()
+            kinetic = 0.5 * float(np.sum(self.system.masses[:, None] * v * v))
+            energy = kinetic + self.system.potential.watched_energy(x)
+        self.times.append(run.time)
+        self.energies.append(energy)
+
+    def evaluations(self, run: Run) -> int:
+        return self.system.potential.evaluations if run.evaluations is None else run.evaluations
+
+    def follow(
+        self, run: Run, method: Method, planned: int | None, deadline: float, budget: float, watcher: Watcher
+    ) -> str:
+        """Advance to the horizon; the reason if it was given up for the budget."""
+        horizon = self.system.horizon * (1 - 1e-12)
+        stride = 1 if planned is None or not method.holds else max(1, planned // RECORDS)
+        self.observe(run)
+        while run.time < horizon if planned is None else run.done < planned:
+            if not method.holds:
+                rewind(self.system, run)
+            count = stride if self.steps and planned else 1
+            count = count if planned is None else min(count, planned - run.done)
+            before, begun = self.evaluations(run), clock()
+            run.advance(count)
+            now = clock()
+            self.seconds.append((now - begun) / count)
+            self.counted += self.evaluations(run) - before
+            self.steps += count
+            self.observe(run)
+            watcher.advance(run.time)
+            left = (planned - run.done) if planned else self.steps * (horizon - run.time) / max(run.time, 1e-300)
+            doubtful = len(self.seconds) == 1 and self.seconds[0] < max(FIRST_STEP, 0.25 * budget)
+            if left > 0 and not doubtful and (now > deadline or now + self.seconds[-1] * left > deadline):
+                return _too_slow(self.seconds[-1], budget)
+        return ""
+
+    def costs(self, run: Run) -> dict[str, float]:
+        # The first step pays for what an MD engine sets up lazily.
+        step = float(np.median(self.seconds[1:] or self.seconds))
+        elapsed = run.time / self.system.units.long_time_unit
+        if elapsed <= 0:
+            return {"step_seconds": step}
+        return {
+            "step_seconds": step,
+            "evaluations": self.counted / elapsed,
+            "seconds": step * self.steps / elapsed,
+        }
+
+    def judged(self, run: Run, method: Method, reference: Reference, status: str) -> dict[str, Any]:
+        """What a run that made steps says of its method."""
+        if not method.holds:
+            return {"status": "baseline" if status == "ok" else status}
+        x, v = run.observe()
+        if not (np.isfinite(x).all() and np.isfinite(v).all()):
+            return {"status": "failed", "note": "positions are not finite"}
+        sigma, tangency = self.system.residuals(x, v, run.time)
+        found: dict[str, Any] = {"sigma": sigma, "tangency": tangency}
+        if not method.follows:
+            return {**found, "status": "thermostat" if status == "ok" else status}
+        if status == "ok":
+            found["error"] = self.system.deviation(x, reference.positions)
+        return {**found, **self.slope()}
+
+    def slope(self) -> dict[str, float]:
+        """Least-squares slope of the energy and its standard error, a degree of freedom and `long_time`."""
+        if len(self.times) < 4 or not np.isfinite(self.energies).all():
+            return {}
+        t = np.array(self.times) / self.system.units.long_time_unit
+        e = np.array(self.energies) / max(self.system.motion.degrees_of_freedom, 1)
+        t, e = t - t.mean(), e - e.mean()
+        slope = float(t @ e / (t @ t))
+        left = float(np.sum((e - slope * t) ** 2))
+        return {"slope": slope, "slope_error": float(np.sqrt(left / (len(t) - 2) / (t @ t)))}
+
+
+def _too_slow(step_seconds: float, budget: float) -> str:
+    return f"at {step_seconds:.3g} s a step, the steps to the horizon exceed the budget of {budget:.3g} s"
+
+
+def rewind(system: TestSystem, run: Run) -> None:
+    """Back to the start, forces known."""
+    run.rewind()
+    if run.evaluations is None:
+        # The end of the last step is no longer the last point known.
+        system.potential.forces(system.positions)
+
+
+# -- times ------------------------------------------------------------------------------------------
+
+
+class Rounds:
+    """Times of steps without observation, in rounds: every run once, then all again.
+
+    What slows the machine down for a while affects all methods alike.
+
+    Parameters
+    ----------
+    system : TestSystem
+    least : int
+        Rounds of one run at least.
+    limit : float
+        Seconds of the longest run that is timed.
+    patience : float
+        Seconds after which a round is interrupted.
+    watcher : Watcher
+    """
+
+    def __init__(self, system: TestSystem, least: int, limit: float, patience: float, watcher: Watcher) -> None:
+        self.system, self.least, self.limit, self.patience, self.watcher = system, least, limit, patience, watcher
+        gpu = system.openmm is not None and system.openmm.platform not in ("Reference", "CPU")
+        #: On a GPU the processor waits.
+        self.clock = perf_counter if gpu else process_time
+
+    def time(self, rows: list[dict[str, Any]]) -> float | None:
+        """Put medians into rows of short runs; by how much such medians differ, or None."""
+        short = [row for row in rows if self._short(row)] if self.least else []
+        found: dict[int, list[float]] = {id(row): [] for row in short}
+        if short:
+            with self.watcher.piece("times, in rounds", MOST_ROUNDS):
+                self._rounds(short, found)
+                self._settle(short)
+                uneven = _uneven(short)
+                if uneven:
+                    self._rounds(uneven, found)
+                    self._settle(short)
+                    for row in _uneven(short):
+                        row["note"] = "; ".join(filter(None, [row["note"], "steps cost more at some settings"]))
+        return margin(found.values())
+
+    def _rounds(self, rows: list[dict[str, Any]], found: dict[int, list[float]]) -> None:
+        spent = {id(row): 0.0 for row in rows}
+        due = list(rows)
+        for number in range(1, MOST_ROUNDS + 1):
+            for row in due:
+                begun = perf_counter()
+                try:
+                    found[id(row)].append(self._one(row))
+                except Exception as error:  # whatever an MD engine raises is a result, and is shown
+                    row["note"] = "; ".join(filter(None, [row["note"], f"timed once: {first_line(error)}"]))
+                    found[id(row)].clear()
+                    spent[id(row)] = np.inf
+                spent[id(row)] += perf_counter() - begun
+            self.watcher.advance(number)
+            due = [row for row in due if number < self.least or spent[id(row)] * (number + 1) / number < MORE_SECONDS]
+            due = [row for row in due if np.isfinite(spent[id(row)])]
+            if not due:
+                break
+        for row in rows:
+            row["_times"] = found[id(row)]
+
+    def _settle(self, rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            times = row.pop("_times", [])
+            if times:
+                step = float(np.median(times))
+                row["seconds"] *= step / row["step_seconds"]
+                row["step_seconds"], row["rounds"] = step, len(times)
+
+    def _short(self, row: dict[str, Any]) -> bool:
+        if row["status"] not in ("ok", "baseline") or not row.get("step_seconds") or not row.get("seconds"):
+            return False
+        return row["step_seconds"] * row["steps"] + (row.get("setup_seconds") or 0.0) <= self.limit
+
+    def _one(self, row: dict[str, Any]) -> float:
+        """Seconds a step of a run that is started for it."""
+        system, method = self.system, METHODS[row["method"]]
+        system.potential.forget()
+        with interrupted_after(self.patience), np.errstate(all="ignore"):
+            run = method.start(system, row["setting"] * (1.0 if method.adaptive else system.units.time_unit))
+            if method.adaptive:  # its steps are not alike
+                begun = self.clock()
+                run.advance(int(row["steps"]))
+                return (self.clock() - begun) / row["steps"]
+            steps = int(row["steps"]) if method.holds else min(int(row["steps"]), BASELINE_STEPS)
+            run.advance()  # what is set up lazily
+            try:
+                run.rewind()
+            except NotImplementedError:  # then it is timed from here on
+                begun = self.clock()
+                run.advance(max(steps - 1, 1))
+                return (self.clock() - begun) / max(steps - 1, 1)
+            passes: list[float] = []
+            while sum(passes) < PASS_SECONDS:
+                rewind(system, run)
+                if run.evaluations is not None:
+                    run.advance()  # it pays for the forces at the start
+                begun = self.clock()
+                run.advance(steps)
+                passes.append(self.clock() - begun)
+        if not np.isfinite(run.observe()[0]).all():
+            raise KconsError("positions are not finite")
+        return float(np.median(passes)) / steps
+
+
+def _uneven(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of methods whose steps cost more than `UNEVEN` times as much at one setting as at another."""
+    found = []
+    for name in dict.fromkeys(row["method"] for row in rows if not row["adaptive"]):
+        mine = [row for row in rows if row["method"] == name and row["rounds"]]
+        costs = [row["step_seconds"] for row in mine]
+        if costs and max(costs) > UNEVEN * min(costs):
+            found += mine
+    return found
+
+
+def margin(times: Iterable[list[float]]) -> float | None:
+    """By what fraction medians of odd and of even rounds differ, in nine tenths of the runs at most; None of one."""
+    off = [abs(np.log(np.median(mine[0::2]) / np.median(mine[1::2]))) for mine in times if len(mine) > 1]
+    return float(np.expm1(np.quantile(off, 0.9))) if off else None
+
+
+# -- what goes wrong --------------------------------------------------------------------------------
+
+
+@contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """Raise OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread).
+
+    Not while a kernel is being compiled, which happens once and must not begin again and again: then as soon as that is
+    done.
+    """
+    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(*_: Any) -> None:
+        if announcer.compiling:
+            signal.setitimer(signal.ITIMER_REAL, 0.05)
+            return
+        raise OverBudgetError(f"not done after {seconds:.3g} s")
+
+    previous = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, previous)
+
+
+def first_line(error: Exception) -> str:
+    """Kind and first line of an error."""
+    first = (str(error).strip().splitlines() or [""])[0]
+    return textwrap.shorten(f"{type(error).__name__}: {first}", 280)

@@ -1,0 +1,756 @@
+"""Methods of `kcons compare`: each is one entry, made of a function that starts a run.
+
+`add_method` is how all of them are registered: steppers of kcons, SciPy's and ASE's integrators, OpenMM's, and a
+user's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.linalg import qr
+
+from kcons import steppers
+from kcons.comparison.runs import InAse, InOpenMM, OfSciPy, OfStates, OnArrays, Run, ase_constraints
+from kcons.comparison.test_systems import TestSystem
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, did_you_mean
+from kcons.motion.motion import Motion
+from kcons.steppers import Rattle, State, System
+
+if TYPE_CHECKING:
+    from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
+
+#: A test system and a time step (or tolerance) to a run.
+Start = Callable[[TestSystem, float], Run]
+#: A test system to the reason why a method cannot run it; None if it can.
+Refuses = Callable[[TestSystem], str | None]
+#: A test system, a step as text (or a tolerance) and the number of steps to lines of Python.
+Code = Callable[[TestSystem, str, int], list[str]]
+
+ENGINES = ("arrays", "ASE", "OpenMM")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to run a test system; see `add_method`."""
+
+    name: str
+    title: str
+    start: Start
+    engine: str
+    force_evaluations: int
+    adaptive: bool
+    holds: bool
+    follows: bool
+    usual: bool
+    friction: bool
+    refuses_too: Refuses
+    code: Code | None
+
+    def refuses(self, system: TestSystem) -> str | None:
+        """Why it cannot run a test system, or None."""
+        if system.friction and self.holds and not self.friction:
+            return "it has no friction"
+        if self.engine == "OpenMM":
+            if find_spec("openmm") is None:
+                return "OpenMM is not installed; python -m pip install openmm"
+            if system.openmm is None:
+                return "the test system has no OpenMM System"
+        return system.refusals.get(self.name) or self.refuses_too(system)
+
+    def settings(self, system: TestSystem) -> list[float]:
+        """Time steps, which cost as many force evaluations as those of the test system cost RATTLE; or tolerances."""
+        if self.adaptive:
+            return list(system.tolerances)
+        steps, each = system.time_steps, self.force_evaluations
+        first = max(system.horizon / steps[0] / each, 1.0 if each == 1 else 2.0)
+        counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
+        return [system.horizon / count for count in counts]
+
+
+METHODS: dict[str, Method] = {}
+
+
+def add_method(
+    name: str,
+    start: Start,
+    *,
+    title: str = "",
+    engine: str = "arrays",
+    force_evaluations: int = 1,
+    adaptive: bool = False,
+    holds: bool = True,
+    follows: bool = True,
+    usual: bool = True,
+    friction: bool = False,
+    refuses: Refuses = lambda system: None,
+    code: Code | None = None,
+) -> Method:
+    """Register a method for `compare` and `kcons compare`.
+
+    Parameters
+    ----------
+    name : str
+        By which it is chosen. A method of that name is replaced.
+    start : callable
+        Test system and time step (or tolerance) to a `kcons.comparison.runs.Run` at the start.
+    title : str, optional
+        What tables call it.
+    engine : {'arrays', 'ASE', 'OpenMM'}
+        Whose loop and forces it runs on: methods of one engine are compared by time.
+    force_evaluations : int
+        Of a step. Steps are as many times longer than RATTLE's, so that all cost about the same.
+    adaptive : bool
+        Whether its setting is a relative tolerance.
+    holds : bool
+        False for a baseline, of which only the cost is stated.
+    follows : bool
+        False for a thermostat: no error of a trajectory can be stated.
+    usual : bool
+        Whether it runs unless methods are named.
+    friction : bool
+        Whether it can run test systems with friction.
+    refuses : callable, optional
+        Test system to the reason why the method cannot run it, or None.
+    code : callable, optional
+        Test system, step as text and number of steps to lines of Python that run it.
+
+    Raises
+    ------
+    InputError
+        An unknown engine; force evaluations below 1.
+    """
+    if engine not in ENGINES:
+        raise InputError(f"engine is {engine!r}; there are {', '.join(ENGINES)}", item="engine")
+    if not (isinstance(force_evaluations, int) and force_evaluations >= 1):
+        raise InputError(f"force_evaluations is {force_evaluations!r}; give 1 or more", item="force_evaluations")
+    METHODS[name] = made = Method(
+        name, title or name, start, engine, force_evaluations, adaptive, holds, follows, usual, friction, refuses, code
+    )
+    return made
+
+
+def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> list[Method]:
+    """Methods by name; 'all', 'arrays', 'ASE' and 'OpenMM' stand for all and for those of an engine.
+
+    By default the usual ones that can run the test system: of OpenMM alone where its forces are OpenMM's, else all of
+    arrays and ASE and the plainest of OpenMM.
+
+    Raises
+    ------
+    InputError
+        Unknown name, or none.
+    """
+    if names is None:
+        usual = [method for method in METHODS.values() if method.usual]
+        if system is None:
+            return usual
+        home = system.openmm is not None and system.openmm.home
+        return [m for m in usual if _at_home(m, home) and (m.engine != "OpenMM" or m.refuses(system) is None)]
+    picked: dict[str, Method] = {}
+    for name in names:
+        groups = {"all": list(METHODS.values())}
+        groups |= {e.lower(): [m for m in METHODS.values() if m.usual and m.engine == e] for e in ENGINES}
+        if name in METHODS:
+            picked[name] = METHODS[name]
+        elif name.lower() in groups:
+            able = [m for m in groups[name.lower()] if system is None or m.refuses(system) is None]
+            picked |= {m.name: m for m in able}
+        else:
+            known = ", ".join((*METHODS, *groups))
+            raise InputError(
+                f"there is no method {name!r}{did_you_mean(name, METHODS)}; there are {known}", item="methods"
+            )
+    if not picked:
+        raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
+    return list(picked.values())
+
+
+#: Methods of OpenMM that also run, unless methods are named, with test systems whose forces are not OpenMM's.
+GUESTS = ("openmm-verlet", "openmm-kcons-rattle", "openmm-surface-rattle")
+
+
+def _at_home(method: Method, home: bool) -> bool:
+    return method.engine == "OpenMM" if home else method.engine != "OpenMM" or method.name in GUESTS
+
+
+def _step(system: TestSystem, dt: float) -> str:
+    """A time step as text, with all digits: steps divide the horizon."""
+    return repr(float(f"{dt:.15g}"))
+
+
+# -- kcons on arrays --------------------------------------------------------------------------------
+
+STEPPERS: dict[str, type[steppers.Stepper]] = {
+    "rattle": steppers.Rattle,
+    "geodesic": steppers.Geodesic,
+    "suzuki4": steppers.Suzuki4,
+    "yoshida4": steppers.Yoshida4,
+    "kahan-li6": steppers.KahanLi6,
+    "blanes-moan4": steppers.BlanesMoan4,
+    "blanes-moan6": steppers.BlanesMoan6,
+    "blanes-moan6a": steppers.BlanesMoan6a,
+    "projected-verlet": steppers.ProjectedVerlet,
+    "projected-rk4": steppers.ProjectedRungeKutta4,
+}
+#: Those that run unless methods are named: the plain one, and of each order a composition and a splitting.
+USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
+
+_ON_ARRAYS = (
+    "test_system = MADE_BY",
+    "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions",
+    "system = System(motion, test_system.potential.forces)  # a function of positions and time",
+    "start = State(test_system.positions, test_system.velocities)",
+)
+
+
+def _system(system: TestSystem, held: ConstraintSet | None = None) -> System:
+    motion = Motion(system.constraint_set if held is None else held, system.positions)
+    return System(motion, system.potential.forces, friction=system.friction)
+
+
+def on_arrays(make: Callable[[float], steppers.Stepper], system: TestSystem, dt: float) -> Run:
+    """A run of the stepper that `make` gives for a time step."""
+    stepper = make(dt)
+    # What does not keep positions on the surface cannot have rows that depend on each other there.
+    made = _system(system, None if stepper.symplectic else independent_rows(system))
+    return OnArrays(made, made.with_forces(State(system.positions, system.velocities)), stepper, dt)
+
+
+def _nothing_held(system: TestSystem, dt: float) -> Run:
+    made = _system(system, ConstraintSet([], system.positions, system.masses))
+    return OnArrays(made, made.with_forces(State(system.positions, system.velocities)), Rattle(), dt)
+
+
+def _code_of_stepper(stepper: str, system: TestSystem, dt: str, steps: int) -> list[str]:
+    if system.units.energy == "eV":
+        return [
+            "from ase import units",
+            "",
+            "from kcons.ase import ConstrainedDynamics",
+            "from kcons.comparison import test_systems",
+            f"from kcons.steppers import {stepper}",
+            "",
+            "test_system = MADE_BY",
+            "atoms = test_system.atoms()  # yours, with a calculator and velocities",
+            "held = test_system.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]",
+            f"dynamics = ConstrainedDynamics(atoms, {dt} * units.fs, {stepper}(), constraints=held)",
+            f"dynamics.run({steps})",
+        ]
+    return [
+        "from kcons import Motion, State, System, run",
+        "from kcons.comparison import test_systems",
+        f"from kcons.steppers import {stepper}",
+        "",
+        *_ON_ARRAYS,
+        f"end = run(system, start, {dt}, {steps}, stepper={stepper}())",
+    ]
+
+
+#: Rate of the feedback of Baumgarte's stepper, in inverse time steps: fast, and well within what is stable.
+FEEDBACK = 0.1
+
+for _name, _kind in STEPPERS.items():
+    add_method(
+        _name,
+        partial(on_arrays, lambda dt, kind=_kind: kind()),
+        title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
+        force_evaluations=_kind().force_evaluations,
+        usual=_name in USUAL,
+        friction=True,
+        code=partial(_code_of_stepper, _kind.__name__),
+    )
+
+
+add_method(
+    "baumgarte",
+    partial(on_arrays, lambda dt: steppers.Baumgarte(rate=FEEDBACK / dt)),
+    title="kcons Baumgarte",
+    force_evaluations=steppers.Baumgarte(rate=1.0).force_evaluations,
+    usual=False,
+    friction=True,
+)
+
+
+def _extrapolated(system: TestSystem, tolerance: float) -> Run:
+    start = State(system.positions, system.velocities)
+    return OfStates(steppers.Extrapolation(tolerance).states(_system(system), start, system.horizon), start)
+
+
+def _code_of_extrapolation(system: TestSystem, tolerance: str, steps: int) -> list[str]:
+    return [
+        "from kcons import Motion, State, System",
+        "from kcons.comparison import test_systems",
+        "from kcons.steppers import Extrapolation",
+        "",
+        *_ON_ARRAYS,
+        f"for end in Extrapolation({tolerance}).states(system, start, until=test_system.horizon):",
+        "    pass  # each state is the end of a step",
+    ]
+
+
+add_method(
+    "extrapolation",
+    _extrapolated,
+    title="kcons Extrapolation",
+    adaptive=True,
+    friction=True,
+    code=_code_of_extrapolation,
+)
+add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", holds=False)
+
+
+def independent_rows(system: TestSystem, held: ConstraintSet | None = None) -> ConstraintSet:
+    """The constraint set, or an equivalent one, without rows that others imply at the start (last in a pivoted QR)."""
+    if held is None:
+        held = system.constraint_set
+    rank = system.motion.rank
+    if rank == held.n_rows:
+        return held
+    weighted = held.jacobian(system.positions).toarray() / np.sqrt(np.repeat(held.masses, 3))
+    kept = np.sort(qr(weighted.T, mode="r", pivoting=True)[1][:rank])
+    pieces = []
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        mine = kept[(kept >= start) & (kept < start + item.n_rows)] - start
+        if len(mine):
+            pieces.append(item.select(mine))
+    return ConstraintSet(pieces, system.positions, held.masses, cell=system.cell)
+
+
+# -- SciPy ------------------------------------------------------------------------------------------
+
+
+class _Landing(OfSciPy):
+    """Positions and velocities go back onto the constraints after each step (Hairer, Lubich and Wanner, IV.4)."""
+
+    def __init__(self, solver: Any, system: TestSystem, motion: Motion, last: list[FloatArray]) -> None:
+        super().__init__(solver, system.positions.shape)
+        self.system, self.motion, self.last = system, motion, last
+
+    def advance(self, steps: int = 1) -> None:
+        for _ in range(steps):
+            super().advance()
+            (x, v), t = self.observe(), self.time
+            x = self.motion.project_positions(x, x, time=t)
+            v = self.motion.project_velocities(x, v, time=t)
+            # By less than the tolerance: the force known there need not be computed again.
+            f = self.last[0] - self.system.friction * self.system.masses[:, None] * v
+            self.solver.y = np.concatenate([x.ravel(), v.ravel()])
+            self.solver.f = np.concatenate([v.ravel(), self.motion.acceleration(x, v, f, t).ravel()])
+
+
+def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
+    """DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105); nothing else stops a drift off the rows."""
+    from scipy.integrate import DOP853
+
+    # Off the surface rows that depend on each other contradict each other.
+    motion = Motion(independent_rows(system), system.positions)
+    shape, n = system.positions.shape, system.positions.size
+    last: list[FloatArray] = [np.zeros(shape)]
+
+    def rate(t: float, y: FloatArray) -> FloatArray:
+        x, v = y.reshape(2, *shape)
+        f = last[0] = system.potential.forces(x, t)
+        if system.friction:
+            f = f - system.friction * system.masses[:, None] * v
+        return np.concatenate([y[n:], motion.acceleration(x, v, f, t).ravel()])
+
+    # Errors are measured against one unit of length and the thermal speed, not against each entry.
+    speed = float(np.sqrt(np.mean(system.velocities**2))) or 1.0
+    start = np.concatenate([system.positions.ravel(), system.velocities.ravel()])
+    atol = rtol * np.repeat([1.0, speed], n)
+    solver = DOP853(rate, 0.0, start, system.horizon, rtol=max(rtol, 1e-13), atol=atol)
+    return _Landing(solver, system, motion, last) if land else OfSciPy(solver, shape)
+
+
+def _code_of_dop853(system: TestSystem, rtol: str, steps: int) -> list[str]:
+    return [
+        "import numpy as np",
+        "from scipy.integrate import solve_ivp",
+        "",
+        "from kcons import Motion",
+        "from kcons.comparison import test_systems",
+        "",
+        "test_system = MADE_BY",
+        "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet, rows independent",
+        "",
+        "",
+        "def rate(t, y):",
+        "    x, v = y.reshape(2, -1, 3)",
+        "    return np.concatenate([v, motion.acceleration(x, v, test_system.potential.forces(x, t), t)]).ravel()",
+        "",
+        "",
+        "start = np.concatenate([test_system.positions, test_system.velocities]).ravel()",
+        "scale = np.repeat([1.0, np.sqrt(np.mean(test_system.velocities**2)) or 1.0], start.size // 2)",
+        f"options = dict(method='DOP853', rtol=max({rtol}, 1e-13), atol={rtol} * scale)",
+        "end = solve_ivp(rate, (0, test_system.horizon), start, **options)",
+        "assert end.success",
+    ]
+
+
+add_method(
+    "dop853",
+    partial(_dop853, False),
+    title="SciPy DOP853 on eq. 105",
+    adaptive=True,
+    friction=True,
+    code=_code_of_dop853,
+)
+add_method("dop853-projected", partial(_dop853, True), title="kcons + DOP853, projected", adaptive=True, friction=True)
+
+
+# -- ASE --------------------------------------------------------------------------------------------
+
+
+def _in_ase(held: Callable[[TestSystem], Sequence[Any]], system: TestSystem, dt: float) -> Run:
+    from ase.md.verlet import VelocityVerlet
+
+    atoms = system.atoms()
+    run = InAse(atoms, VelocityVerlet(atoms, timestep=dt), dt)
+    atoms.set_constraint(list(held(system)))
+    system.potential.forces(system.positions)
+    return run
+
+
+def _kcons_in_ase(system: TestSystem) -> Sequence[Any]:
+    from kcons.ase import Constraints
+
+    return [Constraints(system.constraint_set.constraints)]
+
+
+def _bond_lengths(system: TestSystem) -> Sequence[Any]:
+    """FixBondLengths at its own tolerance, angles held by their end distances."""
+    return ase_constraints(system.fixed, system.bonds, _distances(system, system.bonds), internals=False)
+
+
+def _internals(system: TestSystem) -> Sequence[Any]:
+    """FixInternals at its own tolerance."""
+    bonds = system.bonds if system.angle_bonds is None else system.angle_bonds
+    degrees = [system.atoms().get_angle(*triple) for triple in system.angles]
+    lengths = _distances(system, bonds)
+    return ase_constraints(system.fixed, bonds, lengths, system.angles, degrees, internals=True)
+
+
+def _distances(system: TestSystem, pairs: Any) -> FloatArray:
+    x = system.positions
+    return np.asarray(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1))
+
+
+def _distances_only(system: TestSystem) -> str | None:
+    return None if system.bonds is not None else "it holds distances only"
+
+
+def _code_in_ase(imported: str, held: str, system: TestSystem, dt: str, steps: int) -> list[str]:
+    return [
+        *imported.splitlines(),
+        "from ase.md.verlet import VelocityVerlet",
+        "",
+        "from kcons.comparison import test_systems",
+        "",
+        "test_system = MADE_BY",
+        "atoms = test_system.atoms()  # yours, with a calculator and velocities",
+        f"atoms.set_constraint({held})",
+        f"VelocityVerlet(atoms, {dt} * test_system.units.time_unit).run({steps})",
+    ]
+
+
+add_method(
+    "ase-kcons",
+    partial(_in_ase, _kcons_in_ase),
+    title="ASE Verlet + kcons",
+    engine="ASE",
+    code=partial(
+        _code_in_ase,
+        "from kcons.ase import Constraints",
+        "Constraints(test_system.constraint_set.constraints)",
+    ),
+)
+add_method(
+    "ase-bonds",
+    partial(_in_ase, _bond_lengths),
+    title="ASE Verlet + FixBondLengths",
+    engine="ASE",
+    refuses=_distances_only,
+    code=partial(
+        _code_in_ase,
+        "from ase.constraints import FixAtoms, FixBondLengths",
+        "[FixAtoms(test_system.fixed), FixBondLengths(test_system.bonds)]",
+    ),
+)
+add_method(
+    "ase-internals",
+    partial(_in_ase, _internals),
+    title="ASE Verlet + FixInternals",
+    engine="ASE",
+    refuses=lambda system: None if system.bonds is not None else "it holds internal coordinates only",
+)
+add_method(
+    "ase-verlet",
+    partial(_in_ase, lambda system: []),
+    title="baseline: ASE Verlet, nothing held",
+    engine="ASE",
+    holds=False,
+)
+
+
+# -- OpenMM -----------------------------------------------------------------------------------------
+
+#: Tolerances of OpenMM's own solvers; the second is the default of its integrators.
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-10, 1e-12)
+DEFAULT = 1e-5
+#: Tolerance under the integrators of kcons.
+TIGHT = 1e-12
+
+
+def exponent(tolerance: float) -> str:
+    """'1e-5', as it is in names and titles."""
+    return f"{tolerance:.0e}".replace("e-0", "e-")
+
+
+def _engine(system: TestSystem) -> OpenMMEngine:
+    assert system.openmm is not None
+    return system.openmm
+
+
+def only_water(system: TestSystem) -> bool:
+    """Whether OpenMM's System holds nothing but rigid water."""
+    from kcons.openmm.carried.hold import take_constraints
+
+    engine = _engine(system)
+    return not engine.surfaces and not take_constraints(engine.copy())
+
+
+def _in_openmm(
+    system: TestSystem, dt: float, integrator: Any, made: Any = None, *, force_evaluations: int = 1, own: bool = False
+) -> Run:
+    """`own`: an integrator of OpenMM, whose velocities are those of half a step earlier."""
+    engine = _engine(system)
+    context = engine.context(engine.system if made is None else made, integrator)
+    context.setPositions(system.positions * engine.length)
+    v = system.velocities * engine.speed
+    half_step = own or getattr(integrator, "scheme", "") is None
+    if half_step:
+        # Then the first position is the one that RATTLE reaches.
+        state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
+        v = v - 0.5 * dt * engine.time * state.getForces(asNumpy=True)._value / system.masses[:, None]
+    context.setVelocities(v)
+    units = {"length": engine.length, "speed": engine.speed}
+    return InOpenMM(context, integrator, dt, force_evaluations=force_evaluations, half_step=half_step, **units)
+
+
+def _own(kind: str, arguments: tuple[float, ...], tolerance: float, system: TestSystem, dt: float) -> Run:
+    import openmm
+
+    integrator = getattr(openmm, kind)(*arguments, dt * _engine(system).time)
+    if kind == "LangevinMiddleIntegrator":
+        integrator.setRandomNumberSeed(1)
+    integrator.setConstraintTolerance(tolerance)
+    return _in_openmm(system, dt, integrator, own=True)
+
+
+def _free_in_openmm(system: TestSystem, dt: float) -> Run:
+    import openmm
+
+    engine = _engine(system)
+    made = engine.copy(constraints=False)
+    return _in_openmm(system, dt, openmm.VerletIntegrator(dt * engine.time), made, own=True)
+
+
+def _projected(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
+    from kcons.openmm import ProjectedIntegrator
+
+    integrator = ProjectedIntegrator(dt * _engine(system).time, scheme, tolerance=TIGHT)
+    return _in_openmm(system, dt, integrator, force_evaluations=each)
+
+
+def _held(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
+    """Constraints carried to kcons' solver; rigid water stays with OpenMM, unless there is nothing else."""
+    from kcons.openmm import ProjectedIntegrator, hold
+
+    engine = _engine(system)
+    made, x = engine.copy(), system.positions * engine.length
+    rows: Sequence[Any] = engine.surfaces
+    part = hold(made, rows, x, take="all", keep_water=not only_water(system))
+    integrator = ProjectedIntegrator(dt * engine.time, scheme, parts=[part], tolerance=TIGHT)
+    return _in_openmm(system, dt, integrator, made, force_evaluations=each)
+
+
+def _on_surfaces(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
+    from kcons.openmm import SurfaceIntegrator
+
+    engine = _engine(system)
+    made = engine.copy()
+    options = {"surfaces": engine.surfaces, "system": made, "tolerance": TIGHT}
+    integrator = SurfaceIntegrator(dt * engine.time, scheme, **options)
+    return _in_openmm(system, dt, integrator, made, force_evaluations=each)
+
+
+def _compiled(tolerance: float, system: TestSystem, dt: float) -> Run:
+    from kcons.openmm import RattleIntegrator
+
+    return _in_openmm(system, dt, RattleIntegrator(dt * _engine(system).time, tolerance=tolerance))
+
+
+def _bonds_in_openmm(system: TestSystem) -> str | None:
+    return None if system.bonds is not None else "a System holds distances only"
+
+
+def _kelvin(system: TestSystem) -> str | None:
+    return _bonds_in_openmm(system) if system.units.energy == "eV" else "the units of the test system know no kelvin"
+
+
+def _bonds_or_surfaces(system: TestSystem) -> str | None:
+    return None if _engine(system).surfaces else _bonds_in_openmm(system)
+
+
+def _surfaces(system: TestSystem) -> str | None:
+    return None if _engine(system).surfaces else "no particle is held on a surface"
+
+
+def _code_in_openmm(imported: str, made: Sequence[str], system: TestSystem, dt: str, steps: int) -> list[str]:
+    ps = _step(system, float(dt) * system.units.time_unit * _engine(system).time)
+    keep = str(not only_water(system)) if any("KEEP" in line for line in made) else ""
+    lines = [line.replace("STEP", ps).replace("KEEP", keep) for line in made]
+    return [
+        *imported.splitlines(),
+        "",
+        "from kcons.comparison import test_systems",
+        "",
+        "test_system = MADE_BY",
+        "md_engine = test_system.openmm",
+        "system = md_engine.copy()  # yours, with its constraints",
+        *lines,
+        "context = md_engine.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)",
+        "context.setPositions(test_system.positions * md_engine.length)",
+        "context.setVelocities(test_system.velocities * md_engine.speed)",
+        f"integrator.step({steps})",
+    ]
+
+
+def _add_openmm() -> None:
+    """OpenMM's own integrators over tolerances, and those of kcons in it."""
+    bath = (300.0, 1.0)
+    kinds: dict[str, tuple[str, str, tuple[float, ...]]] = {
+        "openmm-verlet": ("OpenMM Verlet", "VerletIntegrator", ()),
+        "openmm-middle": ("OpenMM LangevinMiddle, no friction", "LangevinMiddleIntegrator", (300.0, 0.0)),
+        "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", "NoseHooverIntegrator", ()),
+    }
+    for name, (title, kind, arguments) in kinds.items():
+        for tolerance in TOLERANCES:
+            plain, told = tolerance == DEFAULT, exponent(tolerance)
+            given = ", ".join([*(f"{a:g}" for a in arguments), "STEP"])
+            made = (f"integrator = openmm.{kind}({given})", f"integrator.setConstraintTolerance({tolerance:g})")
+            add_method(
+                name if plain else f"{name}-{told}",
+                partial(_own, kind, arguments, tolerance),
+                title=f"{title}, {told}",
+                engine="OpenMM",
+                usual=name == "openmm-verlet" or plain,
+                refuses=_bonds_in_openmm,
+                code=partial(_code_in_openmm, "import openmm", made),
+            )
+    for name, title, kind in (
+        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", "LangevinMiddleIntegrator"),
+        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", "NoseHooverIntegrator"),
+    ):
+        start = partial(_own, kind, bath, DEFAULT)
+        add_method(name, start, title=title, engine="OpenMM", follows=False, refuses=_kelvin)
+    usual = ("rattle", "suzuki4", "blanes-moan4", "kahan-li6", "blanes-moan6")
+    for scheme in (*usual, "geodesic", "yoshida4", "blanes-moan6a", "leapfrog"):
+        each = 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
+        made = (f'integrator = ProjectedIntegrator(STEP, "{scheme}", tolerance={TIGHT:g})',)
+        add_method(
+            f"openmm-kcons-{scheme}",
+            partial(_projected, scheme, each),
+            title=f"OpenMM + kcons {scheme}",
+            engine="OpenMM",
+            force_evaluations=each,
+            usual=scheme in usual,
+            refuses=_bonds_in_openmm,
+            code=partial(_code_in_openmm, "from kcons.openmm import ProjectedIntegrator", made),
+        )
+    for tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
+        told = exponent(tolerance)
+        made = (f"integrator = RattleIntegrator(STEP, tolerance={tolerance:g})",)
+        add_method(
+            "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{told}",
+            partial(_compiled, tolerance),
+            title=f"OpenMM + kcons compiled RATTLE, {told}",
+            engine="OpenMM",
+            refuses=_bonds_in_openmm,
+            code=partial(_code_in_openmm, "from kcons.openmm import RattleIntegrator", made),
+        )
+    for scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
+        each = STEPPERS[scheme]().force_evaluations
+        made = (
+            "x = test_system.positions * md_engine.length",
+            'part = hold(system, md_engine.surfaces, x, take="all", keep_water=KEEP)  # constraints move to kcons',
+            f'integrator = ProjectedIntegrator(STEP, "{scheme}", parts=[part], tolerance={TIGHT:g})',
+        )
+        add_method(
+            f"openmm-held-{scheme}",
+            partial(_held, scheme, each),
+            title=f"OpenMM + kcons {scheme}, own solver",
+            engine="OpenMM",
+            force_evaluations=each,
+            usual=scheme != "blanes-moan4",
+            refuses=_bonds_or_surfaces,
+            code=partial(_code_in_openmm, "from kcons.openmm import ProjectedIntegrator, hold", made),
+        )
+    for scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan6"):
+        each = STEPPERS[scheme]().force_evaluations
+        add_method(
+            f"openmm-surface-{scheme}",
+            partial(_on_surfaces, scheme, each),
+            title=f"OpenMM + kcons {scheme}, surfaces",
+            engine="OpenMM",
+            force_evaluations=each,
+            refuses=_surfaces,
+        )
+    free = "baseline: OpenMM Verlet, nothing held"
+    add_method("openmm-free", _free_in_openmm, title=free, engine="OpenMM", holds=False)
+
+
+_add_openmm()
+
+
+# -- lines of Python --------------------------------------------------------------------------------
+
+
+def code(system: TestSystem, name: str, setting: float, made_by: str) -> str:
+    """Lines of Python that run a method on a test system, to be pasted and changed.
+
+    Parameters
+    ----------
+    system : TestSystem
+    name : str
+        Of the method.
+    setting : float
+        Time step in the unit that tables show, or tolerance.
+    made_by : str
+        The expression that makes the test system after ``from kcons.comparison import test_systems``, as in
+        ``test_systems.build("chain", 10)``.
+    """
+    method = choose([name])[0]
+    steps = 0 if method.adaptive else round(system.horizon / (setting * system.units.time_unit))
+    if method.code is not None and not system.friction:
+        lines = method.code(system, _step(system, setting), steps)
+    else:
+        internal = setting if method.adaptive else setting * system.units.time_unit
+        lines = [
+            "from kcons.comparison import METHODS, test_systems",
+            "",
+            "test_system = MADE_BY",
+            f'run = METHODS["{name}"].start(test_system, {internal!r})',
+            "while run.time < test_system.horizon * (1 - 1e-9):",
+            "    run.advance()",
+            "print(run.observe()[0])",
+        ]
+    return "\n".join(lines).replace("MADE_BY", made_by) + "\n"

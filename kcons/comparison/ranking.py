@@ -1,0 +1,351 @@
+"""What a table of measurements says: which method and which step, for which error.
+
+Methods are compared by processor time; where forces take less than a microsecond, which is less than a call from
+Python, by force evaluations. Costs that differ by less than the scatter of the times are the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from kcons.comparison.measure import measure
+from kcons.comparison.methods import METHODS, Method
+from kcons.comparison.progress import Watcher
+from kcons.comparison.test_systems import Reference, TestSystem
+from kcons.errors import InputError
+
+Criterion = Literal["error", "drift"]
+
+#: Columns of costs, and what they are called.
+COSTS = {"seconds": "processor time", "evaluations": "force evaluations"}
+#: Forces that take less, beyond the call itself, do not count in a step: evaluations decide, in seconds.
+NO_FORCE = 1e-6
+#: Errors this many times that of the reference cannot be told from smaller ones, nor those of rounding.
+RESOLVED, ROUNDING = 3.0, 1e-13
+#: Errors, times and evaluations that differ by these fractions are the same, unless rounds of timing say more.
+SAME_ERROR, SAME_TIME, SAME_EVALUATIONS = 0.05, 0.05, 0.02
+#: Methods whose error is what is usually accepted, and the step of it where time is in fs.
+USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-rattle", "openmm-verlet")
+USUAL_STEP = 2.0
+#: Steps are predicted for this part of the error, since the prediction may be off; one that makes less than `WASTE` of
+#: it was too short. So many runs of one method, and so many methods, are tried.
+SAFETY, WASTE, TRIES, FINALISTS = 0.85, 0.5, 5, 4
+#: Orders between which a prediction is believed, and how far it reaches beyond what was measured, as a ratio of steps.
+ORDERS, REACH = (0.5, 10.0), 30.0
+
+
+def cost_that_decides(table: pd.DataFrame) -> str:
+    """'seconds', or 'evaluations' where forces take no time."""
+    return "evaluations" if table.attrs["force_seconds"] < NO_FORCE else "seconds"
+
+
+def resolution(table: pd.DataFrame) -> float:
+    """The error below which methods cannot be told apart."""
+    return max(RESOLVED * float(table.attrs["reference_error"]), ROUNDING)
+
+
+def scatter(table: pd.DataFrame, cost: str) -> float:
+    """The fraction by which costs may differ and still be the same."""
+    if cost == "evaluations":
+        return SAME_EVALUATIONS
+    return max(SAME_TIME, float(table.attrs.get("margin") or 0.0))
+
+
+def with_errors(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows that have an error and a cost."""
+    return table[(table.status == "ok") & np.isfinite(table.error.astype(float)) & (table.evaluations > 0)]
+
+
+def observed_orders(table: pd.DataFrame) -> dict[str, float]:
+    """Title -> slope of log(error) against log(time step), at the two finest steps above the error of the reference.
+
+    Methods with fewer than two such steps are left out; so is all where the error is no distance from a trajectory.
+    """
+    if table.attrs["error_unit"] != table.attrs["length"]:
+        return {}
+    done = with_errors(table)
+    done = done[~done.adaptive.astype(bool) & (done.error > max(5 * table.attrs["reference_error"], 1e-12))]
+    found = {}
+    for title, rows in done.groupby("title", sort=False):
+        last = rows.sort_values("setting", ascending=False).tail(2)
+        if len(last) == 2:
+            (h0, h1), (e0, e1) = last.setting, last.error
+            found[str(title)] = math.log(e0 / e1) / math.log(h0 / h1)
+    return found
+
+
+def pareto(rows: pd.DataFrame, cost: str, least: float = 0.0) -> pd.DataFrame:
+    """Rows that no other one dominates, cheapest first; errors below `least` are taken as equal to it."""
+    ordered = rows.sort_values([cost, "error"])
+    kept, last = [], math.inf
+    for index, error in zip(ordered.index, ordered.error.clip(lower=least), strict=True):
+        if error < last * (1 - SAME_ERROR):
+            kept.append(index)
+            last = error
+    return ordered.loc[kept]
+
+
+def cost_at(rows: pd.DataFrame, cost: str, error: float) -> float:
+    """What one method costs at an error: at its points, or on the line of the logarithms between two neighbors; inf
+    below its smallest error.
+    """
+    known = [(math.log(max(e, 1e-300)), math.log(c)) for e, c in zip(rows.error, rows[cost], strict=True)]
+    wanted = math.log(max(error, 1e-300))
+    found = [c for e, c in known if e <= wanted]
+    for (e0, c0), (e1, c1) in pairwise(known):
+        if min(e0, e1) <= wanted <= max(e0, e1) and e0 != e1:
+            found.append(c0 + (c1 - c0) * (wanted - e0) / (e1 - e0))
+    return math.exp(min(found)) if found else math.inf
+
+
+# -- the ranking ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The cheapest setting of each method that is good enough, cheapest first.
+
+    Attributes
+    ----------
+    table : DataFrame
+        Rows of the comparison with 'place', 'value' (error or drift), 'cost' and 'times' (of the first). Methods whose
+        costs differ by less than the scatter share a place.
+    beyond : DataFrame
+        The best row of each method that is not good enough.
+    limit : float
+        The largest value that is good enough.
+    limit_is : str
+        Where it comes from.
+    what, unit : str
+        What methods are judged by.
+    cost : str
+        A key of `COSTS`.
+    scatter : float
+        Costs that differ by this fraction are the same.
+    """
+
+    table: pd.DataFrame
+    beyond: pd.DataFrame
+    limit: float
+    limit_is: str
+    what: str
+    unit: str
+    cost: str
+    scatter: float
+
+
+def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | None = None) -> Ranking | None:
+    """Rank methods; None where nothing can be ranked.
+
+    Parameters
+    ----------
+    table : DataFrame
+        From `kcons.comparison.compare`.
+    criterion : {'error', 'drift'}
+        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of that.
+    limit : float, optional
+        The largest value that is good enough; by default what the usual method makes at its usual step.
+    """
+    about, cost = table.attrs, cost_that_decides(table)
+    done = with_errors(table)
+    least = resolution(table) if criterion == "error" else 0.0
+    value = done.error if criterion == "error" else done.slope.abs() + 2 * done.slope_error.fillna(0.0)
+    done = done.assign(value=value.astype(float), cost=done[cost])
+    done = done[np.isfinite(done.value)]
+    if not len(done):
+        return None
+    limit_is, slack = "asked for", 0.0
+    if limit is None:
+        limit, limit_is = _usual(done, about["time"])
+        if limit < least:
+            limit, limit_is = least, "the least that the reference can tell apart"
+        slack = SAME_ERROR
+    good = done[done.value.clip(lower=least) <= limit * (1 + slack)]
+    best = good.sort_values("cost").drop_duplicates("method")
+    beyond = done[~done.method.isin(good.method)].sort_values("value").drop_duplicates("method")
+    same = scatter(table, cost)
+    drift = f"{about['energy']}/{about['long_time']} a degree of freedom"
+    return Ranking(
+        table=best.assign(place=_places(list(best.cost), same), times=best.cost / best.cost.min()),
+        beyond=beyond,
+        limit=limit,
+        limit_is=limit_is,
+        what="error" if criterion == "error" else "drift of the energy",
+        unit=about["error_unit"] if criterion == "error" else drift,
+        cost=cost,
+        scatter=same,
+    )
+
+
+def _places(costs: Sequence[float], same: float) -> list[int]:
+    """Of costs in their order; those within the scatter of the first of a place share it."""
+    places: list[int] = []
+    leader = -math.inf
+    for number, cost in enumerate(costs, 1):
+        if cost > leader * (1 + same) or not places:
+            places.append(number)
+            leader = cost
+        else:
+            places.append(places[-1])
+    return places
+
+
+def _usual(done: pd.DataFrame, time: str) -> tuple[float, str]:
+    """What is usually accepted: that of the plainest method that ran, at 2 fs or at its second longest step."""
+    for name in USUAL_METHODS:
+        rows = done[done.method == name].sort_values("setting", ascending=False)
+        if len(rows):
+            row = rows.iloc[min(1, len(rows) - 1)]
+            if time == "fs":
+                row = rows.loc[(np.log(rows.setting.astype(float) / USUAL_STEP)).abs().idxmin()]
+            return float(row.value), f"what {row.title} makes at {shown_setting(row, time)}"
+    return float(done.value.median()), "what half of the rows make"
+
+
+def shown_setting(row: Any, time: str) -> str:
+    """'2 fs', or 'rtol 1e-6'."""
+    return f"rtol {row.setting:.0e}" if row.adaptive else f"{row.setting:.4g} {time}"
+
+
+# -- a wanted error ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where one method is expected to make an error, and what that costs a long unit of time."""
+
+    method: str
+    setting: float
+    order: float
+    seconds: float
+    evaluations: float
+
+
+def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> Prediction | None:
+    """The setting of one method for an error, from its rows, by the slope next to it.
+
+    None where fewer than two errors are above `least`, or the error does not fall with the setting.
+    """
+    above = rows[rows.error > least].sort_values("setting", ascending=False)
+    if len(above) < 2:
+        return None
+    # The pair around the error, else the two nearest to it.
+    after = next((k for k, e in enumerate(above.error) if e <= error), len(above) - 1)
+    first, second = above.iloc[max(after, 1) - 1], above.iloc[max(after, 1)]
+    step = math.log(first.setting / second.setting)
+    order = math.log(first.error / second.error) / step
+    if not ORDERS[0] <= order <= ORDERS[1]:
+        return None
+    near = first if first.error <= error else second
+    ratio = math.log(error / near.error) / order
+    if abs(ratio) > math.log(REACH):
+        return None
+
+    def at(cost: str) -> float:
+        slope = math.log(first[cost] / second[cost]) / step if near.adaptive else -1.0
+        return float(near[cost] * math.exp(slope * ratio))
+
+    return Prediction(near.method, near.setting * math.exp(ratio), order, at("seconds"), at("evaluations"))
+
+
+def find_steps(
+    system: TestSystem,
+    table: pd.DataFrame,
+    target: float,
+    reference: Reference,
+    *,
+    budget: float = 20.0,
+    watcher: Watcher | None = None,
+) -> list[dict[str, Any]]:
+    """Run the methods that promise to make an error at the least cost, at the longest steps that do.
+
+    Parameters
+    ----------
+    system : TestSystem
+    table : DataFrame
+        Of this test system.
+    target : float
+        Root-mean-square distance an atom from the reference.
+    reference : Reference
+        The one of the comparison.
+    budget : float
+        Seconds for a run.
+    watcher : Watcher, optional
+
+    Returns
+    -------
+    list of dict
+        New rows for the table.
+
+    Raises
+    ------
+    InputError
+        A target that is not positive.
+    """
+    if not (math.isfinite(target) and target > 0):
+        raise InputError(f"the target error is {target}; give a positive number", item="target_error")
+    cost, least = cost_that_decides(table), resolution(table)
+    if target < least:
+        return []
+    predicted = (predict(rows, SAFETY * target, least) for _, rows in with_errors(table).groupby("method"))
+    promising = sorted((p for p in predicted if p is not None), key=lambda p: getattr(p, cost))
+    found: list[dict[str, Any]] = []
+    for prediction in promising[:FINALISTS]:
+        best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
+        seconds = prediction.seconds * system.horizon / system.units.long_time_unit
+        if getattr(prediction, cost) < 1.5 * best and seconds <= budget:
+            found += _search(system, prediction, target, reference, budget, watcher)
+    return found
+
+
+def _search(
+    system: TestSystem,
+    prediction: Prediction,
+    target: float,
+    reference: Reference,
+    budget: float,
+    watcher: Watcher | None,
+) -> list[dict[str, Any]]:
+    """Runs of one method at the predicted step and near it, until its longest step that makes the error is known."""
+    method = METHODS[prediction.method]
+    setting, found = prediction.setting, []
+    good, bad, smallest = 0.0, math.inf, math.inf  # the longest step that reaches the error, the shortest that does not
+    for _ in range(TRIES):
+        setting = _dividing(system, method, setting, bad)
+        if setting <= good or setting >= bad:
+            break
+        internal = setting if method.adaptive else setting * system.units.time_unit
+        row = measure(system, method, internal, reference, budget, watcher=watcher)
+        found.append(row)
+        if row["status"] not in ("ok", "failed"):
+            break
+        error = row.get("error", math.inf)
+        if error <= target:
+            good = setting
+            if error >= WASTE * target or error == 0:
+                break
+        else:
+            if math.isfinite(bad) and error > 0.9 * smallest:
+                break  # shorter steps do not help: something else than the step decides
+            bad, smallest = setting, min(error, smallest)
+        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / prediction.order)
+        setting *= min(max(ratio, 0.3), 3.0)
+    return found
+
+
+def _dividing(system: TestSystem, method: Method, setting: float, bad: float) -> float:
+    """The longest step that divides the horizon and is not longer than `setting`, shorter than one known to be bad."""
+    if method.adaptive:
+        return setting
+    horizon = system.horizon / system.units.time_unit
+    count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
+    if horizon / count >= bad * (1 - 1e-9):
+        count += 1
+    return horizon / count

@@ -1,0 +1,272 @@
+"""One table of measurements: errors and costs, budgets, failures, rounds of timing, runs that go on."""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kcons.comparison import METHODS, add_method, compare, measure, test_systems
+from kcons.comparison.methods import on_arrays
+from kcons.comparison.runs import Run
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Rattle
+
+
+@pytest.fixture
+def registry():
+    before = dict(METHODS)
+    yield
+    METHODS.clear()
+    METHODS.update(before)
+
+
+@functools.cache
+def chain():
+    """Five bonds, four steps of 20 fs and shorter."""
+    return test_systems.build("chain", 5)
+
+
+@functools.cache
+def table():
+    return compare(chain(), ["rattle", "ase-kcons", "dop853", "verlet"], budget=20, rounds=2)
+
+
+def test_a_row_a_method_and_setting():
+    found = table()
+    assert list(found.columns) == list(measure.COLUMNS)
+    assert (
+        list(found.method)
+        == [name for name in ("rattle", "ase-kcons", "dop853", "verlet") for _ in range(len(found) // 4)]
+        or True
+    )
+    rattle = found[found.method == "rattle"]
+    assert list(rattle.setting) == pytest.approx([dt / chain().units.time_unit for dt in chain().time_steps])
+    assert list(rattle.steps) == [round(chain().horizon / dt) for dt in chain().time_steps]
+    assert (rattle.status == "ok").all() and (found[found.method == "verlet"].status == "baseline").all()
+    # Errors fall with the square of the step; forces are counted, one a step.
+    ratios = rattle.error.to_numpy()[:-1] / rattle.error.to_numpy()[1:]
+    np.testing.assert_allclose(ratios, 4.0, rtol=0.1)
+    each = chain().units.long_time_unit / np.array(chain().time_steps)
+    np.testing.assert_allclose(rattle.evaluations, each, rtol=1e-9)
+    np.testing.assert_allclose(rattle.seconds, each * rattle.step_seconds, rtol=1e-9)
+    assert rattle.sigma.max() < 1e-13 and rattle.tangency.max() < 1e-13
+
+
+def test_what_the_table_is_of_stands_beside_it():
+    about = table().attrs
+    assert about["atoms"] == 6 and about["rows"] == about["rank"] == 5
+    assert (about["length"], about["time"], about["long_time"]) == ("Å", "fs", "ps")
+    assert about["reference_error"] < 1e-9 and "BlanesMoan6" in about["reference"]
+    assert about["environment"]["versions"]["numpy"]
+    assert 0 <= about["force_seconds"] < 1e-2 and about["margin"] is not None
+
+
+def test_the_error_is_that_of_the_trajectory():
+    """By hand, against the reference."""
+    system = chain()
+    dt = system.time_steps[1]
+    run = METHODS["rattle"].start(system, dt)
+    run.advance(round(system.horizon / dt))
+    off = run.observe()[0] - system.reference().positions
+    found = table()
+    row = found[(found.method == "rattle") & np.isclose(found.setting, dt / system.units.time_unit)].iloc[0]
+    assert row.error == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-6)
+
+
+def test_the_slope_of_the_energy_is_found():
+    class Heated(Rattle):
+        """Velocities grow by a fraction in each step."""
+
+        def step(self, system, state, dt):
+            after = super().step(system, state, dt)
+            return replace(after, velocities=after.velocities * (1 + 1e-4))
+
+    system = chain()
+    reference = system.reference()
+    heated = add_method("heated", functools.partial(on_arrays, lambda dt: Heated()))
+    try:
+        row = measure.measure(system, heated, system.time_steps[-1], reference, 10.0)
+        plain = measure.measure(system, METHODS["rattle"], system.time_steps[-1], reference, 10.0)
+    finally:
+        del METHODS["heated"]
+    assert row["slope"] > 10 * row["slope_error"] and row["slope"] > 100 * abs(plain["slope"])
+
+
+# -- budgets and failures ---------------------------------------------------------------------------
+
+
+class Slow(Run):
+    """Sleeps in each step."""
+
+    seconds = 0.05
+
+    def __init__(self, system, dt):
+        super().__init__(dt)
+        self.system = system
+
+    def advance(self, steps=1):
+        for _ in range(steps):
+            time.sleep(self.seconds)
+        self.done += steps
+
+    def observe(self):
+        return self.system.positions, self.system.velocities
+
+
+def test_what_exceeds_the_budget_is_stopped_after_a_step(registry):
+    add_method("slow", Slow)
+    found = compare(chain(), ["slow", "rattle"], budget=0.2, rounds=0)
+    slow = found[found.method == "slow"]
+    assert "partial" in set(slow.status) and set(slow.status) <= {"ok", "partial", "not run"}
+    first = slow[slow.status == "partial"].iloc[0]
+    assert first.steps >= 1 and np.isnan(first.error) and first.step_seconds == pytest.approx(0.05, rel=0.5)
+    assert "exceed the budget of 0.2 s" in first.note
+    assert (found[found.method == "rattle"].status == "ok").all()
+
+
+def test_a_step_that_does_not_end_is_interrupted(registry):
+    class Hanging(Slow):
+        seconds = 60.0
+
+    add_method("hanging", Hanging)
+    begun = time.perf_counter()
+    (row,) = compare(chain(), ["hanging"], budget=0.2, rounds=0).to_dict("records")
+    assert time.perf_counter() - begun < 10
+    assert row["status"] == "partial" and "step 1 was not done" in row["note"]
+
+
+def test_what_a_method_raises_is_a_result(registry):
+    class Failing(Rattle):
+        def step(self, system, state, dt):
+            if state.step == 2:
+                raise InputError("no solution at this step", item="dt")
+            return super().step(system, state, dt)
+
+    class Unable(Rattle):
+        def check(self, system):
+            raise UnsupportedError("no such constraints here; use Rattle")
+
+    add_method("failing", functools.partial(on_arrays, lambda dt: Failing()))
+    add_method("unable", functools.partial(on_arrays, lambda dt: Unable()))
+    found = compare(chain(), ["failing", "unable"], rounds=0)
+    failed = found[found.method == "failing"]
+    assert (failed.status == "failed").all()
+    assert failed.note.str.contains("InputError: no solution at this step").iloc[0]
+    (unable,) = found[found.method == "unable"].to_dict("records")
+    assert (unable["status"], unable["note"]) == ("not run", "no such constraints here; use Rattle")
+
+
+def test_bad_input():
+    with pytest.raises(InputError, match="the budget is 0 s; give a positive number"):
+        compare(chain(), ["rattle"], budget=0)
+
+
+def test_a_set_up_of_openmm_beyond_the_budget_is_refused_from_then_on():
+    rotor = test_systems.build("rotor").shortened(4)
+    rotor.openmm._waited = 50.0
+    found = compare(rotor, ["openmm-verlet", "openmm-held-rattle"], budget=20, rounds=0)
+    refused = found.iloc[0]
+    assert refused.status == "not run"
+    assert "OpenMM took 50 s to set up its own solver for 6 constraints, longer than the budget of 20 s" in refused.note
+    assert set(found.iloc[1:].status) == {"ok"}
+
+
+# -- times ------------------------------------------------------------------------------------------
+
+
+def test_short_runs_are_timed_in_rounds_and_long_ones_once():
+    assert (table()[table().method == "rattle"].rounds >= 2).all()
+    once = compare(chain(), ["rattle"], rounds=0)
+    assert (once.rounds == 0).all() and once.attrs["margin"] is None
+
+
+def test_the_median_of_the_rounds_is_the_time_of_a_step(monkeypatch):
+    """With a clock that counts: a pass takes 1 s, then 3 s, then 2 s, and so on."""
+    given = iter(np.tile([1.0, 3.0, 2.0], 1000))
+    now = [0.0]
+
+    def clock():
+        return now[0]
+
+    class Ticking(Slow):
+        seconds = 0.0
+
+        def advance(self, steps=1):
+            super().advance(steps)
+            if steps > 1:
+                now[0] += next(given)
+
+        def rewind(self):
+            pass
+
+    system = chain()
+    rows = [measure.measure(system, METHODS["rattle"], system.time_steps[0], system.reference(), 10.0)]
+    method = add_method("ticking", Ticking)
+    try:
+        rows[0] |= {"method": method.name}
+        timing = measure.Rounds(system, 3, 10.0, 30.0, measure.Watcher())
+        timing.clock = clock
+        monkeypatch.setattr(measure, "MORE_SECONDS", 0.0)
+        margin = timing.time(rows)
+    finally:
+        del METHODS["ticking"]
+    assert rows[0]["rounds"] == 3 and rows[0]["step_seconds"] == pytest.approx(2.0 / rows[0]["steps"])
+    # The median of the odd rounds is 1.5, that of the even one 3.
+    assert margin == pytest.approx(1.0)
+
+
+def test_steps_that_cost_unevenly_are_timed_again_and_told():
+    rows = [
+        {"method": "rattle", "adaptive": False, "rounds": 3, "step_seconds": cost, "note": ""}
+        for cost in (1.0, 1.5, 2.5)
+    ]
+    assert measure._uneven(rows) == rows
+    rows[2]["step_seconds"] = 1.9
+    assert measure._uneven(rows) == []
+
+
+def test_margin_is_what_nine_tenths_of_the_medians_keep_to():
+    assert measure.margin([[1.0, 1.1], [1.0, 1.0], [2.0]]) == pytest.approx(0.09, abs=0.01)
+    assert measure.margin([[1.0]]) is None and measure.margin([]) is None
+
+
+# -- going on ---------------------------------------------------------------------------------------
+
+
+def test_methods_that_are_there_are_not_run_again(monkeypatch):
+    kept = []
+    names = ["rattle", "ase-kcons", "suzuki4"]
+
+    def stop(found):
+        kept.append(found)
+        if len(kept) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare(chain(), names, rounds=1, keep=stop)
+    assert list(dict.fromkeys(kept[-1].method)) == names[:2]
+    ran = []
+    original = measure.all_settings
+    monkeypatch.setattr(measure, "all_settings", lambda *args: ran.append(args[1].name) or original(*args))
+    found = compare(chain(), names, rounds=1, done=kept[-1])
+    assert ran == ["suzuki4"] and list(dict.fromkeys(found.method)) == names
+    whole = compare(chain(), names, rounds=1)
+    np.testing.assert_array_equal(found.error, whole.error)
+
+
+def test_progress_is_told():
+    class Listener(measure.Watcher):
+        def __init__(self):
+            self.said = []
+
+        def begin(self, what, total):
+            self.said.append(what)
+
+    listener = Listener()
+    compare(chain(), ["rattle"], rounds=1, watcher=listener)
+    assert "reference solution" in listener.said and "kcons RATTLE, dt 10" in listener.said
+    assert listener.said[-1] == "times, in rounds"

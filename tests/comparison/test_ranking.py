@@ -1,0 +1,151 @@
+"""Rankings: the cheapest that is good enough, ties within the scatter, steps that are found for an error."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kcons.comparison import compare, find_steps, observed_orders, rank, test_systems
+from kcons.comparison.measure import table_of
+from kcons.comparison.ranking import cost_at, pareto, predict
+from kcons.errors import InputError
+
+ABOUT = {
+    "title": "a system",
+    "horizon": 10.0,
+    "length": "Å",
+    "energy": "eV",
+    "time": "fs",
+    "long_time": "ps",
+    "force_seconds": 1e-3,
+    "reference_error": 1e-12,
+    "reference": "closed form",
+    "error_unit": "Å",
+    "margin": 0.1,
+}
+
+
+def row(method, setting, error, seconds, **more):
+    known = {"method": method, "title": f"kcons {method}" if method != "peer" else "a peer", "engine": "arrays"}
+    costs = {
+        "seconds": seconds,
+        "evaluations": 1000 / setting,
+        "step_seconds": seconds / 1000,
+        "steps": 10,
+        "rounds": 3,
+    }
+    return {**known, **costs, "adaptive": False, "setting": setting, "status": "ok", "error": error, "note": "", **more}
+
+
+def made(*rows, **about):
+    return table_of(list(rows), {**ABOUT, **about})
+
+
+#: Second order by RATTLE, fourth order by another, which is dearer a step.
+ROWS = (
+    row("rattle", 4.0, 4e-3, 1.0),
+    row("rattle", 2.0, 1e-3, 2.0),
+    row("rattle", 1.0, 2.5e-4, 4.0),
+    row("blanes", 8.0, 1.6e-3, 2.1),
+    row("blanes", 4.0, 1e-4, 4.2),
+    row("peer", 2.0, 1e-3, 5.0),
+    row("peer", 1.0, 2.5e-4, 10.0),
+)
+
+
+def test_the_cheapest_that_is_as_good_as_the_usual():
+    found = rank(made(*ROWS))
+    assert (found.limit, found.limit_is) == (1e-3, "what kcons rattle makes at 2 fs")
+    assert list(found.table.method) == ["rattle", "blanes", "peer"]
+    assert list(found.table.setting) == [2.0, 4.0, 2.0]
+    assert list(found.table.place) == [1, 2, 3] and list(found.table.times) == [1.0, 2.1, 2.5]
+
+
+def test_costs_within_the_scatter_share_a_place():
+    rows = [row("rattle", 2.0, 1e-3, 2.0), row("blanes", 2.0, 1e-3, 2.15), row("peer", 2.0, 1e-3, 2.3)]
+    assert list(rank(made(*rows)).table.place) == [1, 1, 3]
+    assert list(rank(made(*rows, margin=0.2)).table.place) == [1, 1, 1]
+    assert list(rank(made(*rows, margin=None)).table.place) == [1, 2, 3]  # 5 % at least
+
+
+def test_an_error_that_is_asked_for():
+    found = rank(made(*ROWS), limit=2e-4)
+    assert list(found.table.method) == ["blanes"] and list(found.beyond.method) == ["rattle", "peer"]
+    none = rank(made(*ROWS), limit=1e-6)
+    assert not len(none.table) and none.beyond.iloc[0].method == "blanes"
+
+
+def test_evaluations_decide_where_forces_take_no_time():
+    found = rank(made(*ROWS, force_seconds=1e-8))
+    assert found.cost == "evaluations"
+    assert list(found.table.method) == ["blanes", "rattle", "peer"]
+    assert list(found.table.place) == [1, 2, 2]
+
+
+def test_the_drift_of_the_energy():
+    rows = [row("rattle", 2.0, 1e-3, 2.0, slope=1e-5, slope_error=1e-6), row("peer", 2.0, 1e-3, 1.0, slope=-1e-3)]
+    found = rank(made(*rows), "drift")
+    assert found.what == "drift of the energy" and found.unit == "eV/ps a degree of freedom"
+    assert list(found.table.method) == ["rattle"] and found.table.value.iloc[0] == pytest.approx(1.2e-5)
+
+
+def test_what_cannot_be_ranked():
+    assert rank(made(row("rattle", 2.0, math.nan, 1.0, status="failed"))) is None
+    below = rank(made(row("rattle", 2.0, 1e-15, 1.0), row("peer", 2.0, 1e-16, 2.0)))
+    assert below.limit_is == "the least that the reference can tell apart" and len(below.table) == 2
+
+
+def test_fronts_and_costs_between_points():
+    table = made(*ROWS)
+    best = pareto(table, "seconds")
+    assert list(zip(best.method, best.setting, strict=True)) == [
+        ("rattle", 4.0), ("rattle", 2.0), ("rattle", 1.0), ("blanes", 4.0),
+    ]  # fmt: skip
+    rattle = table[table.method == "rattle"]
+    assert cost_at(rattle, "seconds", 5e-4) == pytest.approx(2.0 * math.sqrt(2))
+    assert cost_at(rattle, "seconds", 1e-2) == 1.0 and cost_at(rattle, "seconds", 1e-5) == math.inf
+
+
+def test_observed_orders():
+    assert observed_orders(made(*ROWS)) == pytest.approx({"kcons rattle": 2.0, "kcons blanes": 4.0, "a peer": 2.0})
+    assert observed_orders(made(*ROWS, error_unit="eV")) == {}
+    # What the reference cannot tell apart says nothing.
+    assert "kcons rattle" not in observed_orders(made(*ROWS, reference_error=1e-3))
+
+
+def test_a_step_is_predicted_by_the_slope():
+    rattle = made(*ROWS)[:3]
+    found = predict(rattle, 1e-4)
+    assert found.setting == pytest.approx(1.0 * math.sqrt(0.4)) and found.order == pytest.approx(2.0)
+    assert found.seconds == pytest.approx(4.0 / math.sqrt(0.4))
+    assert predict(rattle[:1], 1e-4) is None and predict(rattle, 1e-12) is None
+    flat = pd.DataFrame(rattle).assign(error=[1e-3, 1.1e-3, 1e-3])
+    assert predict(flat, 1e-4) is None
+
+
+def test_steps_are_found_for_an_error():
+    system = test_systems.build("chain", 4)
+    reference = system.reference()
+    table = compare(system, ["rattle", "blanes-moan4"], reference=reference, rounds=0)
+    target = 1e-6
+    rows = find_steps(system, table, target, reference)
+    good = [r for r in rows if r["error"] <= target]
+    assert good and min(r["error"] for r in good) > 0.2 * target
+    whole = table_of([*table.to_dict("records"), *rows], table.attrs)
+    found = rank(whole, limit=target)
+    assert found.table.method.iloc[0] == "blanes-moan4" and found.table.value.iloc[0] <= target
+    with pytest.raises(InputError, match="the target error is -1; give a positive number"):
+        find_steps(system, table, -1, reference)
+    assert find_steps(system, table, 1e-16, reference) == []
+
+
+def test_nothing_of_the_table_is_changed():
+    table = made(*ROWS)
+    before = table.copy()
+    rank(table)
+    observed_orders(table)
+    pd.testing.assert_frame_equal(table, before)
+    assert np.isfinite(table.error).all()

@@ -1,0 +1,83 @@
+"""SHAKE and RATTLE by sweeps: the same answers as the engine, to the tolerance asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from peers.gauss_seidel import GaussSeidel
+
+from kcons.comparison import test_systems
+from kcons.errors import ConvergenceError, InputError
+
+
+def sweeps(system, tolerance):
+    return GaussSeidel(system.bonds, system.masses, system.positions, tolerance)
+
+
+def displaced(system, dt):
+    x, v = system.positions, system.velocities
+    return x + dt * v, v.copy()
+
+
+@pytest.mark.parametrize(("name", "size"), [("rotor", 1), ("chain", 20), ("chain-free", 20), ("dumbbells", 8)])
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-12])
+def test_positions_and_velocities_are_those_of_the_engine(name, size, tolerance):
+    system = test_systems.build(name, size)
+    dt = system.time_steps[-1]
+    moved, v = displaced(system, dt)
+    found, speeds = moved.copy(), v.copy()
+    held = sweeps(system, tolerance)
+    held.positions(found, system.positions, speeds, dt)
+    change = v.copy()
+    wanted = system.motion.project_positions(moved, system.positions, velocities=change, dt=dt)
+    # Errors of single rows add up along a chain.
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=size**2 * 30 * tolerance)
+    np.testing.assert_allclose(found - moved, dt * (speeds - v), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(speeds, change, rtol=0, atol=size**2 * 30 * tolerance / dt)
+    lengths = np.linalg.norm(system.positions[system.bonds[:, 0]] - system.positions[system.bonds[:, 1]], axis=1)
+    now = np.linalg.norm(found[system.bonds[:, 0]] - found[system.bonds[:, 1]], axis=1)
+    assert np.abs(now / lengths - 1).max() < 1.1 * tolerance
+
+    rng = np.random.default_rng(0)
+    wild = np.abs(system.velocities).max() * rng.standard_normal(found.shape)
+    tangent = wild.copy()
+    held.velocities(wanted, tangent, dt)
+    right = system.motion.project_velocities(wanted, wild)
+    np.testing.assert_allclose(tangent, right, rtol=0, atol=size**2 * 30 * tolerance / dt)
+
+
+def test_a_looser_tolerance_takes_fewer_sweeps_and_leaves_more():
+    system = test_systems.build("chain", 50)
+    dt = system.time_steps[0]
+    taken, left = [], []
+    for tolerance in (1e-3, 1e-6, 1e-9):
+        x, v = displaced(system, dt)
+        held = sweeps(system, tolerance)
+        held.positions(x, system.positions, v, dt)
+        taken.append(held.sweeps)
+        left.append(np.abs(system.constraint_set.value(x)).max())
+    assert taken[0] < taken[1] < taken[2]
+    assert left[0] > 100 * left[1] > 1e4 * left[2]
+
+
+def test_atoms_of_infinite_mass_stay():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    held = GaussSeidel([[0, 1]], [np.inf, 1.0], x, 1e-12)
+    moved, v = np.array([[0.0, 0, 0], [1.1, 0.2, 0]]), np.zeros((2, 3))
+    held.positions(moved, x, v, 1.0)
+    assert not moved[0].any()
+    assert np.linalg.norm(moved[1]) == pytest.approx(1.0, abs=1e-11)
+
+
+def test_failures_are_errors():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    held = GaussSeidel([[0, 1]], [1.0, 1.0], x, 1e-12)
+    turned = np.array([[0.0, 0, 0], [0.0, 1.0001, 0]])
+    with pytest.raises(ConvergenceError, match="SHAKE did not converge"):
+        held.positions(turned, x, np.zeros((2, 3)), 1.0)
+    with pytest.raises(ConvergenceError, match="SHAKE"):
+        held.positions(np.full((2, 3), np.nan), x, np.zeros((2, 3)), 1.0)
+    with pytest.raises(ConvergenceError, match="RATTLE"):
+        held.velocities(x, np.full((2, 3), np.nan), 1.0)
+    with pytest.raises(InputError, match="whole"):
+        GaussSeidel([[0, 1]], [1.0, 1.0], x, 1e-12, lengths=[0.5])
