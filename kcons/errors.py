@@ -227,12 +227,12 @@ class MissingPackageError(KconsError, ModuleNotFoundError):
 EXTRAS = {
     "ase": "ase",
     "matplotlib": "plots",
+    "pandas": "plots",
     "openmm": "openmm",
     "MDAnalysis": "mdanalysis",
     "tblite": "xtb",
     "sympy": "formulas",
     "pymbar": "free-energy",
-    "shtab": "completion",
 }
 
 

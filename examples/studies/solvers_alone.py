@@ -5,14 +5,13 @@
 
 P brings positions back onto the constraints after a step of 2 fs at 300 K, V takes out of thermal velocities what
 leaves them. Each solver does both, warm, on one thread. DIR/precision.csv: residual and time a constraint at every
-tolerance that a solver has (kcons has none but rounding). DIR/scaling.csv: time and memory against size, at a tolerance
+tolerance that a solver has (kcons has none but rounding). DIR/scaling.csv: time against size, at a tolerance
 of 1e-8, each point in a process of its own.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -59,10 +58,8 @@ TOLERANCE = 1e-8
 LONGEST, QUICK_LONGEST = 120.0, 30.0
 #: Exponents are fitted to sizes from here on: below, the call costs more than the work.
 FIT_FROM = 1000
-#: Bytes below which growth of memory is not seen: freed memory is used again.
-LEAST_MEMORY = 2**18
 #: Columns that grow with the size, and what figures call them.
-GROWING = {"P seconds": "positions, s", "V seconds": "velocities, s", "memory": "memory, bytes"}
+GROWING = {"P seconds": "positions, s", "V seconds": "velocities, s", "set-up": "set-up, s"}
 COLORS = {"kcons": "#0072B2", "sweeps": "#a6611a", "ase": "#D55E00", "openmm": "#009E73", "lammps": "#6a51a3"}
 TITLES = {candidate.name: candidate.title for candidate in CANDIDATES}
 
@@ -103,7 +100,7 @@ def timed(system: BareSystem, candidate: Candidate, tolerance: float) -> dict[st
 
 
 def scaling(kind: str, solver: str, sizes: tuple[int, ...], longest: float) -> Iterator[dict[str, Any]]:
-    """Time, set-up and memory at growing sizes, until one takes longer than `longest` or fails."""
+    """Time and set-up at growing sizes, until one takes longer than `longest` or fails."""
     for size in sizes:
         row: dict[str, Any] = {"kind": kind, "size": size, "solver": solver}
         command = [sys.executable, __file__, "--one", kind, str(size), solver]
@@ -126,32 +123,14 @@ def one(kind: str, size: int, solver: str) -> dict[str, Any]:
     build = KINDS[kind][0]
     timed(build(8), candidate, tolerance)  # imports and kernels
     system = build(size)
-    _ = system.moved  # before memory is looked at
-    before = resident()
     stages = timed(system, candidate, tolerance)
-    grown = peak() - before
-    found: dict[str, Any] = {"rows": system.n_rows, "status": "ok", "memory": grown if grown > LEAST_MEMORY else None}
+    found: dict[str, Any] = {"rows": system.n_rows, "status": "ok"}
     for stage, values in stages.items():
         if values["status"] != "ok":
             return {**found, "status": values["status"], "words": values["words"]}
         found |= {f"{stage} seconds": values["seconds"], f"{stage} residual": values["residual"]}
         found["set-up"] = values["set-up"]
     return found
-
-
-def resident() -> int:
-    """Bytes in use now (Linux), or at most so far."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return peak()
-
-
-def peak() -> int:
-    """Bytes in use at most so far."""
-    import resource  # not on Windows
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def exponents(table: pd.DataFrame) -> dict[tuple[str, str, str], float]:
@@ -171,13 +150,13 @@ def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
         shown = table[table.status == "ok"]
         columns = {"title": "system", "solver": "solver", "tolerance": "tolerance", "stage": "stage"}
         return {"precision": shown[[*columns, "ns a row", "residual"]].rename(columns=columns)}
-    shown = table[["kind", "size", "solver", "P seconds", "V seconds", "set-up", "memory", "status"]]
-    fitted = pd.DataFrame((*which, power) for which, power in exponents(table).items())
+    shown = table[["kind", "size", "solver", "P seconds", "V seconds", "set-up", "status"]]
+    fitted = pd.DataFrame((*which, f"{power:.2f}") for which, power in exponents(table).items())
     return {"scaling": shown, "exponents": fitted.set_axis(["kind", "solver", "column", "power of the size"], axis=1)}
 
 
 def figures(table: pd.DataFrame) -> dict[str, Figure]:
-    """Residual against time a constraint; or time and memory against size."""
+    """Residual against time a constraint; or time against size."""
     from matplotlib.figure import Figure
 
     ok = table[table.status == "ok"]

@@ -171,7 +171,7 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
     best = good.sort_values("cost").drop_duplicates("method")
     beyond = done[~done.method.isin(good.method)].sort_values("value").drop_duplicates("method")
     same = scatter(table, cost)
-    drift = f"{about['energy']}/{about['long_time']} a degree of freedom"
+    drift = f"{about.get('energy', '')}/{about['long_time']} a degree of freedom"
     return Ranking(
         table=best.assign(place=_places(list(best.cost), same), times=best.cost / best.cost.min()),
         beyond=beyond,

@@ -19,7 +19,13 @@ from kcons.motion import Motion
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), ROOT / "examples" / "studies" / "xtb_steps.py"]
+#: Studies on the harness have tests of their own, in tests/studies.
+OWN = {
+    *("harness", "bare_solvers", "bare_systems", "fitted_forces"),
+    *("hard_cases", "stability", "solvers_alone", "whole_comparison"),
+}
+STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
+EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 #: Between the cells of a table.

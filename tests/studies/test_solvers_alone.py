@@ -40,7 +40,7 @@ def test_exponents_are_fitted_beyond_the_cost_of_a_call():
         for solver, power in (("kcons", 1.0), ("sweeps", 1.5))
         for n in sizes
     ]
-    table = pd.DataFrame(rows).assign(**{"V seconds": None, "memory": None})
+    table = pd.DataFrame(rows).assign(**{"V seconds": None, "set-up": None})
     fitted = solvers_alone.exponents(table)
     assert fitted["chain", "kcons", "P seconds"] == pytest.approx(1.0)
     assert fitted["chain", "sweeps", "P seconds"] == pytest.approx(1.5)

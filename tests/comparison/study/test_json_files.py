@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import pytest
 
-import kcons
 from kcons.comparison.study import json_files
 from kcons.errors import InputError
 
@@ -51,13 +49,3 @@ def test_other_files_are_refused(tmp_path, text):
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"x\.json holds no result of this study"):
         json_files.read(path, "mine", of="this study")
-
-
-def test_results_are_written_here_alone():
-    """What else makes JSON speaks to a process, or to a page of its own."""
-    root = Path(kcons.__file__).parents[1]
-    files = [*(root / "kcons" / "comparison").rglob("*.py"), *(root / "kcons" / "cli").rglob("*.py")]
-    files += [*(root / "kcons" / "mdanalysis").rglob("*.py"), *(root / "examples").rglob("*.py")]
-    found = {path.name for path in files if "json.dump" in path.read_text(encoding="utf-8")}
-    assert found == {"scaling.py", "main.py", "studies/check_speed.py", "doctor.py", "interactive.py"}
-    assert not [path.name for path in files if "write_text(json" in path.read_text(encoding="utf-8")]

@@ -33,10 +33,40 @@ MUTANTS = [
         "tests/comparison/study/test_curves.py::test_marks_along_an_edge_do_not_count_as_data",
     ),
     (
-        "comparison/methods/engines.py",
-        "self.context.setPositions(x * self._length)",
+        "comparison/runs.py",
+        "self.context.setPositions(x * self.length)",
         "self.context.setPositions(x)",
-        "tests/comparison/methods/test_engines.py::test_units_of_openmm",
+        "tests/hard_cases/test_hard_cases.py::test_in_ase_and_openmm",
+    ),
+    (
+        "comparison/ranking.py",
+        "if cost > leader * (1 + same) or not places:",
+        "if True:",
+        "tests/comparison/test_ranking.py::test_costs_within_the_scatter_share_a_place",
+    ),
+    (
+        "comparison/ranking.py",
+        "beyond = done[~done.method.isin(good.method)]",
+        "beyond = done",
+        "tests/comparison/test_ranking.py::test_an_error_that_is_asked_for",
+    ),
+    (
+        "comparison/measure.py",
+        "if method.name not in there:",
+        "if True:",
+        "tests/comparison/test_measure.py::test_methods_that_are_there_are_not_run_again",
+    ),
+    (
+        "comparison/measure.py",
+        'row["seconds"] *= step / row["step_seconds"]',
+        "pass",
+        "tests/comparison/test_measure.py::test_a_row_a_method_and_setting",
+    ),
+    (
+        "comparison/report.py",
+        "height = max(height + least, float(",
+        "height = max(height, float(",
+        "tests/comparison/test_report.py::test_no_name_is_cut_or_covers_another",
     ),
     (
         "openmm/collective/row_program.py",
