@@ -124,7 +124,11 @@ def _trajectories(chosen: argparse.Namespace, budget: float, folder: Path) -> in
             table.attrs["asked"] = asked
             report.write_csv(path, table)
 
-        options = {"budget": budget, "rounds": 1 if chosen.quick else measure.ROUNDS, "reference": reference}
+        options: dict[str, Any] = {
+            "budget": budget,
+            "rounds": 1 if chosen.quick else measure.ROUNDS,
+            "reference": reference,
+        }
         try:
             table = measure.compare(system, chosen.methods, **options, done=done, keep=keep, watcher=watcher)
         except KeyboardInterrupt:

@@ -83,5 +83,5 @@ def _layers(chosen: argparse.Namespace) -> Layers:
         raise InputError(f"--slow and --fast are for {known} and for files, not {chosen.scene!r}", item="scene")
     if chosen.slow is None:
         raise InputError("a file needs --slow and --fast, the expensive and the cheap forces", item="slow")
-    slow, fast = (argparse.Namespace(**{**vars(chosen), "forces": name}) for name in (chosen.slow, chosen.fast))
-    return layers.of_test_systems(test_system(slow), test_system(fast))
+    both = [argparse.Namespace(**{**vars(chosen), "forces": name}) for name in (chosen.slow, chosen.fast)]
+    return layers.of_test_systems(test_system(both[0]), test_system(both[1]))

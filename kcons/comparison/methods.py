@@ -254,13 +254,17 @@ def _code_of_stepper(stepper: str, system: TestSystem, dt: str, steps: int) -> l
     ]
 
 
+def _without_step(kind: type[steppers.Stepper]) -> Callable[[float], steppers.Stepper]:
+    return lambda dt: kind()
+
+
 #: Rate of the feedback of Baumgarte's stepper, in inverse time steps: fast, and well within what is stable.
 FEEDBACK = 0.1
 
 for _name, _kind in STEPPERS.items():
     add_method(
         _name,
-        partial(on_arrays, lambda dt, kind=_kind: kind()),
+        partial(on_arrays, _without_step(_kind)),
         title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
         force_evaluations=_kind().force_evaluations,
         usual=_name in USUAL,
@@ -646,7 +650,10 @@ def _add_openmm() -> None:
         for tolerance in TOLERANCES:
             plain, told = tolerance == DEFAULT, exponent(tolerance)
             given = ", ".join([*(f"{a:g}" for a in arguments), "STEP"])
-            made = (f"integrator = openmm.{kind}({given})", f"integrator.setConstraintTolerance({tolerance:g})")
+            made: tuple[str, ...] = (
+                f"integrator = openmm.{kind}({given})",
+                f"integrator.setConstraintTolerance({tolerance:g})",
+            )
             add_method(
                 name if plain else f"{name}-{told}",
                 partial(_own, kind, arguments, tolerance),

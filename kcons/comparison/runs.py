@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ase.constraints import FixAtoms, FixBondLengths, FixInternals
+from numpy.typing import ArrayLike
 
 from kcons import steppers
 from kcons.constraints.target import FloatArray
@@ -230,7 +231,7 @@ def seen(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
 
 
 def ase_constraints(
-    fixed: Sequence[int],
+    fixed: ArrayLike,
     pairs: Any,
     lengths: Any,
     triples: Any = (),
@@ -243,7 +244,7 @@ def ase_constraints(
 
     Parameters
     ----------
-    fixed : sequence of int
+    fixed : array_like of int
     pairs, lengths, triples, degrees
         Distances in Å and angles in degrees.
     internals : bool
@@ -251,7 +252,8 @@ def ase_constraints(
     **options
         For FixInternals.
     """
-    held: list[Any] = [FixAtoms(list(fixed))] if len(fixed) else []
+    still = np.asarray(fixed, dtype=int)
+    held: list[Any] = [FixAtoms(still.tolist())] if len(still) else []
     if internals:
         bonds = [[float(d), [int(i) for i in pair]] for d, pair in zip(lengths, pairs, strict=True)]
         angles = [[float(a), [int(i) for i in triple]] for a, triple in zip(degrees, triples, strict=True)]
