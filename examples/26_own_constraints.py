@@ -38,7 +38,7 @@ from kcons.constraints import (
     Torus,
     VelocityFormula,
 )
-from kcons.steppers import BlanesMoan6, Extrapolation, Multistep
+from kcons.steppers import BlanesMoan6, Extrapolation
 
 AXES = np.array([1.0, 2.0, 3.0])
 TORUS = "sqrt((sqrt(x1**2 + y1**2) - R)**2 + z1**2)"
@@ -252,7 +252,7 @@ def car_by_dop853(tolerance: float) -> Car:
     return found.y[:4, -1], index_one(END, found.y[:, -1])[1], found.nfev
 
 
-def car_by_kcons(scheme: Multistep | Extrapolation | int) -> Car:
+def car_by_kcons(scheme: Extrapolation | int) -> Car:
     """The same; a number is that of steps of BlanesMoan6."""
     times: list[float] = []
 
@@ -286,7 +286,6 @@ def car_error(found: Car) -> float:
 #: Name -> how, each at the loosest setting with an error below 1e-7.
 CAR: dict[str, Callable[[], Car]] = {
     "SciPy alone, DOP853": lambda: car_by_dop853(1e-7),
-    "Multistep": lambda: car_by_kcons(Multistep(1e-6)),
     "Extrapolation": lambda: car_by_kcons(Extrapolation(2e-8)),
     "BlanesMoan6": lambda: car_by_kcons(145),
 }

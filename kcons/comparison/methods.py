@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from scipy.linalg import qr
@@ -34,6 +34,7 @@ Refuses = Callable[[TestSystem], str | None]
 #: A test system, a step as text (or a tolerance) and the number of steps to lines of Python.
 Code = Callable[[TestSystem, str, int], list[str]]
 
+Kind = Literal["trajectory", "baseline", "thermostat"]
 ENGINES = ("arrays", "ASE", "OpenMM")
 
 
@@ -47,12 +48,21 @@ class Method:
     engine: str
     force_evaluations: int
     adaptive: bool
-    holds: bool
-    follows: bool
+    kind: Kind
     usual: bool
     friction: bool
     refuses_too: Refuses
     code: Code | None
+
+    @property
+    def holds(self) -> bool:
+        """Whether it holds what the test system holds."""
+        return self.kind != "baseline"
+
+    @property
+    def follows(self) -> bool:
+        """Whether it is to follow the reference trajectory."""
+        return self.kind == "trajectory"
 
     def refuses(self, system: TestSystem) -> str | None:
         """Why it cannot run a test system, or None."""
@@ -86,8 +96,7 @@ def add_method(
     engine: str = "arrays",
     force_evaluations: int = 1,
     adaptive: bool = False,
-    holds: bool = True,
-    follows: bool = True,
+    kind: Kind = "trajectory",
     usual: bool = True,
     friction: bool = False,
     refuses: Refuses = lambda system: None,
@@ -109,10 +118,8 @@ def add_method(
         Of a step. Steps are as many times longer than RATTLE's, so that all cost about the same.
     adaptive : bool
         Whether its setting is a relative tolerance.
-    holds : bool
-        False for a baseline, of which only the cost is stated.
-    follows : bool
-        False for a thermostat: no error of a trajectory can be stated.
+    kind : {'trajectory', 'baseline', 'thermostat'}
+        A baseline holds nothing, and only its cost is stated. Of a thermostat no error of a trajectory can be stated.
     usual : bool
         Whether it runs unless methods are named.
     friction : bool
@@ -125,14 +132,16 @@ def add_method(
     Raises
     ------
     InputError
-        An unknown engine; force evaluations below 1.
+        An unknown engine or kind; force evaluations below 1.
     """
     if engine not in ENGINES:
         raise InputError(f"engine is {engine!r}; there are {', '.join(ENGINES)}", item="engine")
+    if kind not in get_args(Kind):
+        raise InputError(f"kind is {kind!r}; there are {', '.join(get_args(Kind))}", item="kind")
     if not (isinstance(force_evaluations, int) and force_evaluations >= 1):
         raise InputError(f"force_evaluations is {force_evaluations!r}; give 1 or more", item="force_evaluations")
     METHODS[name] = made = Method(
-        name, title or name, start, engine, force_evaluations, adaptive, holds, follows, usual, friction, refuses, code
+        name, title or name, start, engine, force_evaluations, adaptive, kind, usual, friction, refuses, code
     )
     return made
 
@@ -308,7 +317,7 @@ add_method(
     friction=True,
     code=_code_of_extrapolation,
 )
-add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", holds=False)
+add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", kind="baseline")
 
 
 def independent_rows(system: TestSystem, held: ConstraintSet | None = None) -> ConstraintSet:
@@ -500,7 +509,7 @@ add_method(
     partial(_in_ase, lambda system: []),
     title="baseline: ASE Verlet, nothing held",
     engine="ASE",
-    holds=False,
+    kind="baseline",
 )
 
 
@@ -668,7 +677,7 @@ def _add_openmm() -> None:
         ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", "NoseHooverIntegrator"),
     ):
         start = partial(_own, kind, bath, DEFAULT)
-        add_method(name, start, title=title, engine="OpenMM", follows=False, refuses=_kelvin)
+        add_method(name, start, title=title, engine="OpenMM", kind="thermostat", refuses=_kelvin)
     usual = ("rattle", "suzuki4", "blanes-moan4", "kahan-li6", "blanes-moan6")
     for scheme in (*usual, "geodesic", "yoshida4", "blanes-moan6a", "leapfrog"):
         each = 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
@@ -722,7 +731,7 @@ def _add_openmm() -> None:
             refuses=_surfaces,
         )
     free = "baseline: OpenMM Verlet, nothing held"
-    add_method("openmm-free", _free_in_openmm, title=free, engine="OpenMM", holds=False)
+    add_method("openmm-free", _free_in_openmm, title=free, engine="OpenMM", kind="baseline")
 
 
 _add_openmm()

@@ -15,7 +15,6 @@ A stepper never changes its input. Where it raises, nothing has happened.
 """
 
 from kcons.steppers.adaptive.extrapolation import Extrapolation
-from kcons.steppers.adaptive.multistep import Multistep
 from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4
 from kcons.steppers.geodesic import Geodesic
 from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
@@ -36,7 +35,6 @@ __all__ = [
     "Extrapolation",
     "Geodesic",
     "KahanLi6",
-    "Multistep",
     "Observer",
     "ProjectedRungeKutta4",
     "ProjectedVerlet",

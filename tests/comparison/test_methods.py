@@ -81,6 +81,8 @@ def test_what_is_wrong_with_a_method_is_said(registry):
         add_method("mine", lambda system, dt: None, engine="gromacs")
     with pytest.raises(InputError, match="force_evaluations is 0; give 1 or more"):
         add_method("mine", lambda system, dt: None, force_evaluations=0)
+    with pytest.raises(InputError, match="kind is 'bath'; there are trajectory, baseline, thermostat"):
+        add_method("mine", lambda system, dt: None, kind="bath")
     assert "mine" not in registry
     with pytest.raises(InputError, match=r"there is no method 'ratle' \(did you mean 'rattle'"):
         choose(["ratle"])

@@ -2,5 +2,4 @@
 
 - `tolerated`: the tolerance, attempts at a step, and what is said where there is none
 - `extrapolation`: a reversible scheme, extrapolated to many digits
-- `multistep`: the accelerations of earlier steps, one force evaluation a step
 """

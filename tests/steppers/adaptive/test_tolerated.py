@@ -10,9 +10,9 @@ from stepper_systems import spherical_pendulum
 
 from kcons import run
 from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import Extrapolation, Multistep
+from kcons.steppers import Extrapolation
 
-SCHEMES = [Extrapolation, Multistep]
+SCHEMES = [Extrapolation]
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
