@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import study_scripts as scripts
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
@@ -23,7 +24,7 @@ from ase.md.md import MolecularDynamics
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import ConstrainedDynamics, constrain, draw_velocities, rigid_water
-from kcons.comparison import environment, processor_of, scripts
+from kcons.comparison import environment, processor_of
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
 

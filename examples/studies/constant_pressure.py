@@ -19,13 +19,14 @@ from typing import Any
 
 import numba
 import numpy as np
+import study_scripts as scripts
 from ase import units
 from ase.build import fcc100
 from ase.calculators.emt import EMT
 
 from kcons import ConstraintSet
 from kcons.ase import ConstrainedLangevin, constrain, draw_velocities
-from kcons.comparison import scripts, volumes
+from kcons.comparison import volumes
 from kcons.constraints import Distance, Plane
 from kcons.motion import Motion
 from kcons.steppers import run

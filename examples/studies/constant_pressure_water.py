@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study_scripts as scripts
 from ase import units
 
 from kcons import ConstraintSet
-from kcons.comparison import scripts, volumes
+from kcons.comparison import volumes
 from kcons.constraints import Distance
 from kcons.motion import Motion
 from kcons.steppers import run

@@ -24,6 +24,7 @@ from typing import Any
 
 import numba
 import numpy as np
+import study_scripts as scripts
 from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.constraints import FixBondLengths
@@ -33,7 +34,7 @@ from rich.console import Console
 import kcons
 from kcons import ConstraintSet, State, System
 from kcons.ase import constrain
-from kcons.comparison import environment, processor_of, scripts, system_of
+from kcons.comparison import environment, processor_of, system_of
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.motion import Motion
 from kcons.plan import make_plan

@@ -28,9 +28,7 @@ from kcons import run
 from kcons.comparison import environment, json_files
 from kcons.thermostats import slow_share
 
-spec = importlib.util.spec_from_file_location(
-    "long_steps_water", Path(__file__).with_name("long_steps_water.py")
-)
+spec = importlib.util.spec_from_file_location("long_steps_water", Path(__file__).with_name("long_steps_water.py"))
 assert spec is not None and spec.loader is not None
 water = sys.modules["long_steps_water"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(water)

@@ -19,11 +19,11 @@ os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons.comparison import scripts
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

@@ -25,11 +25,12 @@ from typing import Any
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 
 from kcons import ConstraintSet
-from kcons.comparison import environment, json_files, processor_of, scripts, system_of
+from kcons.comparison import environment, json_files, processor_of, system_of
 from kcons.constraints import Distance
 from kcons.errors import KconsError
 from kcons.motion import Motion

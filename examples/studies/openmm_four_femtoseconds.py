@@ -29,11 +29,12 @@ from typing import Any
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 
 from kcons import ConstraintSet, Motion
-from kcons.comparison import environment, json_files, scripts
+from kcons.comparison import environment, json_files
 from kcons.constraints import Angle, Constraint, Distance
 from kcons.openmm import Langevin, ProjectedIntegrator, constraints_of, hold, positions_of
 from kcons.topology import HeldRows, bond_angles

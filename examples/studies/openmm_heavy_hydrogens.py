@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import environment, scripts
+from kcons.comparison import environment
 from kcons.openmm import (
     Isokinetic,
     Langevin,

@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import environment, processor_of, scripts
+from kcons.comparison import environment, processor_of
 from kcons.openmm import Isokinetic, Langevin, Precision, ProjectedIntegrator, RattleIntegrator, positions_of
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

@@ -21,10 +21,11 @@ os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import environment, processor_of, scripts
+from kcons.comparison import environment, processor_of
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

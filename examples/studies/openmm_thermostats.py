@@ -22,10 +22,11 @@ os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import environment, json_files, processor_of, scripts
+from kcons.comparison import environment, json_files, processor_of
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

@@ -20,23 +20,16 @@ from typing import Any
 
 import numpy as np
 import openmm
+import study_scripts as scripts
 from ase import units
 from openmm import app
 from rich.console import Console
 from rich.table import Table
+from study_scripts import work_off
 
 from kcons import ConstraintSet, Motion
 from kcons.cli.progress import Bars
-from kcons.comparison import (
-    Potential,
-    environment,
-    layers,
-    long_steps,
-    long_steps_report,
-    processor_of,
-    scripts,
-    work_off,
-)
+from kcons.comparison import Potential, environment, layers, long_steps, long_steps_report, processor_of
 from kcons.constraints import Distance
 
 PDB = Path(__file__).resolve().parent.parent / "tests" / "data" / "alanine-dipeptide-implicit.pdb"

@@ -30,12 +30,13 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+import study_scripts as scripts
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 
 from kcons.ase import Constraints
-from kcons.comparison import environment, scripts
+from kcons.comparison import environment
 from kcons.constraints import Dihedral
 from kcons.free_energy import Scan, scan
 

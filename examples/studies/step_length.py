@@ -21,22 +21,14 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+import study_scripts as scripts
 from ase import units
 from rich.console import Console
 from rich.table import Table
+from study_scripts import work_off
 
 from kcons.cli.progress import Bars
-from kcons.comparison import (
-    ASE_UNITS,
-    environment,
-    fluid,
-    layers,
-    long_steps,
-    long_steps_report,
-    processor_of,
-    scripts,
-    work_off,
-)
+from kcons.comparison import ASE_UNITS, environment, fluid, layers, long_steps, long_steps_report, processor_of
 from kcons.steppers import State
 from kcons.thermostats import (
     Langevin,

@@ -14,11 +14,12 @@ import time
 from typing import Any
 
 import numpy as np
+import study_scripts as scripts
 from ase import Atoms
 from ase.calculators.calculator import Calculator
 
 from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
-from kcons.comparison import Fluid, environment, processor_of, scripts, test_systems
+from kcons.comparison import Fluid, environment, processor_of, test_systems
 from kcons.thermostats import thermal_velocities
 
 #: Fluid, molecules, steps of a block: 10 to 20 ms.

@@ -21,24 +21,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import study_scripts as scripts
 from ase import Atoms, units
 from rich.console import Console
 from rich.table import Table
+from study_scripts import work_off
 
 from kcons import ConstraintSet
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
 from kcons.cli.progress import Bars
-from kcons.comparison import (
-    LennardJones,
-    Potential,
-    PotentialCalculator,
-    environment,
-    fluid,
-    json_files,
-    processor_of,
-    scripts,
-    work_off,
-)
+from kcons.comparison import LennardJones, Potential, PotentialCalculator, environment, fluid, json_files, processor_of
 from kcons.constraints import Distance
 from kcons.motion import Motion
 from kcons.steppers import State, Stepper, System, run

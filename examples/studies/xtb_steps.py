@@ -30,20 +30,13 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import study_scripts as scripts
 from fitted_forces import FittedForces
+from study_scripts import work_off
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.cli.progress import Bars
-from kcons.comparison import (
-    Potential,
-    environment,
-    layers,
-    long_steps,
-    long_steps_report,
-    processor_of,
-    scripts,
-    work_off,
-)
+from kcons.comparison import Potential, environment, layers, long_steps, long_steps_report, processor_of
 from kcons.constraints import Distance
 from kcons.thermostats import ForceGroups, Langevin, thermal_velocities
 

@@ -8,8 +8,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from kcons.comparison.progress import Watcher
-from kcons.comparison.study.tables import duration
+from kcons.comparison.progress import Watcher, duration
 
 
 class Bars(Watcher):

@@ -30,8 +30,6 @@ _NAMES = {
     "report": ("figure", "read_csv", "text", "write_csv"),
     "runs": ("Run",),
     "study.json_files": ("json_files",),
-    "study.scripts": ("scripts",),
-    "study.study": ("work_off",),
     "test_systems": ("Reference", "TestSystem"),
     "test_systems.fluid": ("Fluid", "fluid"),
     "test_systems.lennard_jones": ("LennardJones",),

@@ -1,4 +1,4 @@
-"""Progress of long work, for whoever wants to show it."""
+"""Progress of long work, for whoever wants to show it, and times in words."""
 
 from __future__ import annotations
 
@@ -29,3 +29,11 @@ class Watcher:
             yield
         finally:
             self.end()
+
+
+def duration(seconds: float) -> str:
+    """Three digits and a unit, for example '12.5 ms'."""
+    for size, limit, unit in ((1e-9, 1e-6, "ns"), (1e-6, 1e-3, "µs"), (1e-3, 1.0, "ms"), (1.0, 600.0, "s")):
+        if seconds < 0.9995 * limit:
+            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
+    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"

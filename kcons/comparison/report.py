@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from kcons.comparison.machine import processor_of
+from kcons.comparison.progress import duration
 from kcons.comparison.ranking import COSTS, Ranking, cost_that_decides, pareto, rank, shown_setting, with_errors
 from kcons.errors import InputError
 from kcons.steppers.files import in_one_piece
@@ -148,14 +149,6 @@ def columns(table: pd.DataFrame, left: tuple[str, ...] = ()) -> str:
         return "  ".join(c.ljust(w) if name in left else c.rjust(w) for (name, w), c in pairs).rstrip()
 
     return "\n".join([line(list(widths)), *(line(list(row)) for row in table.itertuples(index=False))])
-
-
-def duration(seconds: float) -> str:
-    """Three digits and a unit, for example '12.5 ms'."""
-    for size, limit, unit in ((1e-9, 1e-6, "ns"), (1e-6, 1e-3, "µs"), (1e-3, 1.0, "ms"), (1.0, 600.0, "s")):
-        if seconds < 0.9995 * limit:
-            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
-    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
 
 
 def _spent(cost: float, kind: str) -> str:

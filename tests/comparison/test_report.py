@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 
 from kcons.comparison import compare, figure, rank, read_csv, test_systems, text, write_csv
-from kcons.comparison.report import CURVES, chosen_curves, columns, duration, sentence
+from kcons.comparison.progress import duration
+from kcons.comparison.report import CURVES, chosen_curves, columns, sentence
 from kcons.errors import InputError
 
 

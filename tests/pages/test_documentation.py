@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: Studies on the harness have tests of their own, in tests/studies.
 OWN = {
-    *("harness", "bare_solvers", "bare_systems", "fitted_forces"),
+    *("harness", "study_scripts", "bare_solvers", "bare_systems", "fitted_forces"),
     *("hard_cases", "stability", "solvers_alone", "whole_comparison"),
 }
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]

@@ -19,7 +19,8 @@ import numpy as np
 
 from kcons.comparison.averages.layers import Layers
 from kcons.comparison.machine import environment
-from kcons.comparison.study.study import Watcher, interruptible, picked
+from kcons.comparison.progress import Watcher
+from kcons.comparison.study.asked import interruptible, picked
 from kcons.comparison.test_systems.system import Units
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from kcons.comparison.report import columns, duration
+from kcons.comparison.progress import duration
+from kcons.comparison.report import columns
 
 if TYPE_CHECKING:
     from kcons.comparison.averages.sampling import SamplingComparison

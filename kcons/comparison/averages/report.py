@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from kcons.comparison.averages.sampling import GOAL, METHODS, Sampled, SamplingComparison
 from kcons.comparison.machine import processor_of
+from kcons.comparison.progress import duration
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw, say
-from kcons.comparison.study.tables import Marked, Table, duration, footnotes, numbered, verdict
+from kcons.comparison.study.tables import Marked, Table, footnotes, numbered, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,7 +17,8 @@ import numpy as np
 
 from kcons.comparison.averages.step_zero import Extrapolated, extrapolate
 from kcons.comparison.machine import environment
-from kcons.comparison.study.study import Watcher, interruptible, picked
+from kcons.comparison.progress import Watcher
+from kcons.comparison.study.asked import interruptible, picked
 from kcons.comparison.test_systems.fluid import Fluid
 from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray

@@ -1,8 +1,7 @@
 """What all studies share.
 
 - `json_files`: results in files
-- `study`: pieces of work, kept and resumed
-- `scripts`: calls timed in turn, tables, options of scripts
+- `asked`: what is asked for by name
 - `tables`, `curves`: what is shown, and its writers
 - `report_files`: the files of a report
 """

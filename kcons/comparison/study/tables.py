@@ -111,14 +111,6 @@ def markdown(table: Table) -> str:
 # -- what cells say ---------------------------------------------------------------------------------
 
 
-def duration(seconds: float) -> str:
-    """Three digits and a unit, for example '12.5 ms'."""
-    for size, limit, unit in ((1e-9, 1e-6, "ns"), (1e-6, 1e-3, "µs"), (1e-3, 1.0, "ms"), (1.0, 600.0, "s")):
-        if seconds < 0.9995 * limit:
-            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
-    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
-
-
 def numbered(notes: Iterable[str]) -> dict[str, int]:
     """Notes in the order of their first appearance, numbered from 1."""
     return {note: k for k, note in enumerate(dict.fromkeys(note for note in notes if note), 1)}

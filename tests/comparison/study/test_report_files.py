@@ -17,12 +17,3 @@ def test_files(tmp_path, tables):
     assert json.loads(paths[0].read_text()) == {"a": 1.0}
     assert paths[1].read_bytes().startswith(b"\x89PNG")
     assert not tables or paths[2].read_text() == "a\nb\n"
-
-
-def test_made_by():
-    about = {"date": "today", "commit": "abc", "cpu": "a processor", "cores": 2, "python": "3.11"}
-    result = {"environment": {**about, "versions": {"numpy": "2", "ase": None}}, "made_by": {"version": "1"}}
-    result["made_by"]["quick"] = True
-    text = report_files.made_by(result)
-    assert "today, commit abc, kcons 1\na processor, 2 cores" in text and "numpy 2\nquick" in text
-    assert "ase" not in text

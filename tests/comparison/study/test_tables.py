@@ -7,6 +7,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from kcons.comparison.progress import duration
 from kcons.comparison.study import tables
 from kcons.comparison.study.tables import Marked, Table
 
@@ -88,4 +89,4 @@ def test_verdict():
     ],
 )
 def test_duration(seconds, text):
-    assert tables.duration(seconds) == text
+    assert duration(seconds) == text

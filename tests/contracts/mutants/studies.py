@@ -3,18 +3,6 @@
 MUTANTS = [
     # -- studies: what is kept, and what is shown --
     (
-        "comparison/study/study.py",
-        "return found if found.get(self.under) == self.head[self.under] else {}",
-        "return found",
-        "tests/comparison/study/test_study.py::test_other_code_settings_or_formats_do_not_count",
-    ),
-    (
-        "comparison/study/study.py",
-        "            if name not in known:\n                put",
-        "            if True:\n                put",
-        "tests/comparison/study/test_study.py::test_pieces_are_done_once_and_progress_is_told",
-    ),
-    (
         "steppers/files.py",
         "if not math.isfinite(value):",
         "if False:",

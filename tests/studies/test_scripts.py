@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import study_scripts as scripts
 from rich.console import Console
 
-from kcons.comparison.study import scripts
 from kcons.errors import InputError
 
 

@@ -3,22 +3,105 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from rich.console import Console
 
+from kcons.comparison import json_files
 from kcons.comparison.machine import environment
-from kcons.comparison.study import json_files
-from kcons.comparison.study.study import Kept, picked
+from kcons.comparison.progress import Watcher
+from kcons.comparison.study.asked import picked
 from kcons.comparison.study.tables import Table, terminal
 from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
+
+
+Name = TypeVar("Name")
+Found = TypeVar("Found")
+
+
+class Kept:
+    """A result in a file, with the code and the settings that made it.
+
+    Parameters
+    ----------
+    path : Path or None
+        None: nothing is kept.
+    made_by : mapping
+        Code and settings.
+    form : str, optional
+        The entry 'format' of the file.
+    under : str
+        The entry for `made_by`.
+    pack : callable, optional
+        Data to the text of the file.
+
+    Attributes
+    ----------
+    head : dict
+        What every such file begins with: format, code and settings, machine.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        made_by: Mapping[str, Any],
+        *,
+        form: str = "",
+        under: str = "made_by",
+        pack: Callable[[Mapping[str, Any]], str] = json_files.text,
+    ) -> None:
+        self.path, self.form, self.under, self.pack = path, form, under, pack
+        self.head = {**({"format": form} if form else {}), under: made_by, "environment": environment()}
+
+    def earlier(self) -> dict[str, Any]:
+        """What the file holds, if the same code made it with the same settings; otherwise nothing."""
+        if self.path is None:
+            return {}
+        try:
+            found = json_files.read(self.path, self.form)
+        except (OSError, InputError):
+            return {}
+        return found if found.get(self.under) == self.head[self.under] else {}
+
+    def put(self, result: Mapping[str, Any]) -> None:
+        """Into the file, in one piece."""
+        if self.path is not None:
+            json_files.write(self.path, self.pack({**self.head, **result}))
+
+
+def work_off(
+    what: str,
+    pieces: Mapping[Name, Callable[[], Found]],
+    put: Callable[[Name, Found], Any],
+    known: Container[Name] = (),
+    watcher: Watcher | None = None,
+) -> None:
+    """Do one piece of work after another, but for those that are known.
+
+    Parameters
+    ----------
+    what : str
+        For the progress bar.
+    pieces : mapping of names to callables
+    put : callable
+        Gets the name and what was found.
+    known : container of names, optional
+    watcher : Watcher, optional
+    """
+    watching = watcher or Watcher()
+    with watching.piece(what, max(len(pieces), 1)):
+        for done, (name, piece) in enumerate(pieces.items(), 1):
+            if name not in known:
+                put(name, piece())
+            watching.advance(done)
 
 
 def in_turn(
