@@ -183,7 +183,7 @@ _REPLACEMENTS = {
     "Constraints": ": atoms.set_constraint(), then constrain(atoms, [*old.constraints, *new])",
     "FixAtoms": ", with FixedAtoms for what FixAtoms held",
     "FixBondLengths": ", with Distance for what FixBondLengths held",
-    "FixInternals": ", with Distance, Angle and Dihedral for what FixInternals held",
+    "FixInternals": ", with Distance, Angle, Dihedral and DistanceDifference for what FixInternals held",
     "FixLinearTriatomic": ", with Distance and LinearRelation for what FixLinearTriatomic held",
     "FixCom": ", with CenterOfMass for what FixCom held",
     "FixSubsetCom": ", with CenterOfMass for what FixSubsetCom held",

@@ -16,6 +16,7 @@ from kcons.constraints import (
     Constraint,
     Dihedral,
     Distance,
+    DistanceDifference,
     FixedAtoms,
     Line,
     LinearCombination,
@@ -29,7 +30,7 @@ from kcons.errors import UnsupportedError
 def from_ase_constraints(atoms: Atoms) -> list[Constraint]:
     """What the ASE constraints on `atoms` hold, as kcons constraints.
 
-    Knows FixAtoms, FixBondLengths, FixInternals (bonds, angles, dihedrals), FixLinearTriatomic, FixCom,
+    Knows FixAtoms, FixBondLengths, FixInternals, FixLinearTriatomic, FixCom,
     FixSubsetCom, FixedPlane, FixedLine and FixCartesian. The atoms are not changed::
 
         held = from_ase_constraints(atoms)
@@ -66,11 +67,10 @@ def _bond_lengths(atoms: Atoms, item: Any) -> list[Constraint]:
 
 
 def _internals(atoms: Atoms, item: Any) -> list[Constraint]:
-    if item.bondcombos:
-        raise UnsupportedError(
-            "FixInternals holds combinations of bond lengths (bondcombos); use a Custom constraint for them"
-        )
-    result: list[Constraint] = []
+    result: list[Constraint] = [
+        DistanceDifference([row[:2] for row in rows], value, weights=[row[2] for row in rows])
+        for value, rows in item.bondcombos
+    ]
     for rows, family, unit in (
         (item.bonds, Distance, 1.0),
         (item.angles, Angle, np.pi / 180),
@@ -134,13 +134,15 @@ def ase_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
     if families == {"Distance"}:
         pairs = [pair for item in rows for pair in item.atoms.tolist()]
         return _named("FixBondLengths", pairs=pairs, bondlengths=[d for item in rows for d in _targets(item)])
-    if families <= {"Distance", "Angle", "Dihedral"}:
-        parts: dict[str, list[Any]] = {"Distance": [], "Angle": [], "Dihedral": []}
+    if families <= {"Distance", "Angle", "Dihedral", "DistanceDifference"}:
+        parts: dict[str, list[Any]] = {"Distance": [], "Angle": [], "Dihedral": [], "DistanceDifference": []}
         for item in rows:
-            values = _targets(item) if item.family == "Distance" else np.degrees(_targets(item)).tolist()
-            parts[item.family] += [list(row) for row in zip(values, item.atoms.tolist(), strict=True)]
-        bonds, angles, dihedrals = parts.values()
-        return _named("FixInternals", bonds=bonds, angles_deg=angles, dihedrals_deg=dihedrals, mic=True)
+            values = np.degrees(_targets(item)).tolist() if item.family in ("Angle", "Dihedral") else _targets(item)
+            named = item.weighted_pairs() if isinstance(item, DistanceDifference) else item.atoms.tolist()
+            parts[item.family] += [list(row) for row in zip(values, named, strict=True)]
+        bonds, angles, dihedrals, sums = parts.values()
+        more = {"bondcombos": sums} if sums else {}
+        return _named("FixInternals", bonds=bonds, angles_deg=angles, dihedrals_deg=dihedrals, mic=True, **more)
     atoms = sorted({atom for item in rows for atom in item.atoms.ravel().tolist()})
     if families == {"FixedAtoms"}:
         return _named("FixAtoms", indices=atoms)

@@ -26,6 +26,7 @@ from ase.constraints import (
     FixLinearTriatomic,
     FixSubsetCom,
     Hookean,
+    MirrorForce,
     dict2constraint,
 )
 from ase.db import connect
@@ -43,6 +44,7 @@ from kcons.constraints import (
     Angle,
     Dihedral,
     Distance,
+    DistanceDifference,
     FixedAtoms,
     ImplicitSurface,
     Line,
@@ -125,9 +127,7 @@ def test_own_object_is_translated_to_its_rows():
 
 
 @pytest.mark.parametrize(
-    "other",
-    [Hookean(a1=0, a2=1, rt=1.0, k=1.0), FixInternals(bondcombos=[[None, [[0, 1, 1.0], [0, 2, -1.0]]]])],
-    ids=lambda v: type(v).__name__,
+    "other", [Hookean(a1=0, a2=1, rt=1.0, k=1.0), MirrorForce(0, 1)], ids=lambda v: type(v).__name__
 )
 def test_unknown_ase_constraints_are_named(other):
     atoms = molecule("H2O")
@@ -242,7 +242,12 @@ def test_constraint_object_round_trip():
 #: What is held, and the object of ASE that holds the same; None where no single one does.
 NATIVE = {
     "FixBondLengths": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
-    "FixInternals": [Distance([[0, 1]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])],
+    "FixInternals": [
+        Distance([[0, 1]]),
+        Angle([[0, 1, 2]]),
+        Dihedral([[3, 2, 1, 0]]),
+        DistanceDifference([[0, 4], [1, 5]], weights=[1.0, -2.0]),
+    ],
     "FixAtoms": [FixedAtoms([8, 0])],
     "FixedPlane": [Plane([4, 0, 5], [0, 1, 2])],
     "FixedLine": [Line([4, 0], None, [0, 1, 2])],

@@ -7,7 +7,7 @@ import pytest
 import water_files as files
 from water_files import mda
 
-from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, LinearRelation
+from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, DistanceDifference, LinearRelation
 from kcons.errors import InputError
 from kcons.mdanalysis import ConstraintCheck, constraints_of, load_trajectory
 
@@ -214,6 +214,7 @@ def test_rows_of_all_kinds(water):
         Distance(files.pairs(N), files.targets(N)),
         Dihedral([[1, 0, near_by, near_by + 1]]),
         CenterOfMass([0, 1, 2]),
+        DistanceDifference([[0, near_by], [1, near_by + 1]]),
     ]
     result = checked(water["dcd"], rows, worst=500)
     found = {row.row: row for row in result.worst}
@@ -224,8 +225,11 @@ def test_rows_of_all_kinds(water):
     for axis in range(3):
         expected = np.abs(middle[:, axis]).max()
         assert found[N + axis].largest == pytest.approx(expected, abs=2e-6)
+    apart = [np.linalg.norm(near(x[:, near_by + k] - x[:, k]), axis=1) for k in (0, 1)]
+    expected = np.abs(apart[0] - apart[1] - (apart[0] - apart[1])[0]).max()
+    assert found[4 * N + 7].largest == pytest.approx(expected, abs=2e-6) and expected > 0.01
     kinds = {unit.unit: unit.n_rows for unit in result.units}
-    assert kinds == {"Å": 3 * N + 6, "rad": N + 1}
+    assert kinds == {"Å": 3 * N + 7, "rad": N + 1}
     assert set(result.series) >= {"largest Å", "largest rad", "rms Å", "rms rad"}
 
 
