@@ -16,7 +16,12 @@ from kcons.errors import with_extra
 
 try:
     from kcons.ase.calculator import ConstrainedCalculator
-    from kcons.ase.constraints_object import Constraints, constrain
+    from kcons.ase.constraints_object import (
+        Constraints,
+        ConstraintsWithFixedAtoms,
+        constrain,
+        to_ase_constraints,
+    )
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.logger import ConstraintLogger
     from kcons.ase.monte_carlo import ConstrainedMonteCarlo
@@ -42,6 +47,7 @@ __all__ = [
     "ConstrainedNoseHoover",
     "ConstraintLogger",
     "Constraints",
+    "ConstraintsWithFixedAtoms",
     "IsokineticDynamics",
     "MultipleTimeSteps",
     "PressureReporter",
@@ -51,4 +57,5 @@ __all__ = [
     "from_ase_constraints",
     "mend_elements",
     "rigid_water",
+    "to_ase_constraints",
 ]

@@ -42,6 +42,7 @@ from ase_systems import (
 from kcons.ase import ConstrainedDynamics, Constraints, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (
     Angle,
+    CenterOfMass,
     Dihedral,
     Distance,
     DistanceDifference,
@@ -251,6 +252,8 @@ NATIVE = {
     "FixAtoms": [FixedAtoms([8, 0])],
     "FixedPlane": [Plane([4, 0, 5], [0, 1, 2])],
     "FixedLine": [Line([4, 0], None, [0, 1, 2])],
+    "FixCartesian": [LinearCombination([[3], [5]], [[0, 0, 1.0]]), LinearCombination([[3], [5]], [[1.0, 0, 0]])],
+    "FixSubsetCom": [CenterOfMass([0, 1, 2])],
     "two directions": [Plane([4], [0, 1, 2]), Plane([5], [0, 1, 1])],
     "two kinds": [FixedAtoms([8]), Distance([[0, 1]])],
 }
@@ -387,7 +390,7 @@ def test_repeat(used):
     large = atoms.repeat((2, 1, 3))
     assert large.get_number_of_degrees_of_freedom() == 6 * (9 - 6)
     assert off(large, large.constraints[0]) <= 1e-14
-    assert len(large.constraints[0].get_indices()) == 18
+    assert len(large.constraints[0].touched) == 18
 
 
 @pytest.mark.parametrize("used", [True, False])
