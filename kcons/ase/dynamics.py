@@ -189,10 +189,17 @@ class ConstrainedDynamics(MolecularDynamics):
         """3 N less the rank of everything that is held."""
         return self._systems().motion.degrees_of_freedom
 
+    def get_kinetic_energy(self) -> float:
+        """Kinetic energy in eV; of a bath with noise that of the middle of the last step, see `ConstrainedLangevin`."""
+        step, energy = getattr(self.stepper, "exchanged", None) or (-1, 0.0)
+        if step == self.nsteps and np.array_equal(self.atoms.arrays["momenta"], self._momenta):
+            return float(energy)
+        return kinetic_energy_of(self.atoms)
+
     def get_temperature(self) -> float:
         """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
         freedom = self.degrees_of_freedom
-        return 2 * kinetic_energy_of(self.atoms) / (freedom * units.kB) if freedom else 0.0
+        return 2 * self.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
 
     def applied_forces(self) -> FloatArray:
         """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""

@@ -53,7 +53,12 @@ class SeededBath(Listed):
     thermal_energy, friction : float
     seed, substeps : int
         See `Langevin`.
+    exchanged : (int, float) or None
+        Number of the last step that was made, and its kinetic energy after noise in its middle, for logs: there
+        velocities are as warm as the bath, at the ends of steps those of stiff motions are colder. None without noise.
     """
+
+    exchanged: tuple[int, float] | None = None
 
     order = 2
     reversible = False
@@ -228,7 +233,10 @@ class LangevinStep(ArrayStep):
             kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
         noise += keep * v if kept is None else kept + keep * (v - kept)
         self.v = self.along(noise)
-        self.heat += system.kinetic_energy(self.v) - before
+        after = system.kinetic_energy(self.v)
+        self.heat += after - before
+        if thermostat.friction > 0:
+            thermostat.exchanged = self.number, after
 
     def noise(self, shape: tuple[int, ...]) -> FloatArray:
         """Normal numbers for this exchange."""
