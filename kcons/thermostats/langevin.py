@@ -96,7 +96,7 @@ class SeededBath(Listed):
         if still is not None:
             return still
         if dt < 0:
-            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+            raise InputError(f"the time step is {system.shown_time(dt)}; noise cannot be taken back", item="dt")
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
             return self.begun(system, state, dt).through(self.operations(system))
 

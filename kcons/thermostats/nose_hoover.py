@@ -203,8 +203,8 @@ class NoseHooverChain(Listed):
         except OverflowError:
             check_finite(begin.velocities, "velocity", state.step + 1)
             raise InputError(
-                f"step {state.step + 1}: a chain of period {self.period:g} cannot follow a time step of {dt:g}; take "
-                "at most a twentieth of the period",
+                f"step {state.step + 1}: a chain of period {system.shown_time(self.period)} cannot follow a time step "
+                f"of {system.shown_time(dt)}; take at most a twentieth of the period",
                 item="dt",
             ) from None
         self._left = chain

@@ -438,6 +438,7 @@ def test_forces_that_are_not_numbers(kind, bad):
 
 
 @KINDS
+@pytest.mark.filterwarnings("ignore:the atoms move in steps")
 def test_a_time_step_that_is_too_large_leaves_the_atoms_alone(kind):
     atoms = waters()
     moving = made(kind, atoms)
