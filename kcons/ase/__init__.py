@@ -34,7 +34,7 @@ try:
         IsokineticDynamics,
         draw_velocities,
     )
-    from kcons.ase.topology import constraints_of, mend_elements
+    from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass
     from kcons.ase.translation import from_ase_constraints
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.ase") from error
@@ -56,6 +56,7 @@ __all__ = [
     "draw_velocities",
     "from_ase_constraints",
     "mend_elements",
+    "repartition_hydrogen_mass",
     "rigid_water",
     "to_ase_constraints",
 ]
