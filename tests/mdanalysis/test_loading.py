@@ -70,10 +70,10 @@ def test_a_format_whose_package_is_missing(tmp_path, monkeypatch):
     path.write_text("END\n")
     made = files.universe(N)
     monkeypatch.setattr(made, "load_new", missing)
-    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); install that package"):
+    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); python -m pip install gemmi, or give"):
         load_trajectory(made, path)
     monkeypatch.setattr("MDAnalysis.Universe", missing)
-    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); give a file such as"):
+    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); python -m pip install gemmi, or give"):
         open_universe(path)
 
 
