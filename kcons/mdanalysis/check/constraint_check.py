@@ -25,7 +25,7 @@ from kcons.mdanalysis.check.atom_names import AtomNames
 from kcons.mdanalysis.check.bound_rows import BoundRows
 from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.check.conclusions import Asked, concluded
-from kcons.mdanalysis.check.files.endings import damage, last_offset, leftover
+from kcons.mdanalysis.check.files.endings import damage_of, ending_of
 from kcons.mdanalysis.check.files.file_precision import by_frame, grid_of, precision_of_reader
 from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
 from kcons.mdanalysis.check.files.target_file import TargetFile
@@ -38,7 +38,7 @@ from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remark
 from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
-from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, quiet
 from kcons.mdanalysis.topology import host_of, require_angstrom, velocities_known
 from kcons.topology.rows_by_name import HeldRows
 
@@ -159,7 +159,6 @@ class ConstraintCheck(AnalysisBase):
         self._wants_rank = rank
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
-        self._format = format_of(reader)
         called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         in_file = precision_of_reader(reader, precision)
         remarks += remarks_on(reader)
@@ -208,9 +207,7 @@ class ConstraintCheck(AnalysisBase):
         self._bind(int(frames_asked[0]))
         in_blocks = blocks_of(self._trajectory, self._rows.table) is not None
         # The compiled look at a block sees damage by itself.
-        self._reading.damage = (
-            None if in_blocks else damage(self._path, self._format, n_frames, self._trajectory.n_atoms)
-        )
+        self._reading.damage = None if in_blocks else damage_of(self._trajectory)
         options = with_backend(options, in_blocks)
         self._pass_of_means = self.asked.mode == "mean"
         with inherited(self, options["backend"]):
@@ -350,8 +347,7 @@ class ConstraintCheck(AnalysisBase):
         """What lies behind the last frame, or keeps it from being read."""
         trajectory = self._trajectory
         n = trajectory.n_frames
-        last = last_offset(trajectory)
-        broken = self._reading.damage or leftover(self._path, self._format, n, trajectory.n_atoms, last)
+        broken = self._reading.damage or ending_of(trajectory)
         try:
             with quiet():
                 trajectory[n - 1]

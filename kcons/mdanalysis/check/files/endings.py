@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,30 @@ from MDAnalysis.lib.util import anyopen
 
 from kcons.mdanalysis.check.files.file_precision import XTC_MAGIC
 from kcons.mdanalysis.check.result import Break
+from kcons.mdanalysis.loading import format_of
+
+
+def ending_of(reader: Any) -> Break | None:
+    """`leftover` of the file of a reader, or of the first file of a chain that has one."""
+    return _first(reader, lambda r, path: leftover(path, format_of(r), r.n_frames, r.n_atoms, _offset(r)))
+
+
+def damage_of(reader: Any) -> Break | None:
+    """`damage` of the file of a reader, or of the first file of a chain that has one."""
+    return _first(reader, lambda r, path: damage(path, format_of(r), r.n_frames, r.n_atoms))
+
+
+def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:
+    """What is found first; in a chain of files, frames are counted from its beginning."""
+    parts, begin = getattr(reader, "readers", None) or [reader], 0
+    for part in parts:
+        path = str(getattr(part, "filename", None) or "")
+        found = look(part, path) if os.path.isfile(path) else None
+        if found is not None:
+            where = f"{path}: " if len(parts) > 1 else ""
+            return replace(found, frame=begin + found.frame, reason=where + found.reason)
+        begin += part.n_frames
+    return None
 
 
 def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, last_offset: int | None) -> Break | None:
@@ -67,8 +93,6 @@ def damage(path: str | Path, file_format: str, n_frames: int, n_atoms: int) -> B
 
     The reader does not look: it takes what it finds for coordinates.
     """
-    if not os.path.isfile(path):
-        return None
     if file_format != "DCD":
         try:
             return _text_break(path, file_format, n_atoms)
@@ -260,7 +284,7 @@ def _trr_frame_size(path: str | Path, offset: int) -> int:
     return int(begin + 52 + (16 if double else 8) + sum(blocks))
 
 
-def last_offset(reader: Any) -> int | None:
+def _offset(reader: Any) -> int | None:
     """Where the last frame of an XTC or TRR file begins."""
     offsets = getattr(getattr(reader, "_xdr", None), "offsets", None)
     return int(offsets[-1]) if offsets is not None and len(np.atleast_1d(offsets)) else None

@@ -274,13 +274,46 @@ def test_two_frames_that_are_read_as_twice_the_atoms(tmp_path, x, ending):
         checked(path)
 
 
+# -- chains -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "xyz", "gro"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_each_file_of_a_chain_has_an_end(tmp_path, x, ending, which):
+    """A part that was cut off, or has more frames than are read, is not hidden by the next."""
+    y = files.whole(x)
+    paths = [tmp_path / f"{k}.{ending}" for k in range(2)]
+    for path in paths:
+        if ending == "gro":
+            path.write_text(gro(y[0]))
+        else:
+            files.write(path, y, side=None)
+    made = files.universe(N)
+    rows = Distance(files.pairs(N), files.targets(N))
+
+    def whole_chain():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            made.load_new([str(path) for path in paths])
+            return ConstraintCheck(made, rows).run().check
+
+    assert whole_chain().status == "kept"
+    data = paths[which].read_bytes()
+    paths[which].write_bytes(2 * data if ending == "gro" else data[:-20])
+    result = whole_chain()
+    assert result.status == "incomplete"
+    assert result.broken.frame == {"gro": 1 + which}.get(ending, 7 + 8 * which)
+    # The reader of XTC says so itself where it comes to the end.
+    assert f"{which}.{ending}: " in result.broken.reason or ending == "xtc"
+
+
 # -- numbers of atoms -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("ending", ["xyz", "arc", "lammpsdump"])
 @pytest.mark.parametrize("wrong", ["fewer", "more", "two frames more", "says fewer", "an empty line"])
 def test_a_frame_with_another_number_of_atoms(tmp_path, x, ending, wrong):
-    """The reader counts lines: atoms of one frame, or a line that says how many, would be taken for those of the next."""
+    """The reader counts lines: atoms of one frame would be taken for those of the next."""
     make = files.write if ending == "xyz" else files.write_text
     options = {"side": None} if ending == "xyz" else {}
     path = make(tmp_path / f"w.{ending}", files.whole(x), **options)
