@@ -205,7 +205,8 @@ def _put(
     paths = [folder / name for name in FILES]
     whole = as_json({"file": str(Path(trajectory).resolve()), **data})
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
-    contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, text and f"{text}\n".encode(errors="replace")]
+    page = f"{text}\n".encode(errors="replace") if text else b""
+    contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, page]
     if not paths[0].exists():
         _claim(paths[0], contents[0])
     written = []

@@ -198,10 +198,8 @@ def coor(x):
 
 def cif(x, model=1):
     pytest.importorskip("gemmi")
-    names = (
-        "group_PDB id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id label_entity_id label_seq_id "
-    )
-    names += "Cartn_x Cartn_y Cartn_z occupancy B_iso_or_equiv auth_seq_id auth_asym_id pdbx_PDB_model_num"
+    names = "group_PDB id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id label_entity_id "
+    names += "label_seq_id Cartn_x Cartn_y Cartn_z occupancy B_iso_or_equiv auth_seq_id auth_asym_id pdbx_PDB_model_num"
     head = "data_water\nloop_\n" + "".join(f"_atom_site.{name}\n" for name in names.split()) if model == 1 else ""
     return head + "".join(
         f"ATOM {k + 1} O OW . SOL A 1 1 {r[0]:.3f} {r[1]:.3f} {r[2]:.3f} 1 0 1 A {model}\n" for k, r in enumerate(x)
