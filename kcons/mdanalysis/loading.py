@@ -203,8 +203,8 @@ def _format(path: str | Path, given: str | None, item: str) -> str:
         )
     what = "trajectory" if item == "format" else "topology"
     raise InputError(
-        f"{path}: its name tells no format of a {what} that MDAnalysis reads; give one ({option} NAME, {item}=): "
-        f"{', '.join(sorted(readers))}",
+        f"{path}: its name tells no format of a {what} that MDAnalysis reads; rename it, or give its format ({item}=, "
+        f"kcons check {option} NAME): {', '.join(sorted(readers))}",
         item=item,
     )
 
