@@ -33,6 +33,30 @@ MUTANTS = [
         "tests/mdanalysis/check/files/test_file_precision.py::test_a_wild_molecule_of_the_topology_excuses_no_other",
     ),
     (
+        "mdanalysis/check/files/endings.py",
+        '"GRO": n_atoms + 3,',
+        '"GRO": 2 * n_atoms + 6,',
+        "tests/mdanalysis/check/files/test_endings.py::test_what_lies_behind_the_only_frame_that_is_read",
+    ),
+    (
+        "mdanalysis/check/files/endings.py",
+        "word.isdigit() and int(word) == n_atoms",
+        "word.isdigit()",
+        "tests/mdanalysis/check/files/test_endings.py::test_a_frame_with_another_number_of_atoms",
+    ),
+    (
+        "mdanalysis/check/files/file_precision.py",
+        "_off_grid(x, 10 * step) > error",
+        "_off_grid(x, step) <= error",
+        "tests/mdanalysis/check/files/test_file_precision.py::test_what_is_no_grid",
+    ),
+    (
+        "mdanalysis/check/findings.py",
+        "if rms > found.rounding[unit].max() + tolerance * table.sizes[mine].min():",
+        "if rms > np.inf:",
+        "tests/mdanalysis/check/test_constraint_check.py::test_other_frames_that_are_off_are_not_the_first_alone",
+    ),
+    (
         "mdanalysis/check/frames/row_table.py",
         "np.where(periodic, 1.0, constraint_set.scale)",
         "np.where(periodic, 1.0, 1.0)",
