@@ -35,7 +35,7 @@ TURN = 1e-3
 #: How far each atom is moved besides, so that nothing cancels by symmetry.
 SHAKE = 1e-4
 #: Steps after which it is looked whether bodies feel each other; shorter runs have no averages.
-LOOK_AT = 10_000
+LOOK_AT = 20_000
 #: How often bodies that do not feel each other are brought to half their distance, to see whether they do so there.
 NEARER = 10
 

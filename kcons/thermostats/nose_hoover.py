@@ -89,7 +89,7 @@ class NoseHooverChain(Listed):
     -----
     UserWarning
         At the start of a run, or where it goes on with other velocities: total momentum is conserved but for a factor,
-        and not zero. At the start: the forces exert no torque, so that the same holds of angular momentum. After 10,000
+        and not zero. At the start: the forces exert no torque, so that the same holds of angular momentum. After 20,000
         steps: no body, which rows tie together, feels another.
 
     Notes

@@ -134,6 +134,7 @@ def test_kinetic_energy_is_constant():
 
 
 @pytest.mark.validation
+@pytest.mark.filterwarnings("ignore:no atom or body")
 def test_kinetic_energy_is_constant_over_a_million_steps():
     atoms = waters()
     moving = IsokineticDynamics(atoms, FS, temperature_K=300)

@@ -97,7 +97,7 @@ class Isokinetic(Splitting):
     UserWarning
         At the start of a run: total momentum is conserved but for a factor exp(U/2K), and not zero; or a temperature is
         asked for and forces exert no torque, so that the same holds of angular momentum. Neither samples a temperature.
-        After 10,000 steps: a temperature is asked for, and no body, which rows tie together, feels another.
+        After 20,000 steps: a temperature is asked for, and no body, which rows tie together, feels another.
 
     Notes
     -----

@@ -17,6 +17,7 @@ from pressure_systems import (
 )
 from scipy import stats
 
+from kcons.errors import InputError
 from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import MonteCarloBarostat
 
@@ -53,3 +54,10 @@ def test_volumes_of_other_kinds(kind):
         assert cells[-1][0, 0] == pytest.approx(cells[-1][1, 1], rel=1e-12)
         assert abs(cells[-1][0, 0] - cells[-1][2, 2]) > 1e-3
     assert len(np.unique(lengths)) > 1
+
+
+def test_a_width_that_no_trial_can_have_is_refused():
+    with pytest.raises(InputError, match=r"no length by more than 9%: give at most 0\.27") as caught:
+        MonteCarloBarostat(1.0, width=0.3)
+    assert caught.value.item == "width"
+    assert MonteCarloBarostat(1.0, width=0.27).width == 0.27
