@@ -58,7 +58,7 @@ def scatter(found, expected=0.0):
 
 
 @pytest.mark.filterwarnings("ignore:.*independent ones")
-@pytest.mark.parametrize("name", SERIES)
+@pytest.mark.parametrize("name", SERIES, ids=lambda name: name.replace(" ", "-"))
 def test_errors_are_as_large_as_they_say(name):
     rng = np.random.default_rng(1)
     series = [SERIES[name](rng) for _ in range(600)]
