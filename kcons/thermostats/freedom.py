@@ -375,8 +375,8 @@ def _apart(system: System, state: State) -> bool:
     if count < 2:
         return False
     body, half = np.arange(count), count // 2
-    centers = np.stack([np.bincount(label + 1, column, count + 1)[1:] for column in x.T], axis=1)
-    centers /= np.bincount(label + 1, minlength=count + 1)[1:, None]
+    sums = np.stack([np.bincount(label + 1, column, count + 1)[1:] for column in x.T], axis=1)
+    centers = np.asarray(sums / np.bincount(label + 1, minlength=count + 1)[1:, None], dtype=np.float64)
     least = BALANCED * float(np.abs(forces).max())
 
     def felt(move: FloatArray, moved: NDArray[np.bool_]) -> bool:
@@ -391,8 +391,8 @@ def _apart(system: System, state: State) -> bool:
     if felt(small, body % 2 == 1):
         return False
     for moved, towards in ((body % 2 == 1, body - 1), (body >= count - half, body - (count - half))):
-        way = centers[towards] - centers
-        if any(felt((1.0 - 0.5**k) * way, moved) for k in range(1, NEARER + 1)):
+        way: FloatArray = centers[towards] - centers
+        if any(felt(np.asarray((1.0 - 0.5**k) * way), moved) for k in range(1, NEARER + 1)):
             return False
     return True
 

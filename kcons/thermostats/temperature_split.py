@@ -322,7 +322,9 @@ class TemperatureSplit:
         counts = 3 * int(exists[0].sum()), int(exists[1].sum())
         squares = [max(float(series[:, 1, kind].mean()), 0.0) / max(counts[kind], 1) for kind in (0, 1)]
         return SplitTemperatures(
-            *found,
+            shift=found[0],
+            turn=found[1],
+            internal=found[2],
             shifts=counts[0],
             turns=counts[1],
             shift_frequency=math.sqrt(squares[0]),

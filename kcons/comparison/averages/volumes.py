@@ -22,7 +22,7 @@ STRETCHES = 6
 def mean_and_error(values: ArrayLike) -> tuple[float, float]:
     """`thermostats.mean` of a series, with an error of NaN for fewer than 32 values."""
     series = np.asarray(values, dtype=float)
-    return tuple(mean(series)) if len(series) >= FEWEST else (float(series.mean()), float("nan"))
+    return mean(series) if len(series) >= FEWEST else (float(series.mean()), float("nan"))
 
 
 def compressed(volumes: ArrayLike) -> tuple[float, float]:
