@@ -48,12 +48,13 @@ def test_a_small_slow_part_counts():
     assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.3)
 
 
+@pytest.mark.filterwarnings("ignore:.*independent ones")  # in one of 300, a single block has most of the spread
 def test_weights_that_belong_to_the_values():
     """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
     rng, b = np.random.default_rng(2), 1.0
     found = []
     for _ in range(300):
-        x = ar1(rng, 6000, 0.6)
+        x = ar1(rng, 3000, 0.6)
         found.append(weighted_mean(x, log_weights=b * x[:, 0] + 900.0))
     assert within(found, b, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.08)
     assert within(found, b, norm.ppf(0.975)) == pytest.approx(0.95, abs=0.04)
