@@ -28,11 +28,11 @@ from kcons.thermostats.thermal_velocities import thermal_velocities
 _CERTAIN = 3.0
 
 
-def temperature(squares: FloatArray, curvatures: FloatArray) -> tuple[Estimate, float, str | None]:
-    """The ratio of both means, how many independent samples its error rests on, and what is to be said of it.
+def temperature(squares: FloatArray, curvatures: FloatArray) -> tuple[Estimate, str | None]:
+    """The ratio of both means, and what is to be said of its error.
 
     To first order the ratio r fluctuates by (squares - r curvatures)/<curvatures>. Where <curvatures> is 0 within its
-    own error, the ratio has neither a variance nor a bounded interval: its error is infinite, of no sample.
+    own error, the ratio has neither a variance nor a bounded interval: its error is infinite.
     """
     n, scale = len(squares), float(curvatures.mean())
     found = float(squares.mean()) / scale if scale else math.inf
@@ -41,9 +41,9 @@ def temperature(squares: FloatArray, curvatures: FloatArray) -> tuple[Estimate, 
             f"the mean curvature of {n} samples is 0 within {_CERTAIN:g} standard errors: their temperature may be "
             "anything, and its error is given as infinite. Sample longer"
         )
-        return Estimate(found, math.inf), 0.0, said
+        return Estimate(found, math.inf), said
     error, independent = spread((squares - found * curvatures) / scale)
-    return Estimate(found, error), independent, few(n, independent)
+    return Estimate(found, error), few(n, independent)
 
 
 def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Estimate:
@@ -67,7 +67,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
         checked(series, name)
     if not below.any():
         raise InputError("the forces do not change with the positions: they tell no temperature", item="curvatures")
-    found, _, doubt = temperature(above, below)
+    found, doubt = temperature(above, below)
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=2)
     return found

@@ -117,15 +117,14 @@ def _error(values: FloatArray, degree: int) -> tuple[float, FloatArray]:
         blocks = _means(values, size)
     count = len(blocks)
     memories, plain = _memories(count, degree)
-    logarithms, errors = [], []
+    logarithms, errors, more = [], [], np.expm1(_LOG_R)
     for k, memory in enumerate(memories):
-        more = np.expm1(_LOG_R)
         spectrum = 1.0 + more[:, None] * memory.sizes
         level = ((memory.axes @ blocks) ** 2 / spectrum).sum(axis=1) / len(memory.sizes)
         level = np.maximum(level, np.finfo(float).tiny)
-        ratio = k / (_MEMORIES - 1) * math.log(count * _LONGEST / _SHORTEST)
+        longer = k / (_MEMORIES - 1) * math.log(count * _LONGEST / _SHORTEST)
         likely = -0.5 * (len(memory.sizes) * np.log(level) + np.log(spectrum).sum(axis=1))
-        logarithms.append(likely - np.log1p((_LOG_R / _WIDTH) ** 2) - _SLOWER * ratio)
+        logarithms.append(likely - np.log1p((_LOG_R / _WIDTH) ** 2) - _SLOWER * longer)
         errors.append(np.sqrt(level * (plain + more * memory.own)))
     weights = np.exp(np.array(logarithms) - np.max(logarithms))
     error = float((weights * errors).sum() / weights.sum())

@@ -78,8 +78,6 @@ class SplitTemperatures:
     samples : int
     left_out : tuple of str
         What does not count, and why.
-    independent : float
-        Fewest independent samples that one of these errors rests on; below 10 none is to be relied on.
     """
 
     shift: Estimate | None
@@ -91,7 +89,6 @@ class SplitTemperatures:
     turn_frequency: float
     samples: int
     left_out: tuple[str, ...]
-    independent: float = math.inf
 
 
 class Clusters:
@@ -312,11 +309,9 @@ class TemperatureSplit:
         series = np.array(self._series)[:, :, :, which]
         exists = (clusters.shifts & inside, self._axes * inside, self._rest & inside)
         found: list[Estimate | None] = [None, None, None]
-        independent = math.inf
         for kind, (name, there) in enumerate(zip(("shifts", "turns", "internal motions"), exists, strict=True)):
             if there.any() and series[:, 0, kind].any():
-                found[kind], worth, doubt = temperature(series[:, 0, kind], series[:, 1, kind])
-                independent = min(independent, worth)
+                found[kind], doubt = temperature(series[:, 0, kind], series[:, 1, kind])
                 if doubt:
                     warnings.warn(f"temperature of {name}: {doubt}", UserWarning, stacklevel=2)
         counts = 3 * int(exists[0].sum()), int(exists[1].sum())
@@ -338,7 +333,6 @@ class TemperatureSplit:
                     if exists[kind].any() and not series[:, 0, kind].any()
                 ),
             ),
-            independent=independent,
         )
 
     # -- inner ----------------------------------------------------------------------------------

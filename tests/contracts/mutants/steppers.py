@@ -190,8 +190,8 @@ MUTANTS = [
     ),
     (
         "thermostats/correlated_series.py",
-        "more = np.expm1(_LOG_R)",
-        "more = 0.0 * _LOG_R",
+        "more = [], [], np.expm1(_LOG_R)",
+        "more = [], [], 0.0 * _LOG_R",
         "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[memory-3]",
     ),
     (
