@@ -279,7 +279,7 @@ class Isokinetic(Splitting):
             return still
         begin = self.start(system, state)
         if begin.step == LOOK_AT and self.thermal_energy is not None and self.atoms is None:
-            warn_of_bodies_apart(system, begin, stacklevel=4)
+            warn_of_bodies_apart(system, begin, stacklevel=5)
         after = isokinetic_step(system, self._share(system), begin, dt, self._operations)
         asked = self.thermal_energy, self.kinetic_energy
         self._left = after.thermostat, *asked, after.velocities, after.positions
