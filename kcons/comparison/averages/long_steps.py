@@ -19,7 +19,7 @@ import numpy as np
 
 from kcons.comparison.averages.layers import Layers
 from kcons.comparison.study.machine import environment
-from kcons.comparison.study.study import Watcher, interruptible, picked
+from kcons.comparison.study.study import Watcher, interruptible, noted, picked
 from kcons.comparison.test_systems.system import Units
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError
@@ -241,7 +241,8 @@ def measure(
         return Stepped(status="failed", note=failure, **shown)
     if run.samples < FEWEST:
         return Stepped(status="partial", note=f"{run.samples} samples are too few for an error", **shown)
-    return Stepped(status="ok", **shown, **run.averages())
+    averages, note = noted(run.averages)
+    return Stepped(status="ok", note=note, **shown, **averages)
 
 
 def _refuse(layers: Layers, step: float, friction: float) -> None:

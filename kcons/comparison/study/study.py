@@ -6,6 +6,7 @@ a study ends, what is done is in its file, and its progress bars are gone.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,6 +111,14 @@ class Kept:
         """Into the file, in one piece."""
         if self.path is not None:
             json_files.write(self.path, self.pack({**self.head, **result}))
+
+
+def noted(make: Callable[[], Found]) -> tuple[Found, str]:
+    """What `make` gives, and what it warned of, for a note beside the result: each warning once."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        found = make()
+    return found, "; ".join(dict.fromkeys(str(each.message) for each in said))
 
 
 def picked(names: Iterable[str] | None, known: Iterable[str], what: str, item: str) -> list[str]:

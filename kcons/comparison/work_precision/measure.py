@@ -28,6 +28,7 @@ from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.constraints.compilation import clock
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
+from kcons.thermostats.correlated_series import slope
 
 #: A first step below so many seconds, or this part of the budget, may be slow only because it is the first.
 FIRST_STEP_DOUBT, FIRST_STEP_SHARE = 0.5, 0.25
@@ -428,7 +429,5 @@ def _energy_slope(test_system: TestSystem, log: _Log) -> tuple[float | None, flo
         return None, None
     t = np.array(log.times) / test_system.units.long_time_unit
     e = np.array(log.energies) / max(test_system.motion.degrees_of_freedom, 1)
-    t, e = t - t.mean(), e - e.mean()
-    slope = float(t @ e / (t @ t))
-    left_over = float(np.sum((e - slope * t) ** 2))
-    return slope, float(np.sqrt(left_over / (len(t) - 2) / (t @ t)))
+    found = slope(t, e)
+    return found.value, found.error
