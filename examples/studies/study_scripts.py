@@ -16,8 +16,8 @@ from kcons.comparison.machine import environment
 from kcons.comparison.progress import Watcher
 from kcons.comparison.study.asked import picked
 from kcons.comparison.study.tables import Table, terminal
-from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.thermostats.correlated_series import slope as slope
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -144,21 +144,6 @@ def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict
         name: {"ms": 1e3 * float(np.median(found)) / steps, "ratio": ratio(first, found)}
         for name, found in seconds.items()
     }
-
-
-def slope(t: FloatArray, y: FloatArray, blocks: int = 10) -> tuple[float, float]:
-    """Slope of y(t) by least squares, and its standard error from means over blocks: noise may be correlated in time.
-
-    Parameters
-    ----------
-    t, y : ndarray, shape (n,)
-    blocks : int, optional
-        Each longer than the noise remembers.
-    """
-    steep, level = np.polyfit(t, y, 1)
-    left = np.array([block.mean() for block in np.array_split(y - steep * t - level, blocks)])
-    middle = np.array([block.mean() for block in np.array_split(t, blocks)])
-    return float(steep), float(left.std(ddof=2) / np.sqrt(np.sum((middle - middle.mean()) ** 2)))
 
 
 def table(

@@ -16,7 +16,12 @@ from kcons.errors import with_extra
 
 try:
     from kcons.ase.calculator import ConstrainedCalculator
-    from kcons.ase.constraints_object import Constraints, constrain
+    from kcons.ase.constraints_object import (
+        Constraints,
+        ConstraintsWithFixedAtoms,
+        constrain,
+        to_ase_constraints,
+    )
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.logger import ConstraintLogger
     from kcons.ase.monte_carlo import ConstrainedMonteCarlo
@@ -29,7 +34,7 @@ try:
         IsokineticDynamics,
         draw_velocities,
     )
-    from kcons.ase.topology import constraints_of, mend_elements
+    from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass
     from kcons.ase.translation import from_ase_constraints
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.ase") from error
@@ -42,6 +47,7 @@ __all__ = [
     "ConstrainedNoseHoover",
     "ConstraintLogger",
     "Constraints",
+    "ConstraintsWithFixedAtoms",
     "IsokineticDynamics",
     "MultipleTimeSteps",
     "PressureReporter",
@@ -50,5 +56,7 @@ __all__ = [
     "draw_velocities",
     "from_ase_constraints",
     "mend_elements",
+    "repartition_hydrogen_mass",
     "rigid_water",
+    "to_ase_constraints",
 ]

@@ -175,15 +175,20 @@ def _acted_on(other: Any, n_atoms: int) -> IntArray:
     """Atoms that an ASE constraint acts on; all where it does not say."""
     if isinstance(other, ase.constraints.FixedMode):  # its own get_indices names none
         return np.flatnonzero(other.mode.reshape(-1, 3).any(axis=1))
+    if hasattr(other, "touched"):  # another object of kcons
+        return np.asarray(other.touched)
     indices = other.get_indices() if hasattr(other, "get_indices") else slice(None)
     return np.arange(n_atoms)[indices]
 
 
 _REPLACEMENTS = {
-    "Constraints": ": atoms.set_constraint(), then constrain(atoms, [*old.constraints, *new])",
+    **dict.fromkeys(
+        ("Constraints", "ConstraintsWithFixedAtoms"),
+        ": atoms.set_constraint(), then constrain(atoms, [*old.constraints, *new])",
+    ),
     "FixAtoms": ", with FixedAtoms for what FixAtoms held",
     "FixBondLengths": ", with Distance for what FixBondLengths held",
-    "FixInternals": ", with Distance, Angle and Dihedral for what FixInternals held",
+    "FixInternals": ", with Distance, Angle, Dihedral and DistanceDifference for what FixInternals held",
     "FixLinearTriatomic": ", with Distance and LinearRelation for what FixLinearTriatomic held",
     "FixCom": ", with CenterOfMass for what FixCom held",
     "FixSubsetCom": ", with CenterOfMass for what FixSubsetCom held",

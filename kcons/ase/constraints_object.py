@@ -11,7 +11,7 @@ from weakref import ref
 import ase.constraints
 import numpy as np
 from ase import Atoms
-from ase.constraints import FixConstraint
+from ase.constraints import FixAtoms, FixConstraint
 
 import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
@@ -19,7 +19,7 @@ from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface, warn_of_displacements
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
-from kcons.ase.translation import ase_form
+from kcons.ase.translation import ase_form, ase_forms
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
@@ -30,7 +30,7 @@ from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.steppers.state import KICK_ROUNDING
 
-__all__ = ["Constraints", "constrain"]
+__all__ = ["Constraints", "ConstraintsWithFixedAtoms", "constrain", "to_ase_constraints"]
 
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
@@ -88,6 +88,17 @@ class Constraints(FixConstraint):
         #: The atoms that the positions known of belong to; one object may be on several.
         self._last: ref[Atoms] | None = None
         self._forget()
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """What is held."""
+        return self.__dict__["constraints"]  # type: ignore[no-any-return]
+
+    @constraints.setter
+    def constraints(self, rows: tuple[Constraint, ...]) -> None:
+        self.__dict__["constraints"] = rows
+        fixed = any(item.family == "FixedAtoms" and item.n_rows for item in rows)
+        self.__class__ = ConstraintsWithFixedAtoms if fixed else Constraints  # type: ignore[assignment]
 
     # -- the engine -----------------------------------------------------------------------------
 
@@ -153,8 +164,8 @@ class Constraints(FixConstraint):
             self._positions_due -= 1
         except ConvergenceError as error:
             error.add_note(
-                "In ASE: a smaller timestep or maxstep; or, if the atoms were placed anew, atoms.positions[:] = ... "
-                "followed by Constraints.restore(atoms)"
+                "In ASE: a smaller timestep, maxstep, or dr of BasinHopping; or, if the atoms were placed anew, "
+                "atoms.positions[:] = ... followed by Constraints.restore(atoms)"
             )
             raise
         self._watch.accept(asked, new, bound.cell, atoms)
@@ -228,9 +239,14 @@ class Constraints(FixConstraint):
         """The rank of the rows, which may be less than their number."""
         return self._bound(atoms).motion.rank
 
-    def get_indices(self) -> IntArray:
+    @property
+    def touched(self) -> IntArray:
         """All atoms that some row touches."""
         return touched_atoms(self.constraints)
+
+    def get_indices(self) -> IntArray:
+        """All atoms that some row touches; of `ConstraintsWithFixedAtoms` the fixed ones."""
+        return self.touched
 
     def index_shuffle(self, atoms: Atoms, ind: Any) -> None:
         """Keep the rows whose atoms are all in the slice `ind`, renumbered.
@@ -273,8 +289,8 @@ class Constraints(FixConstraint):
         """Independent copy with the same targets."""
         # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
-        warn_of_displacements(self.get_indices)
-        twin = object.__new__(Constraints)
+        warn_of_displacements(lambda: self.touched)
+        twin = object.__new__(type(self))
         twin.__dict__.update(self.__dict__)
         twin._forget()
         return twin
@@ -305,7 +321,7 @@ class Constraints(FixConstraint):
     def __repr__(self) -> str:
         converted = self._binding.motion.conversions if self._binding is not None else ()
         what = f"; {len(converted)} groups converted to linear rows, the first: {converted[0]}" if converted else ""
-        return f"Constraints({sum(c.n_rows for c in self.constraints)} rows on {len(self.get_indices())} atoms{what})"
+        return f"Constraints({sum(c.n_rows for c in self.constraints)} rows on {len(self.touched)} atoms{what})"
 
     # -- for people -----------------------------------------------------------------------------
 
@@ -336,6 +352,30 @@ class Constraints(FixConstraint):
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
         velocities = velocities_of(atoms) if "momenta" in atoms.arrays else None
         return self.engine(atoms).report(atoms.arrays["positions"], velocities)
+
+
+class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
+    """`Constraints` that hold fixed atoms: to ASE and others a `FixAtoms` of these, too.
+
+    So files that know fixed atoms have them (POSCAR, FHI-aims, Turbomole, extxyz, ...), and programs that ask for
+    `FixAtoms` and its `index`. `Constraints` become this, and cease to be, by what they hold. ``del atoms[i]`` keeps
+    the rows whose atoms all stay, as slices do.
+    """
+
+    @property
+    def index(self) -> IntArray:  # type: ignore[override]
+        """The fixed atoms, in ascending order."""
+        return touched_atoms([item for item in self.constraints if item.family == "FixedAtoms"])
+
+    def get_indices(self) -> IntArray:
+        """The fixed atoms."""
+        return self.index
+
+    def delete_atoms(self, indices: Any, natoms: int) -> Constraints | None:
+        """Keep the rows whose atoms all stay, renumbered; None if there are none."""
+        kept = within(self.constraints, np.delete(np.arange(natoms), indices), natoms)
+        self.constraints, self._binding = kept, None
+        return self if kept else None
 
 
 def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -465,6 +505,48 @@ def constrain(
             stacklevel=2,
         )
     return held
+
+
+def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] = "raise") -> list[FixConstraint]:
+    """Objects of ASE that hold what the constraints of kcons on `atoms` hold, for programs that know ASE's alone.
+
+    Fixed atoms become FixAtoms; distances FixBondLengths, or with their differences, angles and dihedrals FixInternals;
+    planes and lines FixedPlane and FixedLine; single components FixCartesian; centers of mass FixSubsetCom. Other
+    objects on the atoms are taken as they are. The atoms are not changed::
+
+        plain = atoms.copy()
+        plain.set_constraint(to_ase_constraints(atoms))
+
+    ASE applies objects one after another: where they share atoms, its own dynamics and optimizers keep neither.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+    missing : {'raise', 'leave out'}
+        What to do about rows that no object of ASE holds.
+
+    Raises
+    ------
+    UnsupportedError
+        Such rows, named.
+    """
+    require_atoms(atoms)
+    if missing not in ("raise", "leave out"):
+        raise InputError(f"missing must be 'raise' or 'leave out', not {missing!r}", item="missing")
+    result: list[FixConstraint] = []
+    for item in atoms.constraints:
+        if not isinstance(item, Constraints):
+            result.append(item.copy())
+            continue
+        item.engine(atoms)  # settles targets that are open
+        forms, left = ase_forms(item.constraints)
+        if left and missing == "raise":
+            raise UnsupportedError(
+                f"no object of ASE holds {left[0]!r}; leave it out with missing='leave out', or keep the constraints "
+                "of kcons"
+            )
+        result += [ase.constraints.dict2constraint(form) for form in forms]
+    return result
 
 
 def _register() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -41,6 +42,9 @@ from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed, require_stepper
 from kcons.thermostats.pressure.constant_pressure import in_cell
+
+#: Steps longer than this are asked about: 20 fs, above which no motion of molecules at room temperature is followed.
+LONGEST = 20.0 * units.fs * (1 + 1e-12)
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 FAR = 128.0
@@ -102,6 +106,8 @@ class ConstrainedDynamics(MolecularDynamics):
 
     #: Besides that of the atoms.
     _calculators: tuple[Any, ...] = ()
+    #: Equal parts of a step in which the atoms move.
+    _parts = 1
 
     def __init__(
         self,
@@ -119,7 +125,7 @@ class ConstrainedDynamics(MolecularDynamics):
         **kwargs: Any,
     ) -> None:
         require_atoms(atoms)
-        _check_timestep(timestep)
+        self._check_timestep(timestep)
         self._check_every, self._spare = checked_every(check_every)
         self.time = finite_number(time, "time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
@@ -164,8 +170,27 @@ class ConstrainedDynamics(MolecularDynamics):
 
     def set_timestep(self, timestep: float) -> None:
         """Use another time step from now on."""
-        _check_timestep(timestep)
+        self._check_timestep(timestep)
         self.dt = timestep
+
+    def _check_timestep(self, timestep: float) -> None:
+        """Refuse what is no time; ask where the steps that move the atoms are as long as from a slip of units."""
+        try:
+            good = math.isfinite(timestep)
+        except TypeError:
+            good = False
+        if not good:
+            raise InputError(
+                f"the time step is {timestep!r}; give a finite number in ASE's unit of time", item="timestep"
+            )
+        shortest = abs(timestep) / self._parts
+        if shortest > LONGEST:
+            warnings.warn(
+                f"the atoms move in steps of {shortest / units.fs:.4g} fs. Is that meant? ASE's unit of time is "
+                f"{1 / units.fs:.4g} fs: give 2 fs as 2 * ase.units.fs",
+                UserWarning,
+                stacklevel=3,
+            )
 
     def get_time(self) -> float:
         """The time reached, in ASE's unit; right also if the time step was changed."""
@@ -189,10 +214,17 @@ class ConstrainedDynamics(MolecularDynamics):
         """3 N less the rank of everything that is held."""
         return self._systems().motion.degrees_of_freedom
 
+    def get_kinetic_energy(self) -> float:
+        """Kinetic energy in eV; of a bath with noise that of the middle of the last step, see `ConstrainedLangevin`."""
+        step, energy = getattr(self.stepper, "exchanged", None) or (-1, 0.0)
+        if step == self.nsteps and np.array_equal(self.atoms.arrays["momenta"], self._momenta):
+            return float(energy)
+        return kinetic_energy_of(self.atoms)
+
     def get_temperature(self) -> float:
         """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
         freedom = self.degrees_of_freedom
-        return 2 * kinetic_energy_of(self.atoms) / (freedom * units.kB) if freedom else 0.0
+        return 2 * self.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
 
     def applied_forces(self) -> FloatArray:
         """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""
@@ -326,6 +358,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
             self._system = self._made(bound.motion)
+            self._system.time_unit = ("fs", units.fs)
             self._mover.check(self._system)
             self._weights = _weights(self._system)
         else:
@@ -450,15 +483,6 @@ def _tell_temperature(error: BaseException, atoms: Atoms) -> None:
     """Note how warm the atoms were when a calculator failed: it can do nothing with what too long steps have made."""
     if not isinstance(error, KconsError) and atoms.get_number_of_degrees_of_freedom():
         error.add_note(f"the kinetic temperature was {atoms.get_temperature():.0f} K there")
-
-
-def _check_timestep(timestep: float) -> None:
-    try:
-        good = math.isfinite(timestep)
-    except TypeError:
-        good = False
-    if not good:
-        raise InputError(f"the time step is {timestep!r}; give a finite number in ASE's unit of time", item="timestep")
 
 
 def _array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:

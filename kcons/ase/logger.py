@@ -27,7 +27,8 @@ class ConstraintLogger(MDLogger):
 
     ASE's own logger counts what the objects on the atoms remove. Rows that only the dynamics holds, and total momentum
     that a thermostat leaves alone, are missing there, and constraint forces of such rows in the stress. ``logfile=`` of
-    the dynamics of kcons is such a log.
+    the dynamics of kcons is such a log. With a bath that has noise, kinetic energy and temperature are of the middle of
+    the step; see `ConstrainedLangevin`.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ class ConstraintLogger(MDLogger):
         atoms: Atoms = self.atoms
         dyn: Any = self.dyn
         count = len(atoms) if self.peratom else 1
-        whole = kinetic_energy_of(atoms)
+        whole = dyn.get_kinetic_energy() if hasattr(dyn, "motion") else kinetic_energy_of(atoms)
         potential, kinetic = atoms.get_potential_energy() / count, whole / count
         row = [] if dyn is None else [dyn.get_time() / (1000 * units.fs)]
         row += [potential + kinetic, potential, kinetic]

@@ -102,6 +102,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         self._options["steps"] = {"slow": 1, "fast": fast_steps}
         self._bath: Bath = bath
         stepper = self._stepper(temperature_K, friction)
+        self._parts = fast_steps
         if fast is slow:
             raise InputError(
                 "fast and slow are the same calculator: its forces would count twice. Give two, or use "

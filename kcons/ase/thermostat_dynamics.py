@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics, put
 from kcons.ase.pressure.atoms_system import AtomsSystem
-from kcons.ase.topology import kinetic_energy_of, require_atoms
+from kcons.ase.topology import require_atoms
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
@@ -125,7 +125,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
     def get_temperature(self) -> float:
         """Kinetic temperature in K by the degrees of freedom that the thermostat acts on."""
         count = self.thermostat_degrees_of_freedom
-        return 2 * kinetic_energy_of(self.atoms) / (count * units.kB) if count else 0.0
+        return 2 * self.get_kinetic_energy() / (count * units.kB) if count else 0.0
 
     def get_conserved_energy(self) -> float:
         """The quantity in eV that the exact motion conserves, where targets rest; see the thermostat in the core."""
@@ -210,6 +210,9 @@ class ConstrainedLangevin(ThermostattedDynamics):
     """Langevin dynamics on the constraints, whatever they are: geodesic BAOAB.
 
     See `kcons.thermostats.Langevin`. Noise is a function of the seed and of the number of the step.
+
+    `get_kinetic_energy`, `get_temperature` and the log are of the middle of the last step, after noise: there
+    velocities are as warm as the bath. Those that atoms have at the end of a step are colder along stiff motions.
 
     Parameters
     ----------

@@ -13,9 +13,10 @@ from ase import Atoms, units
 from ase.data import atomic_masses, atomic_numbers, chemical_symbols
 from numpy.typing import NDArray
 
-from kcons.constraints.arguments import check_pairs
+from kcons.constraints.arguments import check_pairs, positive
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
 from kcons.topology.guessed_bonds import guess_bonds, reaches
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
@@ -38,6 +39,7 @@ __all__ = [
     "kinetic_energy_of",
     "mend_elements",
     "named_rows",
+    "repartition_hydrogen_mass",
     "require_atoms",
     "snapshot_of",
     "velocities_of",
@@ -213,6 +215,53 @@ def mend_elements(atoms: Atoms) -> int:
     changed = int(np.sum(numbers != atoms.numbers))
     atoms.numbers[:] = numbers
     return changed
+
+
+def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = False) -> int:
+    """Give hydrogens more mass, in place, and take it from the heavy atoms that they are bonded to; how many have it.
+
+    This slows the angles of hydrogens, so that with their bonds held steps may be 4 fs; averages of configurations stay
+    as they are. The same as OpenMM's ``hydrogenMass``. A second call with the same mass changes nothing. Momenta stay:
+    draw velocities afterwards.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+        Bonds are the pairs in ``atoms.info['bonds']``; without them they are guessed.
+    mass : float
+        Of each hydrogen that is bonded to a heavy atom, in dalton.
+    water : bool
+        Whether to change water as well, which rigid water does not need.
+
+    Raises
+    ------
+    InputError
+        A mass that is not positive; a heavy atom would be lighter than its hydrogens. Nothing is changed then.
+    """
+    mass = positive(mass, "mass")
+    bonds = bonds_of(atoms)
+    light = atoms.numbers == 1
+    pairs = bonds[light[bonds].sum(axis=1) == 1]
+    pairs = np.where(light[pairs[:, :1]], pairs, pairs[:, ::-1])  # hydrogen, heavy
+    count, among = (np.bincount(end, minlength=len(atoms)) for end in (bonds.ravel(), pairs[:, 1]))
+    if not water:
+        pairs = pairs[~((atoms.numbers == 8) & (count == 2) & (among == 2))[pairs[:, 1]]]
+    # Of a bridge, from the first of its heavy atoms.
+    pairs = pairs[np.unique(pairs[:, 0], return_index=True)[1]]
+    masses = atoms.get_masses()
+    np.subtract.at(masses, pairs[:, 1], mass - masses[pairs[:, 0]])
+    masses[pairs[:, 0]] = mass
+    left = masses[pairs[:, 1]]
+    if len(pairs) and left.min() < mass:
+        atom = int(pairs[np.argmin(left), 1])
+        raise InputError(
+            f"hydrogens of {mass:g} dalton leave {left.min():.3g} to atom {atom} ({atoms.symbols[atom]}), to which "
+            "they are bonded; give a smaller mass",
+            item="mass",
+            atoms=[atom],
+        )
+    atoms.set_masses(masses)
+    return len(pairs)
 
 
 def atoms_of(snapshot: Snapshot) -> Atoms:

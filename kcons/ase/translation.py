@@ -16,6 +16,7 @@ from kcons.constraints import (
     Constraint,
     Dihedral,
     Distance,
+    DistanceDifference,
     FixedAtoms,
     Line,
     LinearCombination,
@@ -29,7 +30,7 @@ from kcons.errors import UnsupportedError
 def from_ase_constraints(atoms: Atoms) -> list[Constraint]:
     """What the ASE constraints on `atoms` hold, as kcons constraints.
 
-    Knows FixAtoms, FixBondLengths, FixInternals (bonds, angles, dihedrals), FixLinearTriatomic, FixCom,
+    Knows FixAtoms, FixBondLengths, FixInternals, FixLinearTriatomic, FixCom,
     FixSubsetCom, FixedPlane, FixedLine and FixCartesian. The atoms are not changed::
 
         held = from_ase_constraints(atoms)
@@ -66,11 +67,10 @@ def _bond_lengths(atoms: Atoms, item: Any) -> list[Constraint]:
 
 
 def _internals(atoms: Atoms, item: Any) -> list[Constraint]:
-    if item.bondcombos:
-        raise UnsupportedError(
-            "FixInternals holds combinations of bond lengths (bondcombos); use a Custom constraint for them"
-        )
-    result: list[Constraint] = []
+    result: list[Constraint] = [
+        DistanceDifference([row[:2] for row in rows], value, weights=[row[2] for row in rows])
+        for value, rows in item.bondcombos
+    ]
     for rows, family, unit in (
         (item.bonds, Distance, 1.0),
         (item.angles, Angle, np.pi / 180),
@@ -109,7 +109,7 @@ def _indices(atoms: Atoms, item: Any) -> IntArray:
 
 
 _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
-    "Constraints": lambda atoms, item: list(item.constraints),
+    **dict.fromkeys(("Constraints", "ConstraintsWithFixedAtoms"), lambda atoms, item: list(item.constraints)),
     "FixAtoms": lambda atoms, item: [FixedAtoms(_indices(atoms, item))],
     "FixBondLengths": _bond_lengths,
     "FixInternals": _internals,
@@ -123,35 +123,101 @@ _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
 
 
 def ase_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
-    """One constraint of ASE that holds the same, as `ase.constraints.dict2constraint` takes it; None if there is none.
+    """The one constraint of ASE that holds the same, as in `ase_forms`; None if there is none."""
+    forms, left = ase_forms(rows)
+    return forms[0] if len(forms) == 1 and not left else None
 
-    Known are distances; distances, angles and dihedrals; fixed atoms; planes, or lines, of one direction; all with
-    targets that are found and rest.
+
+def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Constraint]]:
+    """Constraints of ASE that hold the same, as `ase.constraints.dict2constraint` takes them, and what none holds.
+
+    Known are fixed atoms; distances and their differences, angles and dihedrals; planes and lines; components of single
+    atoms; centers of mass with all their components; all with targets that are found and rest.
     """
-    if not rows or not all(isinstance(item.target, np.ndarray) for item in rows):
-        return None
-    families = {item.family for item in rows}
-    if families == {"Distance"}:
-        pairs = [pair for item in rows for pair in item.atoms.tolist()]
-        return _named("FixBondLengths", pairs=pairs, bondlengths=[d for item in rows for d in _targets(item)])
-    if families <= {"Distance", "Angle", "Dihedral"}:
-        parts: dict[str, list[Any]] = {"Distance": [], "Angle": [], "Dihedral": []}
-        for item in rows:
-            values = _targets(item) if item.family == "Distance" else np.degrees(_targets(item)).tolist()
-            parts[item.family] += [list(row) for row in zip(values, item.atoms.tolist(), strict=True)]
-        bonds, angles, dihedrals = parts.values()
-        return _named("FixInternals", bonds=bonds, angles_deg=angles, dihedrals_deg=dihedrals, mic=True)
-    atoms = sorted({atom for item in rows for atom in item.atoms.ravel().tolist()})
-    if families == {"FixedAtoms"}:
-        return _named("FixAtoms", indices=atoms)
-    if families in ({"Plane"}, {"Line"}):
-        normals = np.concatenate([np.asarray(item.coefficients)[:, 0] for item in rows])  # type: ignore[attr-defined]
-        if families == {"Line"}:
-            normals = np.cross(normals[::2], normals[1::2])
-        if len(normals) == len(atoms) and np.all(normals == normals[0]):
-            name = "FixedPlane" if families == {"Plane"} else "FixedLine"
-            return _named(name, indices=atoms, direction=normals[0].tolist())
-    return None
+    kinds: dict[str, list[Constraint]] = {}
+    for item in rows:
+        known = isinstance(item.target, np.ndarray) and item.n_rows
+        kinds.setdefault(_KINDS.get(item.family, "") if known else "", []).append(item)
+    left = kinds.pop("", [])
+    forms = []
+    for kind, items in kinds.items():
+        found = _FORMS[kind](items)
+        forms += found
+        left += [] if found else items
+    return forms, left
+
+
+def _fixed(items: list[Constraint]) -> list[dict[str, Any]]:
+    return [_named("FixAtoms", indices=sorted({atom for item in items for atom in item.atoms.ravel().tolist()}))]
+
+
+def _internal(items: list[Constraint]) -> list[dict[str, Any]]:
+    parts: dict[str, list[Any]] = {"Distance": [], "Angle": [], "Dihedral": [], "DistanceDifference": []}
+    for item in items:
+        values = np.degrees(_targets(item)).tolist() if item.family in ("Angle", "Dihedral") else _targets(item)
+        named = item.weighted_pairs() if isinstance(item, DistanceDifference) else item.atoms.tolist()
+        parts[item.family] += [list(row) for row in zip(values, named, strict=True)]
+    bonds, angles, dihedrals, sums = parts.values()
+    if not (angles or dihedrals or sums):
+        return [_named("FixBondLengths", pairs=[pair for _, pair in bonds], bondlengths=[d for d, _ in bonds])]
+    more = {"bondcombos": sums} if sums else {}
+    return [_named("FixInternals", bonds=bonds, angles_deg=angles, dihedrals_deg=dihedrals, mic=True, **more)]
+
+
+def _directed(items: list[Constraint]) -> list[dict[str, Any]]:
+    """Planes by their normals, or lines by their directions; none where one atom has two of them."""
+    atoms: dict[tuple[float, ...], list[int]] = {}
+    for item in items:
+        directions = np.asarray(item.coefficients)[:, 0]  # type: ignore[attr-defined]
+        each = item.atoms[:, 0]
+        if item.family == "Line":
+            directions, each = np.cross(directions[::2], directions[1::2]), each[::2]
+        for direction, atom in zip(directions.tolist(), each.tolist(), strict=True):
+            atoms.setdefault(tuple(direction), []).append(atom)
+    every = [atom for found in atoms.values() for atom in found]
+    if len(set(every)) < len(every):
+        return []
+    name = "FixedPlane" if items[0].family == "Plane" else "FixedLine"
+    return [_named(name, indices=found, direction=list(direction)) for direction, found in atoms.items()]
+
+
+def _components(items: list[Constraint]) -> list[dict[str, Any]]:
+    masks: dict[int, list[bool]] = {}
+    for item in items:
+        for atoms, coefficients in zip(item.atoms.tolist(), item.coefficients.tolist(), strict=True):  # type: ignore[attr-defined]
+            axes = np.flatnonzero(coefficients[0])
+            if len(atoms) != 1 or len(axes) != 1:
+                return []
+            masks.setdefault(atoms[0], [False] * 3)[int(axes[0])] = True
+    atoms_of: dict[tuple[bool, ...], list[int]] = {}
+    for atom, mask in masks.items():
+        atoms_of.setdefault(tuple(mask), []).append(atom)
+    return [_named("FixCartesian", a=sorted(found), mask=list(mask)) for mask, found in atoms_of.items()]
+
+
+def _centers(items: list[Constraint]) -> list[dict[str, Any]]:
+    axes: dict[tuple[int, ...], set[int]] = {}
+    for item in items:
+        for atoms, direction in zip(item.atoms.tolist(), item.directions.tolist(), strict=True):  # type: ignore[attr-defined]
+            axes.setdefault(tuple(atoms), set()).add(int(np.argmax(direction)))
+    if any(len(found) < 3 for found in axes.values()):
+        return []
+    return [_named("FixSubsetCom", indices=list(atoms)) for atoms in axes]
+
+
+#: Families that one object of ASE holds together, and what makes its data; none where it does not hold these.
+_KINDS = {
+    **dict.fromkeys(("Distance", "DistanceDifference", "Angle", "Dihedral"), "internal"),
+    **{family: family for family in ("FixedAtoms", "Plane", "Line", "LinearCombination", "CenterOfMass")},
+}
+_FORMS: dict[str, Callable[[list[Constraint]], list[dict[str, Any]]]] = {
+    "FixedAtoms": _fixed,
+    "internal": _internal,
+    "Plane": _directed,
+    "Line": _directed,
+    "LinearCombination": _components,
+    "CenterOfMass": _centers,
+}
 
 
 def _named(name: str, **kwargs: Any) -> dict[str, Any]:

@@ -33,6 +33,10 @@ def add(commands: Any) -> None:
     check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
     check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
     check.add_argument(
+        "--format", metavar="NAME", help="of the trajectory, where its name does not tell: LAMMPSDUMP, ..."
+    )
+    check.add_argument("--topology-format", metavar="NAME", help="of the topology, where its name does not tell")
+    check.add_argument(
         "--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, allangles or none"
     )
     check.add_argument("--select", default="all", help="rows within this selection only (MDAnalysis' language)")
@@ -70,7 +74,7 @@ def _check(chosen: argparse.Namespace) -> int:
 
     if chosen.out is not None:
         report.refuse_others(chosen.out, chosen.trajectory)  # complain before any work
-    for name in ("rigid_bodies", "no_rigid_water"):
+    for name in ("rigid_bodies", "no_rigid_water", "format", "topology_format"):
         if chosen.forces is not None and getattr(chosen, name):
             option = name.replace("_", "-")
             raise InputError(f"--forces does not go with --{option}; leave one of them out", item="forces")
@@ -140,6 +144,8 @@ def _result(chosen: argparse.Namespace, check_trajectory: Callable[..., CheckRes
         tolerance=chosen.tolerance,
         precision=chosen.precision,
         frames=chosen.frames,
+        format=chosen.format,
+        topology_format=chosen.topology_format,
         workers=chosen.workers,
         worst=chosen.worst,
         rank=not chosen.no_rank,

@@ -16,6 +16,7 @@ from kcons.constraints import (
     Cylinder,
     Dihedral,
     Distance,
+    DistanceDifference,
     Ellipsoid,
     Plane,
     RadiusOfGyration,
@@ -74,6 +75,7 @@ def surfaces() -> None:
     rows = Sphere(0, origin), Cylinder(1, origin, up), Torus(2, origin, up, 1.0), Plane(3, up)
     ellipsoid = Ellipsoid(4, origin, [1.0, 2.0, 3.0], target=None)
     _use(ZIGZAG[:10], *rows, ellipsoid, CenterDistance([5], [6]), RadiusOfGyration([7, 8, 9]))
+    _use(ZIGZAG[:3], DistanceDifference([[0, 1], [1, 2]]))
 
 
 def thermostats() -> None:

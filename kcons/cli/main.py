@@ -53,6 +53,9 @@ def _main(arguments: Sequence[str] | None) -> int:
     except (KconsError, OSError) as error:
         print(f"kcons: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except MemoryError as error:
+        print(f"kcons: there is not enough memory: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("kcons: interrupted", file=sys.stderr)
         return 130

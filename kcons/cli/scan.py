@@ -189,7 +189,7 @@ def _structure(path: Path) -> Atoms:
 def _settings(given: str) -> dict[str, Any]:
     try:
         found = json.loads(given)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"--settings is no JSON: {error}; give such as '{{\"charge\": 1}}'", item="settings"
         ) from error

@@ -27,6 +27,7 @@ from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import Potential
 from kcons.constraints.compilation import announcer, clock
 from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.thermostats.correlated_series import slope
 
 #: A run is observed about so many times.
 RECORDS = 20
@@ -376,18 +377,16 @@ class _Log:
             return {**found, "status": "thermostat" if status == "ok" else status}
         if status == "ok":
             found["error"] = self.system.deviation(x, reference.positions)
-        return {**found, **self.slope()}
+        return {**found, **self.energy_slope()}
 
-    def slope(self) -> dict[str, float]:
+    def energy_slope(self) -> dict[str, float]:
         """Least-squares slope of the energy and its standard error, a degree of freedom and `long_time`."""
         if len(self.times) < 4 or not np.isfinite(self.energies).all():
             return {}
         t = np.array(self.times) / self.system.units.long_time_unit
         e = np.array(self.energies) / max(self.system.motion.degrees_of_freedom, 1)
-        t, e = t - t.mean(), e - e.mean()
-        slope = float(t @ e / (t @ t))
-        left = float(np.sum((e - slope * t) ** 2))
-        return {"slope": slope, "slope_error": float(np.sqrt(left / (len(t) - 2) / (t @ t)))}
+        found = slope(t, e)
+        return {"slope": found.value, "slope_error": found.error}
 
 
 def _too_slow(step_seconds: float, budget: float) -> str:

@@ -17,6 +17,7 @@ from kcons.comparison.averages.long_steps import METHODS, measure
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import TestSystem
 from kcons.steppers import Rattle, State, System, run
+from kcons.thermostats.correlated_series import slope
 
 #: Temperatures that are off by so much, two standard errors included, are right enough.
 RIGHT = 0.01
@@ -115,13 +116,8 @@ def _climb(system: TestSystem, dt: float, seconds: float) -> float:
     for _ in range(RECORDS):
         state = run(made, state, dt, every, stepper=stepper)
         energies.append(system.potential.watched_energy(state.positions) + made.kinetic_energy(state.velocities))
-    t = np.arange(RECORDS) - (RECORDS - 1) / 2
-    e = np.array(energies) - np.mean(energies)
-    slope = float(t @ e / (t @ t))
-    # Neighboring records are not independent: errors from means over blocks of five.
-    left = (e - slope * t).reshape(-1, 5).mean(axis=1)
-    error = float(left.std(ddof=1) / np.sqrt(len(left))) / float(np.sqrt(np.mean(t**2)))
-    return slope / error if error > 0 else 0.0
+    found = slope(np.arange(float(RECORDS)), np.array(energies))
+    return found.value / found.error if found.error > 0 else 0.0
 
 
 def sentence(checks: Sequence[StepCheck], unit: str, kelvin: float = 300.0) -> str:

@@ -3,7 +3,7 @@
 - `compilation`: compiled kernels, and where they are kept
 - `arguments`, `target`, `vectors`: arrays and Quantities from outside, targets and their derivatives, arithmetic
 - `constraint`: the contract of a family
-- `internal`: distances, angles, dihedrals
+- `internal`: distances and their differences, angles, dihedrals
 - `linear`: fixed atoms, linear relations
 - `surface`, `collective`: surfaces, groups
 - `functions`: functions of one's own
@@ -25,7 +25,7 @@ from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.custom import Custom, ImplicitSurface
 from kcons.constraints.functions.formula import Formula
 from kcons.constraints.functions.velocity_formula import VelocityFormula
-from kcons.constraints.internal import Angle, Dihedral, Distance
+from kcons.constraints.internal import Angle, Dihedral, Distance, DistanceDifference
 from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
 from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
 from kcons.constraints.target import MovingTarget
@@ -42,6 +42,7 @@ __all__ = [
     "Cylinder",
     "Dihedral",
     "Distance",
+    "DistanceDifference",
     "Ellipsoid",
     "FixedAtoms",
     "Formula",

@@ -215,7 +215,7 @@ def positive(value: float, item: str) -> float:
     """
     try:
         number = math.nan if np.ndim(value) or isinstance(value, str | bytes | bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not (math.isfinite(number) and number > 0):
         raise InputError(f"{item} is {value!r}; give a positive number", item=item.rpartition(": ")[2])

@@ -77,6 +77,9 @@ class Constraint(ABC):
     units: str | None = None
     #: True if q depends on differences of positions alone, so that minimum images apply.
     translation_invariant: bool = False
+    #: Pairs of slots between which vectors count, those from a slot to a later one that nothing before led to; shape
+    #: (n, 2). In a cell each takes its shortest image. None where all atoms of a row count relative to each other.
+    links: IntArray | None = None
     #: Period of the coordinate (2 pi for dihedrals); sigma is taken to the nearest image.
     period: float | None = None
     kind: RowKind = RowKind.INTERPRETED
@@ -182,6 +185,13 @@ class Constraint(ABC):
     def parameters(self) -> FloatArray:
         """Numbers for the compiled kernels, shape (n_rows, p); see `RowKind`."""
         return np.zeros((self.n_rows, 0))
+
+    @property
+    def linked(self) -> IntArray:
+        """Pairs of atoms, shape (n_rows, n, 2): those of `links`, or neighbors in the list."""
+        if self.links is None:
+            return np.stack([self.atoms[:, :-1], self.atoms[:, 1:]], axis=-1)
+        return self.atoms[:, self.links]
 
     @property
     def relative(self) -> bool:

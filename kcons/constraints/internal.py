@@ -1,20 +1,21 @@
-"""Distances, angles and dihedrals: internal coordinates of a molecule.
+"""Distances, their differences, angles and dihedrals: internal coordinates of a molecule.
 
-All three depend on differences of positions alone, so minimum images apply in periodic cells.
+All depend on differences of positions alone, so minimum images apply in periodic cells.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANGLE
+from kcons.constraints.arguments import ANGLE, numbers
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, dot, norm
-from kcons.errors import SingularGeometryError
+from kcons.errors import InputError, SingularGeometryError
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
 COLLINEAR = 1e-7
@@ -53,6 +54,11 @@ class Distance(Constraint):
     def __init__(self, pairs: ArrayLike, target: Target = None) -> None:
         super().__init__(pairs, target)
 
+    @property
+    def pairs(self) -> IntArray:
+        """The one pair of each row, shape (n_rows, 1, 2)."""
+        return self.atoms[:, None]
+
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         return norm(r[:, 0] - r[:, 1])
 
@@ -81,6 +87,184 @@ class Distance(Constraint):
             ),
         )
         self.refuse_nonpositive(time, first_row)
+
+
+class DistanceDifference(Constraint):
+    """Difference of two distances, or any sum of distances with weights, q = sum_k w_k |r_i - r_j| over pairs (i, j).
+
+    The coordinate of a proton that goes from one atom to another, |D - H| - |H - A|; ``bondcombos`` of ASE's
+    FixInternals; sums of lengths in VASP's ICONST. In periodic cells each pair takes its shortest image, as `Distance`.
+
+    Parameters
+    ----------
+    pairs : array_like of int, shape (n_pairs, 2) or (n_rows, n_pairs, 2)
+        The pairs of atoms of each row. Rows that share atoms in different ways need objects of their own.
+    target : float, array_like, callable of time, MovingTarget or None
+        What each row is held at, in the unit of the positions; may be negative.
+    weights : array_like, shape (n_pairs,)
+        Weight of each distance, for all rows; 1 and -1 unless given.
+
+    Notes
+    -----
+    With u = (r_i - r_j)/d of a pair and c = v_i - v_j: dq/dr_i = sum w u, v^T (d2q/dr2) v = sum w (|c|^2 - (u.c)^2)/d.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> transfer = DistanceDifference([[0, 1], [1, 2]])
+    >>> transfer.measure(np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.5]]]), 0.0)
+    array([-0.5])
+    """
+
+    family = "DistanceDifference"
+    translation_invariant = True
+    kind = RowKind.FUNCTION
+    shared = ("slots", "weights")
+    #: Which atoms of a row are the pairs, and the weight of each pair.
+    slots: tuple[tuple[int, int], ...]
+    weights: tuple[float, ...]
+
+    def __init__(self, pairs: ArrayLike, target: Target = None, *, weights: ArrayLike = (1.0, -1.0)) -> None:
+        try:
+            table = np.asarray(pairs)
+        except ValueError:
+            table = np.zeros(0)
+        if table.ndim == 2:
+            table = table[None]
+        if table.ndim != 3 or table.shape[2] != 2 or not table.size or not np.issubdtype(table.dtype, np.integer):
+            raise InputError(
+                "DistanceDifference: pairs are pairs of atoms, [[0, 1], [1, 2]] for one row; for more rows of as many "
+                "pairs each, a list of such",
+                item="pairs",
+            )
+        found = [_in_one_list(row.tolist()) for row in table]
+        for k, (_, slots) in enumerate(found):
+            if slots != found[0][1]:
+                raise InputError(
+                    f"DistanceDifference: rows 0 and {k} share atoms in different ways; use one object for each",
+                    item="pairs",
+                )
+        self.slots, self.weights = found[0][1], tuple(np.atleast_1d(numbers(weights, "weights")).ravel().tolist())
+        super().__init__([atoms for atoms, _ in found], target)
+        self._settle()
+
+    def _settle(self) -> None:
+        try:
+            self.slots = tuple((int(i), int(j)) for i, j in self.slots)
+            self.weights = tuple(float(w) for w in self.weights)
+        except (TypeError, ValueError):
+            raise InputError("DistanceDifference: slots are pairs and weights are numbers", item="slots") from None
+        n = len(self.slots)
+        if len(self.weights) != n or not np.all(np.isfinite(self.weights)) or not all(self.weights):
+            raise InputError(
+                f"DistanceDifference: weights are {self.weights}; give {n} finite {'number' if n == 1 else 'numbers'} "
+                "other than 0, one for each pair",
+                item="weights",
+            )
+        atoms = self.atoms[0] if self.n_rows else range(self.width)
+        for i, j in self.slots:
+            if i == j:
+                raise InputError(f"DistanceDifference: a pair names atom {atoms[i]} twice", item="pairs")
+        if len({frozenset(pair) for pair in self.slots}) < n:
+            raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
+        if self.n_rows and {slot for pair in self.slots for slot in pair} != set(range(self.width)):
+            raise InputError("DistanceDifference: slots and atoms do not belong together", item="slots")
+        self.links = np.array(_walk(self.slots)[1], dtype=np.int64)
+
+    @property
+    def pairs(self) -> IntArray:
+        """The pairs of each row, shape (n_rows, n_pairs, 2)."""
+        return self.atoms[:, np.array(self.slots)]
+
+    def weighted_pairs(self) -> list[list[list[float]]]:
+        """Of each row its pairs with their weights, [i, j, w], as ASE's ``bondcombos`` has them."""
+        return [[[*pair, w] for pair, w in zip(row, self.weights, strict=True)] for row in self.pairs.tolist()]
+
+    def _arms(self, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Vectors of the pairs, shape (n_rows, n_pairs, 3), and their lengths."""
+        i, j = np.array(self.slots).T
+        d = r[:, i] - r[:, j]
+        return d, norm(d)
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        return np.asarray(self._arms(r)[1] @ np.array(self.weights))
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        d, q = self._arms(r)
+        u = d / q[..., None]
+        result = np.zeros_like(r)
+        for k, ((i, j), w) in enumerate(zip(self.slots, self.weights, strict=True)):
+            result[:, i] += w * u[:, k]
+            result[:, j] -= w * u[:, k]
+        return result
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        d, q = self._arms(r)
+        across = cross(d / q[..., None], self._arms(v)[0])
+        return np.asarray(dot(across, across) / q @ np.array(self.weights))
+
+    def scale(self, time: float = 0.0) -> FloatArray:
+        """0: what is held may be 0, and says nothing of the size of the lengths."""
+        return np.zeros(self.n_rows)
+
+    def parameters(self) -> FloatArray:
+        row = [float(self.width), float(len(self.slots))]
+        for (i, j), w in zip(self.slots, self.weights, strict=True):
+            row += [i, j, w]
+        return np.tile(row, (self.n_rows, 1))
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0:
+            return
+        lengths = self._arms(r)[1]
+        for k, (i, j) in enumerate(self.slots):
+            self.refuse_singular(
+                lengths[:, k] == 0,
+                first_row,
+                lambda row, name, i=i, j=j: (  # type: ignore[misc]
+                    f"atoms {self.atoms[row, i]} and {self.atoms[row, j]} of {name}, coincide: gradient undefined; "
+                    "move them apart"
+                ),
+            )
+        slope = np.sqrt(np.sum(self.gradient(r, time) ** 2, axis=(1, 2)))
+        self.refuse_singular(
+            slope < COLLINEAR * np.abs(self.weights).max(),
+            first_row,
+            lambda k, name: f"the gradient of {name}, vanishes: its atoms lie on a line; bend them, or hold a distance",
+        )
+        if min(self.weights) > 0:
+            self.refuse_nonpositive(time, first_row)
+
+
+def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
+    """Atoms that pairs name, and pairs that lead to each atom from one before it, by their places in this list.
+
+    Along a path, pairs lead from each atom to the next; see `Constraint.links`.
+    """
+    neighbors: dict[int, list[int]] = {}
+    for i, j in pairs:
+        neighbors.setdefault(i, []).append(j)
+        neighbors.setdefault(j, []).append(i)
+    place: dict[int, int] = {}
+    links = []
+    for root in sorted(neighbors, key=lambda atom: len(neighbors[atom])):  # an end of a path first
+        ways = [(root, root)]
+        while ways:
+            before, atom = ways.pop()
+            if atom in place:
+                continue
+            place[atom] = len(place)
+            if atom != before:
+                links.append((place[before], place[atom]))
+            ways += [(atom, other) for other in reversed(neighbors[atom])]
+    return list(place), links
+
+
+def _in_one_list(pairs: list[list[int]]) -> tuple[list[int], tuple[tuple[int, int], ...]]:
+    """Atoms that pairs name, and the pairs by their places in this list."""
+    atoms, _ = _walk(pairs)
+    place = {atom: k for k, atom in enumerate(atoms)}
+    return atoms, tuple((place[i], place[j]) for i, j in pairs)
 
 
 class Angle(Constraint):

@@ -1,9 +1,8 @@
 """Means of correlated samples with weights, and their errors.
 
 The mean force of a window is a ratio, sum w f/sum w. To first order its fluctuation is that of the mean of the series
-u = w (f - mean)/<w>, whose neighbours depend on each other: a mean of n values has g times the variance of independent
-ones, g being the statistical inefficiency (Chodera et al., J. Chem. Theory Comput. 3, 26 (2007), eq. 20; from means of
-blocks where these show more, Flyvbjerg and Petersen, J. Chem. Phys. 91, 461 (1989)). Where
+u = w (f - mean)/<w>, whose neighbors depend on each other: a mean of n values has g times the variance of independent
+ones, g being the statistical inefficiency (from `kcons.thermostats.correlated_series`, as all errors of means). Where
 equilibration ends is where most independent samples are left (Chodera, J. Chem. Theory Comput. 12, 1799 (2016)).
 """
 
@@ -22,13 +21,10 @@ from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError, UnsupportedError
+from kcons.thermostats.correlated_series import FEW_INDEPENDENT, spread
 
-#: Fewest values that an error is taken from, and independent samples below which it is not to be relied on.
-FEWEST, FEW_INDEPENDENT = 16, 10
-#: Blocks whose means are looked at, and fewest values in one.
-BLOCKS, FEWEST_IN_BLOCK = 20, 5
-#: What their variance exceeds with a chance of 5 %, over what is expected: chi square of 19 degrees of freedom.
-_BEYOND_CHANCE = float(chi2.ppf(0.95, BLOCKS - 1)) / (BLOCKS - 1)
+#: Fewest values that an error is taken from.
+FEWEST = 16
 #: Places from which on a run is tried as equilibrated.
 _ORIGINS = 50
 
@@ -47,9 +43,10 @@ class Mean:
     n : int
         Samples used.
     n_effective : float
-        Independent samples of equal weight that would tell as much: (sum w)^2/sum w^2 over the inefficiency.
+        Independent samples of equal weight that would tell as much: (sum w)^2/sum w^2 over the inefficiency, if that is
+        more than 1. Fewer where few blocks make up the spread, as of heavy tails.
     inefficiency : ndarray, shape (d,)
-        Samples for each independent one.
+        Samples for each independent one; less than 1 of values that swing back.
     start : int
         First sample used: what is before it was taken for equilibration.
     """
@@ -78,7 +75,7 @@ def pymbar() -> ModuleType:
         import pymbar
     except ModuleNotFoundError:
         raise UnsupportedError(
-            "errors of correlated series and BAR are left to pymbar, which is not installed: "
+            "the end of equilibration and BAR are left to pymbar, which is not installed: "
             "python -m pip install 'kcons[free-energy]'"
         ) from None
     finally:
@@ -111,7 +108,7 @@ def weighted_mean(
     InputError
         Fewer than 16 samples; a NaN or infinity; a negative weight, or none that is positive.
     UnsupportedError
-        pymbar is not installed.
+        `equilibration`, and pymbar is not installed.
 
     Warns
     -----
@@ -136,17 +133,21 @@ def weighted_mean(
             stacklevel=2,
         )
         fluctuation[:, constant] = 0.0
-    inefficiency = np.array(
-        [1.0 if still else _inefficiency(u) for u, still in zip(fluctuation.T, constant, strict=True)]
-    )
+    covariance = fluctuation.T @ fluctuation / (n * (n - 1))
+    found = [spread(u) for u in fluctuation.T]
+    error = np.array([each.error for each in found])
+    inefficiency = np.ones(len(found))
+    np.divide(error**2, np.diag(covariance), out=inefficiency, where=~constant)
     widening = np.sqrt(inefficiency)
-    covariance = fluctuation.T @ fluctuation / (n * (n - 1)) * np.outer(widening, widening)
-    effective = float(factors.sum() ** 2 / (factors**2).sum() / inefficiency.max())
+    covariance *= np.outer(widening, widening)
+    alike = float(factors.sum() ** 2 / (factors**2).sum())
+    effective = max(min(alike / max(float(inefficiency.max()), 1.0), *(each.independent for each in found)), 1.0)
     if effective < FEW_INDEPENDENT:
         heaviest = float(factors.max() / factors.sum())
         warnings.warn(
-            f"{n} samples are worth {effective:.1f} independent ones (the heaviest has {heaviest:.0%} of the weight, "
-            f"memory lasts for {inefficiency.max():.0f} samples): the error is not to be relied on. Sample longer",
+            f"{n} samples are worth {effective:.1f} independent ones, or a few of them make up the spread (the "
+            f"heaviest has {heaviest:.0%} of the weight, memory lasts for {inefficiency.max():.0f} samples): the error "
+            "is not to be relied on. Sample longer",
             UserWarning,
             stacklevel=2,
         )
@@ -255,21 +256,6 @@ def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:
 def _linearised(series: FloatArray, factors: FloatArray) -> FloatArray:
     """What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0."""
     return factors[:, None] * (series - _mean(series, factors)) / factors.mean()
-
-
-def _inefficiency(series: FloatArray) -> float:
-    """Statistical inefficiency from the autocorrelation; from means of blocks where these say more than chance.
-
-    The sum over the autocorrelation ends where noise takes it below zero, and misses a small slow part beside a fast
-    one: a torsion that turns now and then changes a multiplier little, but for long.
-    """
-    found = float(pymbar().timeseries.statistical_inefficiency(series))
-    size = len(series) // BLOCKS
-    if size < FEWEST_IN_BLOCK:
-        return found
-    means = series[: BLOCKS * size].reshape(BLOCKS, size).mean(axis=1)
-    by_blocks = size * float(means.var(ddof=1) / series.var())
-    return by_blocks if by_blocks > found * _BEYOND_CHANCE else found
 
 
 def _equilibrated(series: FloatArray) -> int:

@@ -15,7 +15,6 @@ import MDAnalysis
 import numpy as np
 
 from kcons.constraints import Constraint, Distance
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
@@ -354,7 +353,9 @@ def _openmm(
         sites = constraints.virtual_sites.in_unit(NM / constraints.snapshot.angstrom)
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
     _warn_of_cut(snapshot)
-    links = np.concatenate([snapshot.topology.bonds, *(_chained(item) for item in rows if item.translation_invariant)])
+    links = np.concatenate(
+        [snapshot.topology.bonds, *(item.linked.reshape(-1, 2) for item in rows if item.translation_invariant)]
+    )
     snapshot = whole_molecules(snapshot, links)
     x = snapshot.positions
     if rows:
@@ -379,11 +380,6 @@ def _openmm(
     if snapshot.velocities is not None:
         velocities = snapshot.velocities * (unit.nanometer / unit.picosecond)
     return ToOpenMM(topology, positions, velocities, system, part)
-
-
-def _chained(item: Constraint) -> IntArray:
-    """Pairs of neighbours in the rows of a constraint."""
-    return np.stack([item.atoms[:, :-1], item.atoms[:, 1:]], axis=-1).reshape(-1, 2)
 
 
 def _system(

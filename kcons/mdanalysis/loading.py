@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import struct
 import sys
 import warnings
@@ -12,15 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import MDAnalysis
-from MDAnalysis.lib.util import guess_format
+from MDAnalysis.lib.util import anyopen, guess_format
 
-from kcons.errors import InputError, UnreadableError
+from kcons.errors import InputError, UnreadableError, did_you_mean
 
-#: What MDAnalysis and the readers below it raise on a bad file.
-READ_ERRORS = (OSError, EOFError, ValueError, TypeError, RuntimeError, LookupError, StopIteration, struct.error)
+#: What MDAnalysis and the readers below it raise on a bad file; the last two of sizes that are not so.
+READ_ERRORS = (
+    *(OSError, EOFError, ValueError, TypeError, RuntimeError, LookupError, StopIteration, struct.error),
+    *(MemoryError, ArithmeticError),
+)
 #: The same where a file is opened: of formats whose package is missing, and of readers that are not MDAnalysis' own.
 _OPEN_ERRORS = (*READ_ERRORS, ImportError, SyntaxError, AttributeError, NotImplementedError)
 
+#: Formats of files whose endings, or names without one, MDAnalysis does not know.
+_FORMATS = {"LAMMPSTRJ": "LAMMPSDUMP", "DUMP": "LAMMPSDUMP", "REVCON": "CONFIG", "NCRST": "NCDF", "RST": "RST7"}
 _HDF5 = b"\x89HDF\r\n"
 #: How files begin, by the ending of their name.
 _BEGINS = {
@@ -61,7 +67,14 @@ def _failing_quietly() -> Iterator[list[str]]:
         sys.unraisablehook = hook
 
 
-def open_universe(topology: str | Path, trajectory: str | Path | None = None, **options: Any) -> Any:
+def open_universe(
+    topology: str | Path,
+    trajectory: str | Path | None = None,
+    *,
+    format: str | None = None,
+    topology_format: str | None = None,
+    **options: Any,
+) -> Any:
     """A Universe from files.
 
     Parameters
@@ -70,32 +83,32 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
         Any topology that MDAnalysis reads.
     trajectory : path, optional
         Any trajectory that MDAnalysis reads.
+    format, topology_format : str, optional
+        Formats of both files, as MDAnalysis names them; by default what their names tell.
     **options
         For `MDAnalysis.Universe`.
 
     Raises
     ------
     InputError
-        A file that is missing or unreadable; atom counts that differ.
+        A file that is missing or unreadable; a format that MDAnalysis does not have; atom counts that differ.
     UnreadableError
         A trajectory that is empty, or begins as it should and cannot be read.
     """
     for path, what in ((topology, "topology"), (trajectory, "trajectory")):
         if path is not None:
             _look_at(Path(path), what)
+    # Without a format, MDAnalysis asks every package it can convert from whether a path is an object of its own, which
+    # imports OpenMM with all its platforms: 80 MB, 70 of them the compiler of an OpenCL platform.
+    kind = _format(topology, topology_format, "topology_format")
     with quiet(), _failing_quietly() as failures:
         try:
-            # Without a format, MDAnalysis asks every package it can convert from whether a path is an object of its
-            # own, which imports OpenMM with all its platforms: 80 MB, 70 of them the compiler of an OpenCL platform.
-            universe = MDAnalysis.Universe(str(topology), **{"topology_format": guess_format(str(topology))} | options)
+            universe = MDAnalysis.Universe(str(topology), topology_format=kind, **options)
         except _OPEN_ERRORS as error:
             failures.append(_first_line(error))
     if failures:
-        raise InputError(
-            f"{topology}: MDAnalysis cannot read this topology ({failures[0]}); give a file such as PSF, PRMTOP, TPR, "
-            "GRO, PDB or mmCIF",
-            item="topology",
-        )
+        advice = _advice_on_packages(failures[0]) or "give a file such as PSF, PRMTOP, TPR, GRO, PDB or mmCIF"
+        raise InputError(f"{topology}: MDAnalysis cannot read this topology ({failures[0]}); {advice}", item="topology")
     if not (hasattr(universe.atoms, "names") or hasattr(universe.atoms, "types")):
         raise InputError(
             f"{topology} says nothing of its atoms, as trajectories do; give a topology such as PSF, PRMTOP, TPR, GRO, "
@@ -103,58 +116,119 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
             item="topology",
         )
     if trajectory is not None:
-        load_trajectory(universe, trajectory, topology)
+        load_trajectory(universe, trajectory, topology, format=format)
     return universe
 
 
-def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path = "the topology") -> None:
+def load_trajectory(
+    universe: Any, trajectory: str | Path, topology: str | Path = "the topology", *, format: str | None = None
+) -> None:
     """Give a Universe another trajectory.
+
+    Parameters
+    ----------
+    universe : MDAnalysis.Universe
+    trajectory : path
+    topology : path
+        What to call the topology.
+    format : str, optional
+        Of the trajectory, as MDAnalysis names it; by default what its name tells.
 
     Raises
     ------
     InputError
-        A file that is missing or unreadable; atom counts that differ.
+        A file that is missing or unreadable; a format that MDAnalysis does not have; atom counts that differ.
     UnreadableError
         A trajectory that is empty, or begins as it should and cannot be read.
     """
     _look_at(Path(trajectory), "trajectory")
+    named = _format(trajectory, format, "format")
     with quiet(), _failing_quietly() as failures:
         try:
-            universe.load_new(str(trajectory), format=guess_format(str(trajectory)))
-            # Some readers look at the file only now.
-            n_frames = universe.trajectory.n_frames
+            universe.load_new(str(trajectory), format=named)
+            # Some readers look at the file only now, and some take the number of atoms of the topology for theirs.
+            n_frames, n_read = universe.trajectory.n_frames, len(universe.trajectory.ts.positions)
         except _OPEN_ERRORS as error:
             failures.append(_first_line(error))
             text = str(error)
-    if not failures:
-        if not n_frames:
-            raise UnreadableError(f"{trajectory} has no whole frame; was it cut off?", item="trajectory")
-        return
-    n_atoms = _stored_atoms(Path(trajectory))
+    if not failures and not n_frames:
+        raise UnreadableError(f"{trajectory} has no whole frame; was it cut off?", item="trajectory")
+    n_atoms = _stored_atoms(Path(trajectory), named) if failures else n_read
     if n_atoms is not None and n_atoms != len(universe.atoms):
         raise InputError(
             f"{trajectory} has {n_atoms} atoms, {topology} has {len(universe.atoms)}; give the topology of the atoms "
             "that were written (engines often leave out water or virtual sites)",
             item="topology",
         )
+    if not failures:
+        return
+    # A file that begins as it should was cut off, or damaged later.
+    kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
     advice = "is it complete, and does its ending tell its format?"
-    if Path(trajectory).suffix.lower() in (".nc", ".ncdf", ".h5md", ".h5"):
+    if named in ("NC", "NCDF", "H5MD"):
         advice = (
             "files of this format cannot be read at all when they were cut off; write DCD, XTC or TRR if that happens"
         )
-    if Path(trajectory).suffix.lower() == ".traj":
-        advice = (
-            "that is ASE's own format: write with kcons.mdanalysis.write_ase, or ase convert run.traj run.pdb (run.xyz "
-            "has more digits, and no cell)"
-        )
-    if failures[0].startswith("ImportError"):
-        advice = "install that package, or give another format"
-    # A file that begins as it should was cut off, or damaged later.
-    kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
+    if packages := _advice_on_packages(failures[0]):
+        kind, advice = InputError, packages
     raise kind(
         f"{trajectory}: MDAnalysis cannot read this trajectory ({failures[0] if text else 'no message'}); {advice}",
         item="trajectory",
     )
+
+
+def _format(path: str | Path, given: str | None, item: str) -> str:
+    """What MDAnalysis calls the format of a file: the one given, or what its name tells.
+
+    Raises
+    ------
+    InputError
+        MDAnalysis has no such format; `item` is the argument that says another one.
+    """
+    readers = set(MDAnalysis._READERS) | (set(MDAnalysis._PARSERS) if item == "topology_format" else set())
+    name = format_named(path) if given is None else given.upper()
+    if name in readers:
+        return name
+    option = f"--{item.replace('_', '-')}"
+    if given is not None:
+        raise InputError(
+            f"MDAnalysis has no format {given!r}{did_you_mean(given, readers)}; there are {', '.join(sorted(readers))}",
+            item=item,
+        )
+    if name == "TRAJ":
+        raise InputError(
+            f"{path}: that is ASE's own format: write with kcons.mdanalysis.write_ase, or ase convert run.traj run.pdb "
+            "(run.xyz has more digits, and no cell)",
+            item="trajectory",
+        )
+    what = "trajectory" if item == "format" else "topology"
+    raise InputError(
+        f"{path}: its name tells no format of a {what} that MDAnalysis reads; rename it, or give its format ({item}=, "
+        f"kcons check {option} NAME): {', '.join(sorted(readers))}",
+        item=item,
+    )
+
+
+def format_named(path: str | Path) -> str:
+    """What MDAnalysis calls the format that a name tells; '' where there is no ending and the name is none.
+
+    The file is looked into where two formats share an ending: restarts of AMBER, and topologies of AMBER and GROMACS.
+    """
+    name = guess_format(str(path)) or Path(path).name.upper()
+    name = _FORMATS.get(name, name)
+    if name in ("RST7", "TOP"):
+        with anyopen(str(path), "rb") as file:
+            head: bytes = file.read(8)
+        if name == "TOP":
+            return "TOP" if head.startswith(b"%") else "ITP"
+        return "NCDF" if head.startswith((b"CDF", _HDF5)) else "INPCRD"
+    return name
+
+
+def _advice_on_packages(failure: str) -> str:
+    """How to get the package that MDAnalysis says is missing; '' where it does not."""
+    found = re.findall(r"install (\w+)", failure)
+    return f"python -m pip install {found[-1].lower()}, or give another format" if found else ""
 
 
 def _begins_well(path: Path) -> bool:
@@ -181,14 +255,16 @@ def _look_at(path: Path, what: str) -> None:
 
 def _first_line(error: BaseException) -> str:
     lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
+    # MDAnalysis says with which class it failed, and why in the next line.
+    told = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")] or lines
+    return f"{type(error).__name__}: {told[0].strip()}" if told else type(error).__name__
 
 
-def _stored_atoms(path: Path) -> int | None:
+def _stored_atoms(path: Path, named: str) -> int | None:
     """Number of atoms that a trajectory says it has."""
     with quiet(), _failing_quietly() as failures:
         try:
-            reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=guess_format(str(path)))
+            reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=named)
             try:
                 return int(reader.parse_n_atoms(str(path)))
             except NotImplementedError:  # of formats that say it frame by frame

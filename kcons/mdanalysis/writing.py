@@ -299,7 +299,8 @@ class TrajectoryWriter:
         if file is not None:
             file.flush()
         elif self._format in ("NC", "NCDF"):
-            self._writer.trjfile.flush()
+            # A file of netCDF4, or of SciPy where that is not installed.
+            self._writer.trjfile.sync()
         else:
             _flush_c_streams()
 

@@ -73,8 +73,9 @@ class ProjectedOde:
         number = state.step + 1
         if system.friction is not None and system.friction.largest * abs(dt) > STABLE:
             raise InputError(
-                f"{self!r} takes friction for a force, which is unstable above {STABLE:g} times the step: "
-                f"{system.friction.largest:g} at a step of {dt:g}. Use a shorter step, or Rattle, which is exact",
+                f"{self!r} takes friction for a force, which is unstable in steps longer than "
+                f"{system.shown_time(STABLE / system.friction.largest)}; this one is {system.shown_time(dt)}. Use a "
+                "shorter step, or Rattle, which is exact",
                 item="dt",
             )
         time, time_remainder = state.later(dt)

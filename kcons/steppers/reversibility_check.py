@@ -90,7 +90,7 @@ class ReversibilityCheck(Listed):
             atom = int(np.argmax(off.max(axis=1)))
             raise ReversibilityError(
                 f"step {after.step} is not reversible: taken back, atom {atom} misses its start by {residual:.3g} "
-                f"(relative; allowed {self.tolerance:.3g}); use a smaller time step than {dt:g}",
+                f"(relative; allowed {self.tolerance:.3g}); use a smaller time step than {system.shown_time(dt)}",
                 residual=residual,
                 tolerance=self.tolerance,
                 atoms=[atom],

@@ -232,6 +232,9 @@ class System:
         A mass that is not positive, of an atom not held by FixedAtoms; bad friction; functions of other arguments.
     """
 
+    #: What messages call the unit in which they show time steps, and its size; no name for the unit of the system.
+    time_unit: tuple[str, float] = ("", 1.0)
+
     def __init__(
         self,
         motion: Motion,
@@ -280,6 +283,11 @@ class System:
     def schedule(self) -> Schedule:
         """When states of this system are certified."""
         return Schedule(self._certify)
+
+    def shown_time(self, time: float) -> str:
+        """A time in `time_unit`, for messages."""
+        name, size = self.time_unit
+        return f"{time / size:g} {name}".rstrip()
 
     def _certify(self, x: FloatArray, v: FloatArray, time: float, dt: float) -> None:
         try:

@@ -128,7 +128,7 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
     elif error.singular:
         cause = "a held dihedral becomes undefined"
     else:
-        cause = f"time step too large (dt = {dt:g})"
+        cause = f"time step too large (dt = {system.shown_time(dt)})"
     return retold(error, f"step {number}: {cause}. {error}", type(error), number)
 
 

@@ -6,16 +6,13 @@
 - `pressure`: barostats beside them
 - `monte_carlo`: without any error of the time step
 - `multistep`: several time steps, and isokinetic spheres
+- `correlated_series`: errors of means and of slopes along a run
 - `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
 - `slow_share`: the stiffness that slow forces carry
 """
 
-from kcons.thermostats.configurational_temperature import (
-    Estimate,
-    configurational_sample,
-    configurational_temperature,
-    mean,
-)
+from kcons.thermostats.configurational_temperature import configurational_sample, configurational_temperature
+from kcons.thermostats.correlated_series import Estimate, mean
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin

@@ -10,7 +10,7 @@ flights of the constrained atoms.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,47 +20,30 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.steppers.stages.compensated_steps import Point
+from kcons.thermostats.correlated_series import Estimate, checked, few, spread
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
-#: Fewest blocks that errors are taken from.
-BLOCKS = 16
+#: Standard errors by which the mean curvature must differ from 0 for a ratio to have an error.
+_CERTAIN = 3.0
 
 
-class Estimate(NamedTuple):
-    """A mean and its standard error."""
+def temperature(squares: FloatArray, curvatures: FloatArray) -> tuple[Estimate, str | None]:
+    """The ratio of both means, and what is to be said of its error.
 
-    value: float
-    error: float
-
-    def off(self, expected: float, error: float = 0.0) -> float:
-        """Distance from `expected` (known to `error`) in standard errors; infinite where both are known exactly."""
-        away, doubt = self.value - expected, math.hypot(self.error, error)
-        if not doubt:
-            return math.copysign(math.inf, away) if away else 0.0
-        return away / doubt
-
-
-def mean(values: ArrayLike) -> Estimate:
-    """Mean of correlated values; the error by averages over blocks.
-
-    Of 16, 32, 64 and 128 blocks the largest error counts: short blocks depend on each other, few are noisy.
-
-    Raises
-    ------
-    InputError
-        Fewer than 32 values.
+    To first order the ratio r fluctuates by (squares - r curvatures)/<curvatures>. Where <curvatures> is 0 within its
+    own error, the ratio has neither a variance nor a bounded interval: its error is infinite.
     """
-    series = numbers(values, "values")
-    if series.ndim != 1 or len(series) < 2 * BLOCKS:
-        raise InputError(f"{series.shape} values are too few for an error; give {2 * BLOCKS} or more", item="values")
-    errors = []
-    for count in (BLOCKS, 2 * BLOCKS, 4 * BLOCKS, 8 * BLOCKS):
-        size = len(series) // count
-        if size:
-            blocks = series[: size * count].reshape(count, size).mean(axis=1)
-            errors.append(float(blocks.std(ddof=1)) / math.sqrt(count))
-    return Estimate(float(series.mean()), max(errors))
+    n, scale = len(squares), float(curvatures.mean())
+    found = float(squares.mean()) / scale if scale else math.inf
+    if abs(scale) <= _CERTAIN * spread(curvatures).error:
+        said = (
+            f"the mean curvature of {n} samples is 0 within {_CERTAIN:g} standard errors: their temperature may be "
+            "anything, and its error is given as infinite. Sample longer"
+        )
+        return Estimate(found, math.inf), said
+    error, independent = spread((squares - found * curvatures) / scale)
+    return Estimate(found, error), few(n, independent)
 
 
 def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Estimate:
@@ -69,16 +52,25 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
     Raises
     ------
     InputError
-        Fewer than 32 samples, or not as many of one as of the other; curvatures that are all 0.
+        Fewer than 32 samples, or not as many of one as of the other; a NaN or infinity; curvatures that are all 0.
+
+    Warns
+    -----
+    UserWarning
+        Fewer than 10 independent samples; a mean curvature that is 0 within three standard errors, so that the ratio
+        has no error: it is given as infinite.
     """
     above, below = numbers(squares, "squares"), numbers(curvatures, "curvatures")
     if above.shape != below.shape:
         raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
+    for series, name in ((above, "squares"), (below, "curvatures")):
+        checked(series, name)
     if not below.any():
         raise InputError("the forces do not change with the positions: they tell no temperature", item="curvatures")
-    scale = float(below.mean())
-    ratio = float(above.mean()) / scale
-    return Estimate(ratio, mean((above - ratio * below) / scale).error)
+    found, doubt = temperature(above, below)
+    if doubt:
+        warnings.warn(doubt, UserWarning, stacklevel=2)
+    return found
 
 
 def configurational_sample(

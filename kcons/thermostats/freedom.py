@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, System
 
@@ -34,6 +34,10 @@ SHIFT = 1e-2
 TURN = 1e-3
 #: How far each atom is moved besides, so that nothing cancels by symmetry.
 SHAKE = 1e-4
+#: Steps after which it is looked whether bodies feel each other; shorter runs have no averages.
+LOOK_AT = 20_000
+#: How often bodies that do not feel each other are brought to half their distance, to see whether they do so there.
+NEARER = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,6 +335,79 @@ def drift_velocity(velocities: FloatArray, masses: FloatArray, directions: Float
         raise UnsupportedError(_HELD)
     mean = masses @ velocities / masses.sum()
     return np.asarray(directions.T @ (directions @ mean))
+
+
+# -- bodies apart -----------------------------------------------------------------------------------
+
+
+def warn_of_bodies_apart(system: System, state: State, stacklevel: int) -> None:
+    """Say so where a deterministic thermostat is all that couples the parts of a system.
+
+    Thermostats ask once, after `LOOK_AT` steps: one evaluation of the forces, and up to 20 more where bodies seem not
+    to feel each other.
+
+    Parameters
+    ----------
+    system : System
+    state : State
+        With its forces.
+    stacklevel : int
+    """
+    if _apart(system, state):
+        warnings.warn(
+            "no atom or body, which rows tie together, feels another: a thermostat that scales all velocities alike "
+            "exchanges no energy between them, and averages may be far from canonical. Use Langevin",
+            stacklevel=stacklevel,
+        )
+
+
+def _apart(system: System, state: State) -> bool:
+    """Whether there are several bodies and none feels another, here and wherever they come nearer.
+
+    Every second one is moved a little, and the forces on the others are looked at. Where nothing changes, bodies may be
+    out of reach: pairs are brought to half their distance again and again.
+    """
+    if system.force is None:
+        return False
+    x, forces, label = state.positions, state.forces, _bodies(system)
+    assert forces is not None
+    count = int(label.max(initial=-1)) + 1
+    if count < 2:
+        return False
+    body, half = np.arange(count), count // 2
+    sums = np.stack([np.bincount(label + 1, column, count + 1)[1:] for column in x.T], axis=1)
+    centers = np.asarray(sums / np.bincount(label + 1, minlength=count + 1)[1:, None], dtype=np.float64)
+    least = BALANCED * float(np.abs(forces).max())
+
+    def felt(move: FloatArray, moved: NDArray[np.bool_]) -> bool:
+        goes = (label >= 0) & moved[label]
+        try:
+            f = system.forces(x + np.where(goes[:, None], move[label], 0.0), state.velocities, state.time, state.step)
+        except NonFiniteError:  # they do where they meet
+            return True
+        return not np.abs(f - forces)[~goes].max(initial=0.0) <= least
+
+    small = SHAKE * (extent(x) or 1.0) * np.random.default_rng(0).standard_normal((count, 3))
+    if felt(small, body % 2 == 1):
+        return False
+    for moved, towards in ((body % 2 == 1, body - 1), (body >= count - half, body - (count - half))):
+        way: FloatArray = centers[towards] - centers
+        if any(felt(np.asarray((1.0 - 0.5**k) * way), moved) for k in range(1, NEARER + 1)):
+            return False
+    return True
+
+
+def _bodies(system: System) -> IntArray:
+    """What rows tie together, a number for each atom, shape (n_atoms,); -1 for those that are fixed."""
+    from scipy.sparse import diags
+    from scipy.sparse.csgraph import connected_components
+
+    moving = system.inverse_masses[:, 0] > 0
+    joins = system.motion.constraint_set.incidence.astype(np.float64) @ diags(moving.astype(np.float64))
+    found = connected_components(joins.T @ joins, directed=False)[1]
+    label = np.full(system.n_atoms, -1, dtype=np.int64)
+    label[moving] = np.unique(found[moving], return_inverse=True)[1]
+    return label
 
 
 def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:

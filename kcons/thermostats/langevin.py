@@ -53,7 +53,12 @@ class SeededBath(Listed):
     thermal_energy, friction : float
     seed, substeps : int
         See `Langevin`.
+    exchanged : (int, float) or None
+        Number of the last step that was made, and its kinetic energy after noise in its middle, for logs: there
+        velocities are as warm as the bath, at the ends of steps those of stiff motions are colder. None without noise.
     """
+
+    exchanged: tuple[int, float] | None = None
 
     order = 2
     reversible = False
@@ -91,7 +96,7 @@ class SeededBath(Listed):
         if still is not None:
             return still
         if dt < 0:
-            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+            raise InputError(f"the time step is {system.shown_time(dt)}; noise cannot be taken back", item="dt")
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
             return self.begun(system, state, dt).through(self.operations(system))
 
@@ -228,7 +233,10 @@ class LangevinStep(ArrayStep):
             kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
         noise += keep * v if kept is None else kept + keep * (v - kept)
         self.v = self.along(noise)
-        self.heat += system.kinetic_energy(self.v) - before
+        after = system.kinetic_energy(self.v)
+        self.heat += after - before
+        if thermostat.friction > 0:
+            thermostat.exchanged = self.number, after
 
     def noise(self, shape: tuple[int, ...]) -> FloatArray:
         """Normal numbers for this exchange."""

@@ -21,6 +21,7 @@ mean zero (Hutchinson): the cost does not depend on the number of clusters.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -36,7 +37,8 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import Point, check_finite
-from kcons.thermostats.configurational_temperature import BLOCKS, Estimate, configurational_temperature
+from kcons.thermostats.configurational_temperature import temperature
+from kcons.thermostats.correlated_series import FEWEST, Estimate
 from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -288,10 +290,15 @@ class TemperatureSplit:
         ------
         InputError
             Fewer than 32 samples; an unknown group.
+
+        Warns
+        -----
+        UserWarning
+            Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
         """
-        if len(self._series) < 2 * BLOCKS or self._clusters is None or self._rest is None:
+        if len(self._series) < FEWEST or self._clusters is None or self._rest is None:
             raise InputError(
-                f"{len(self._series)} samples are too few for an error; add {2 * BLOCKS} or more", item="samples"
+                f"{len(self._series)} samples are too few for an error; add {FEWEST} or more", item="samples"
             )
         names = [None, *self._groups]
         if group not in names:
@@ -301,18 +308,18 @@ class TemperatureSplit:
         clusters = self._clusters
         series = np.array(self._series)[:, :, :, which]
         exists = (clusters.shifts & inside, self._axes * inside, self._rest & inside)
-        shift, turn, internal = (
-            configurational_temperature(series[:, 0, kind], series[:, 1, kind])
-            if there.any() and series[:, 0, kind].any()
-            else None
-            for kind, there in enumerate(exists)
-        )
+        found: list[Estimate | None] = [None, None, None]
+        for kind, (name, there) in enumerate(zip(("shifts", "turns", "internal motions"), exists, strict=True)):
+            if there.any() and series[:, 0, kind].any():
+                found[kind], doubt = temperature(series[:, 0, kind], series[:, 1, kind])
+                if doubt:
+                    warnings.warn(f"temperature of {name}: {doubt}", UserWarning, stacklevel=2)
         counts = 3 * int(exists[0].sum()), int(exists[1].sum())
         squares = [max(float(series[:, 1, kind].mean()), 0.0) / max(counts[kind], 1) for kind in (0, 1)]
         return SplitTemperatures(
-            shift,
-            turn,
-            internal,
+            shift=found[0],
+            turn=found[1],
+            internal=found[2],
             shifts=counts[0],
             turns=counts[1],
             shift_frequency=math.sqrt(squares[0]),

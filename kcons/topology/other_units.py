@@ -12,8 +12,8 @@ from kcons.errors import UnsupportedError
 
 #: Families whose targets are lengths or positions, those whose targets are angles, and what else has a length.
 _LENGTHS = {
-    "Distance", "CenterDistance", "CenterOfMass", "RadiusOfGyration", "LinearCombination", "LinearRelation",
-    "FixedAtoms", "Plane", "Line", "Sphere", "Cylinder", "Torus", "Ellipsoid",
+    "Distance", "DistanceDifference", "CenterDistance", "CenterOfMass", "RadiusOfGyration", "LinearCombination",
+    "LinearRelation", "FixedAtoms", "Plane", "Line", "Sphere", "Cylinder", "Torus", "Ellipsoid",
 }  # fmt: skip
 _ANGLES = {"Angle", "Dihedral"}
 _DATA = {"center": 1, "point": 1, "major_radius": 1, "inverse_axes": -1}

@@ -31,6 +31,7 @@ from kcons.ase import (
     ConstrainedDynamics,
     ConstrainedLangevin,
     ConstrainedMonteCarlo,
+    ConstrainedNoseHoover,
     Constraints,
     IsokineticDynamics,
     constrain,
@@ -38,8 +39,8 @@ from kcons.ase import (
     rigid_water,
 )
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, LinearVelocity
-from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import Geodesic, ProjectedVerlet, Rattle, Suzuki4
+from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.steppers import Baumgarte, Geodesic, ProjectedVerlet, Rattle, Suzuki4
 
 # -- right ------------------------------------------------------------------------------------------
 
@@ -512,6 +513,38 @@ def test_bad_time_step(bad):
     dyn = ConstrainedDynamics(atoms, FS)
     with pytest.raises(InputError, match="time step"):
         dyn.set_timestep(bad)
+
+
+@pytest.mark.parametrize("long", [2.0, -2000 * FS, 20.1 * FS], ids=["without units", "back", "a bit"])
+def test_a_step_that_looks_like_a_slip_of_units_is_asked_about(long):
+    """2 is 20.4 fs; 20 fs are nobody's slip, nor are small parts of a long step (see `MultipleTimeSteps`)."""
+    atoms, _ = water()
+    with pytest.warns(UserWarning, match=rf"steps of {abs(long) / FS:.4g} fs. Is that meant.*2 \* ase.units.fs"):
+        dyn = ConstrainedDynamics(atoms, long)
+    with pytest.warns(UserWarning, match="Is that meant"):
+        dyn.set_timestep(long)
+    dyn.set_timestep(20 * FS)
+    dyn.set_timestep(-0.5 * FS)
+
+
+def test_times_in_errors_are_in_fs():
+    atoms, _ = water()
+    for make, words in (
+        (lambda: ConstrainedLangevin(atoms, -2 * FS, 300, 0.01 / FS, rng=1), "the time step is -2 fs; noise"),
+        (lambda: ConstrainedMonteCarlo(atoms, -0.5 * FS, 300, 5, rng=1), "the time step is -0.5 fs; noise"),
+        (
+            lambda: ConstrainedDynamics(atoms, 20 * FS, Baumgarte(0.1 / FS), friction=1 / FS),
+            "longer than 2 fs; this one is 20 fs",
+        ),
+        (
+            lambda: ConstrainedNoseHoover(atoms, 20 * FS, 300, 1e-4 * FS, momentum="free"),
+            "a chain of period 0.000628319 fs cannot follow a time step of 20 fs",
+        ),
+    ):
+        dynamics = make()
+        draw_velocities(atoms, 300, rng=1)
+        with pytest.raises(KconsError, match=words):
+            dynamics.run(1)
 
 
 @pytest.mark.parametrize("bad", [Rattle, "rattle", 5])

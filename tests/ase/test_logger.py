@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.build import molecule
+from ase.calculators.calculator import Calculator
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms, FixBondLengths
@@ -20,6 +22,8 @@ from kcons.ase import (
     ConstrainedLangevin,
     ConstraintLogger,
     Constraints,
+    IsokineticDynamics,
+    MultipleTimeSteps,
     PressureReporter,
     constrain,
     draw_velocities,
@@ -62,9 +66,85 @@ def test_a_thermostat_that_leaves_total_momentum_alone():
     dynamics = ConstrainedLangevin(
         atoms, units.fs, 300, 0.01 / units.fs, rng=2, fixcm=True, constraints=ROWS, logfile=log, loginterval=2
     )
+    start = atoms.get_kinetic_energy()
     dynamics.run(4)
     assert columns(log)[:, 0] == pytest.approx([0, 0.002, 0.004])
-    assert columns(log)[-1, 4] == pytest.approx(2 * atoms.get_kinetic_energy() / (21 * units.kB), abs=0.06)
+    assert columns(log)[0, 4] == pytest.approx(2 * start / (21 * units.kB), abs=0.06)
+    assert columns(log)[-1, 4] == pytest.approx(2 * dynamics.get_kinetic_energy() / (21 * units.kB), abs=0.06)
+    assert dynamics.get_temperature() == pytest.approx(2 * dynamics.get_kinetic_energy() / (21 * units.kB))
+    assert dynamics.get_kinetic_energy() != atoms.get_kinetic_energy()
+    draw_velocities(atoms, 300, rng=3, zero_momentum=True)  # these are nobody's middle of a step
+    assert dynamics.get_kinetic_energy() == pytest.approx(atoms.get_kinetic_energy(), rel=1e-14)
+
+
+class Wells(Calculator):
+    """Each atom in a harmonic well of its own."""
+
+    implemented_properties: ClassVar = ["energy", "forces"]
+
+    def __init__(self, stiffness: float, places: np.ndarray) -> None:
+        super().__init__()
+        self.stiffness, self.places = stiffness, places
+
+    def calculate(self, atoms=None, properties=None, system_changes=()):
+        d = atoms.positions - self.places
+        self.results = {"energy": 0.5 * self.stiffness * np.sum(d * d), "forces": -self.stiffness * d}
+
+
+def oscillators(step: float) -> Atoms:
+    """Fifty argon atoms whose frequency times the step is 1: at its ends BAOAB has 1 - 1/4 of the temperature."""
+    atoms = Atoms("Ar50", positions=4.0 * np.arange(150.0).reshape(50, 3))
+    mass = float(atoms.get_masses()[0])
+    atoms.calc = Wells(mass / step**2, atoms.positions.copy())
+    return atoms
+
+
+def test_with_noise_the_log_is_of_the_middle_of_the_step():
+    """As warm as the bath, to 5 standard errors, where the momenta at the ends of steps are a quarter colder."""
+    step, log, ends = 10 * units.fs, io.StringIO(), []
+    atoms = oscillators(step)
+    draw_velocities(atoms, 300, rng=1)
+    dynamics = ConstrainedLangevin(atoms, step, 300, 0.5 / step, rng=2)
+    dynamics.run(50)
+    dynamics.attach(ConstraintLogger(dynamics, atoms, log))
+    dynamics.attach(lambda: ends.append(atoms.get_temperature()))
+    dynamics.run(3000)
+    found = columns(log)
+    total, potential, kinetic, temperature = found[:, 1:].T
+    error = 300 * np.sqrt(2 / 150 / (len(found) / 3))  # friction leaves a third of the samples independent
+    assert error < 1.5
+    assert temperature.mean() == pytest.approx(300, abs=5 * error)
+    assert np.mean(ends) == pytest.approx(225, abs=5 * error)
+    assert temperature == pytest.approx(2 * kinetic / (150 * units.kB), abs=0.5)
+    assert total == pytest.approx(potential + kinetic, abs=2e-3)
+
+
+def test_several_time_steps_and_noise():
+    step = 10 * units.fs
+    atoms = oscillators(step)
+    draw_velocities(atoms, 300, rng=1)
+    places, stiffness = atoms.calc.places, atoms.calc.stiffness
+    parts = {"fast": Wells(0.99 * stiffness, places), "slow": Wells(0.01 * stiffness, places)}
+    dynamics = MultipleTimeSteps(atoms, 2 * step, **parts, temperature_K=300, friction=0.5 / step, fast_steps=2, seed=3)
+    dynamics.run(50)
+    found = []
+    dynamics.attach(lambda: found.append((dynamics.get_temperature(), atoms.get_temperature())))
+    dynamics.run(1000)
+    middle, end = np.mean(found, axis=0)
+    assert middle == pytest.approx(300, abs=8)
+    assert end == pytest.approx(225, abs=8)
+
+
+@pytest.mark.parametrize("friction", [0.0, None])
+def test_without_noise_the_log_is_of_the_end(friction):
+    """Constant energy, also as a bath without friction, and isokinetic."""
+    atoms = moving()
+    if friction is None:
+        dynamics = IsokineticDynamics(atoms, units.fs, 300, momentum="free")
+    else:
+        dynamics = ConstrainedLangevin(atoms, units.fs, 300, friction, rng=1)
+    dynamics.run(2)
+    assert dynamics.get_kinetic_energy() == atoms.get_kinetic_energy()
 
 
 @pytest.mark.parametrize("ours", [True, False])

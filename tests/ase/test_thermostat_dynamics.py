@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -134,6 +135,7 @@ def test_kinetic_energy_is_constant():
 
 
 @pytest.mark.validation
+@pytest.mark.filterwarnings("ignore:no atom or body")
 def test_kinetic_energy_is_constant_over_a_million_steps():
     atoms = waters()
     moving = IsokineticDynamics(atoms, FS, temperature_K=300)
@@ -438,6 +440,7 @@ def test_forces_that_are_not_numbers(kind, bad):
 
 
 @KINDS
+@pytest.mark.filterwarnings("ignore:the atoms move in steps")
 def test_a_time_step_that_is_too_large_leaves_the_atoms_alone(kind):
     atoms = waters()
     moving = made(kind, atoms)
@@ -526,3 +529,17 @@ def test_springs_of_ase_count_in_the_conserved_energy():
     dyn.run(20)
     assert dyn.get_conserved_energy() == pytest.approx(before, abs=0.02)
     assert before > 10
+
+
+@pytest.mark.parametrize(
+    "made", [IsokineticDynamics, partial(ConstrainedNoseHoover, tdamp=50 * FS)], ids=["K", "chain"]
+)
+def test_bodies_that_feel_no_other_are_said_in_long_runs(made, monkeypatch):
+    """Waters in a field that is the same for each."""
+    for module in ("isokinetic.isokinetic", "nose_hoover"):
+        monkeypatch.setattr(f"kcons.thermostats.{module}.LOOK_AT", 3)
+    moving = made(waters(), FS, temperature_K=300, momentum="free")
+    moving.run(3)
+    with pytest.warns(UserWarning, match="feels another"):
+        moving.run(1)
+    moving.run(2)

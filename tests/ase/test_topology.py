@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 
 import ase.io
 import numpy as np
@@ -16,6 +17,7 @@ from kcons.ase import (
     constrain,
     constraints_of,
     draw_velocities,
+    repartition_hydrogen_mass,
 )
 from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, mend_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
@@ -224,3 +226,73 @@ def test_bonds_that_are_no_pairs_are_refused(bonds):
     for asked in (bonds_of, snapshot_of, constraints_of):
         with pytest.raises(InputError, match=r"atoms\.info\['bonds'\] must be pairs"):
             asked(atoms)
+
+
+# -- heavy hydrogens ---------------------------------------------------------------------------------------
+
+
+def test_hydrogens_take_mass_from_the_atoms_that_they_are_bonded_to():
+    """As the loop over bonds does it, and OpenMM; also with bonds that are given, and a second time."""
+    atoms = molecule("CH3CH2OH")
+    before = atoms.get_masses()
+    expected = before.copy()
+    for hydrogen in np.flatnonzero(atoms.numbers == 1):
+        heavy = min(range(3), key=lambda k: atoms.get_distance(hydrogen, k))
+        expected[heavy] -= 3 - before[hydrogen]
+        expected[hydrogen] = 3
+    assert repartition_hydrogen_mass(atoms) == 6
+    assert atoms.get_masses() == pytest.approx(expected, abs=1e-12)
+    assert atoms.get_masses().sum() == pytest.approx(before.sum(), abs=1e-12)
+    assert repartition_hydrogen_mass(atoms, 3) == 6
+    assert atoms.get_masses() == pytest.approx(expected, abs=1e-12)
+    assert "bonds" not in atoms.info
+    given = molecule("CH3CH2OH")
+    given.info["bonds"] = [[0, 1], [8, 0]]
+    assert repartition_hydrogen_mass(given, 2) == 1
+    assert (given.get_masses() - before)[[0, 8]] == pytest.approx([before[8] - 2, 2 - before[8]])
+    assert np.count_nonzero(given.get_masses() != before) == 2
+
+
+def test_water_stays_unless_it_is_asked_for():
+    atoms = molecule("H2O") + molecule("CH3OH")
+    atoms.positions[3:] += 8.0
+    light = atoms.get_masses()
+    assert repartition_hydrogen_mass(atoms) == 4
+    assert np.array_equal(atoms.get_masses()[:3], light[:3])
+    assert repartition_hydrogen_mass(atoms, water=True) == 6
+    assert atoms.get_masses()[:3] == pytest.approx([light[0] - 2 * (3 - light[1]), 3, 3])
+    hydrogen = molecule("H2")
+    assert repartition_hydrogen_mass(hydrogen) == 0
+    assert repartition_hydrogen_mass(Atoms("Ar")) == 0
+
+
+def test_masses_that_cannot_be_are_refused():
+    atoms = molecule("CH4")
+    before = atoms.get_masses()
+    with pytest.raises(InputError, match=r"leave 0.043 to atom 0 \(C\).*smaller mass"):
+        repartition_hydrogen_mass(atoms, 4)
+    for bad in (0, -1, np.nan, "3"):
+        with pytest.raises(InputError, match="mass is"):
+            repartition_hydrogen_mass(atoms, bad)
+    with pytest.raises(InputError, match="atoms must be"):
+        repartition_hydrogen_mass([atoms])
+    assert np.array_equal(atoms.get_masses(), before)
+
+
+def test_the_same_masses_as_those_of_openmm():
+    """Of villin in water, atom by atom."""
+    pytest.importorskip("openmm")
+    from openmm import app, unit
+
+    pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))
+    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    light, heavy = (
+        np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+        for system in (field.createSystem(pdb.topology, hydrogenMass=m) for m in (None, 3 * unit.dalton))
+    )
+    numbers = [0 if a.element is None else a.element.atomic_number for a in pdb.topology.atoms()]
+    atoms = Atoms(numbers, pdb.getPositions(asNumpy=True)._value * 10, masses=light)
+    atoms.info["bonds"] = [[bond.atom1.index, bond.atom2.index] for bond in pdb.topology.bonds()]
+    count = repartition_hydrogen_mass(atoms, 3)
+    assert count == np.count_nonzero(heavy == 3) > 200
+    assert atoms.get_masses() == pytest.approx(heavy, abs=1e-12)

@@ -26,6 +26,7 @@ from ase.constraints import (
     FixLinearTriatomic,
     FixSubsetCom,
     Hookean,
+    MirrorForce,
     dict2constraint,
 )
 from ase.db import connect
@@ -41,8 +42,10 @@ from ase_systems import (
 from kcons.ase import ConstrainedDynamics, Constraints, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (
     Angle,
+    CenterOfMass,
     Dihedral,
     Distance,
+    DistanceDifference,
     FixedAtoms,
     ImplicitSurface,
     Line,
@@ -125,9 +128,7 @@ def test_own_object_is_translated_to_its_rows():
 
 
 @pytest.mark.parametrize(
-    "other",
-    [Hookean(a1=0, a2=1, rt=1.0, k=1.0), FixInternals(bondcombos=[[None, [[0, 1, 1.0], [0, 2, -1.0]]]])],
-    ids=lambda v: type(v).__name__,
+    "other", [Hookean(a1=0, a2=1, rt=1.0, k=1.0), MirrorForce(0, 1)], ids=lambda v: type(v).__name__
 )
 def test_unknown_ase_constraints_are_named(other):
     atoms = molecule("H2O")
@@ -242,10 +243,17 @@ def test_constraint_object_round_trip():
 #: What is held, and the object of ASE that holds the same; None where no single one does.
 NATIVE = {
     "FixBondLengths": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
-    "FixInternals": [Distance([[0, 1]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])],
+    "FixInternals": [
+        Distance([[0, 1]]),
+        Angle([[0, 1, 2]]),
+        Dihedral([[3, 2, 1, 0]]),
+        DistanceDifference([[0, 4], [1, 5]], weights=[1.0, -2.0]),
+    ],
     "FixAtoms": [FixedAtoms([8, 0])],
     "FixedPlane": [Plane([4, 0, 5], [0, 1, 2])],
     "FixedLine": [Line([4, 0], None, [0, 1, 2])],
+    "FixCartesian": [LinearCombination([[3], [5]], [[0, 0, 1.0]]), LinearCombination([[3], [5]], [[1.0, 0, 0]])],
+    "FixSubsetCom": [CenterOfMass([0, 1, 2])],
     "two directions": [Plane([4], [0, 1, 2]), Plane([5], [0, 1, 1])],
     "two kinds": [FixedAtoms([8]), Distance([[0, 1]])],
 }
@@ -382,7 +390,7 @@ def test_repeat(used):
     large = atoms.repeat((2, 1, 3))
     assert large.get_number_of_degrees_of_freedom() == 6 * (9 - 6)
     assert off(large, large.constraints[0]) <= 1e-14
-    assert len(large.constraints[0].get_indices()) == 18
+    assert len(large.constraints[0].touched) == 18
 
 
 @pytest.mark.parametrize("used", [True, False])

@@ -110,6 +110,32 @@ def test_the_help_says_what_the_exit_status_means(capsys):
     assert "Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete" in text
 
 
+def test_formats_by_option(folder, tmp_path, capsys):
+    for name in ("good.trr", "t.gro"):
+        (tmp_path / name.partition(".")[0]).write_bytes((folder / name).read_bytes())
+    arguments = ["check", str(tmp_path / "good"), "--topology", str(tmp_path / "t"), "--out", str(tmp_path / "out")]
+    formats = ["--format", "trr", "--topology-format", "GRO"]
+    assert main([*arguments, *formats, *OPTIONS]) == 0
+    capsys.readouterr()
+    for given, words in (([], "--topology-format NAME"), (formats[2:], "--format NAME"), (["--format", "x"], "--topo")):
+        assert main([*arguments, *given, *OPTIONS]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and words in said
+    assert main([*arguments, *formats, *OPTIONS, "--forces", "lj"]) == 2
+    assert "--forces does not go with --format" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["check", "m.xyz", "--topology", "big.gro"], ["freeenergy", "a.toml", "--list"]])
+def test_what_takes_more_memory_than_there_is_is_wrong_use(tmp_path, words):
+    """Status 1 would be a violation."""
+    (tmp_path / "m.xyz").write_text("2\n\nCu 0 0 0\nCu 2.5 0 0\n")
+    (tmp_path / "big.gro").write_text("t\n99999999999\n    1SOL     OW    1   0.2   0.2   0.2\n 1 1 1\n")
+    plan = '[structure]\nfile="m.xyz"\n[forces]\ncalculator="emt"\n[[coordinate]]\ndistance=[0,1]\nfrom=1\nto=3\n'
+    (tmp_path / "a.toml").write_text(plan + "windows=2000000000\n")
+    done = subprocess.run([sys.executable, "-m", "kcons", *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("kcons: ") and done.stderr.count("\n") == 1
+
+
 # -- folders ----------------------------------------------------------------------------------------
 
 

@@ -67,10 +67,12 @@ def test_calculator_that_raises():
 
 
 def test_time_step_too_large():
+    """The step is told in fs, not in ASE's unit."""
     atoms, _ = water(Field(0.0), temperature=3000)
-    dyn = ConstrainedDynamics(atoms, 60 * FS)
+    with pytest.warns(UserWarning, match="steps of 60 fs. Is that meant"):
+        dyn = ConstrainedDynamics(atoms, 60 * FS)
     before = state(atoms)
-    with pytest.raises(ConvergenceError, match="step 1: time step too large") as caught:
+    with pytest.raises(ConvergenceError, match=r"step 1: time step too large \(dt = 60 fs\)") as caught:
         dyn.run(5)
     assert caught.value.step == 1
     assert equal(state(atoms), before)

@@ -38,6 +38,7 @@ def ups(r):
 #: Arguments of each family, in nm, ps, radian.
 MADE = {
     "Distance": {"pairs": [[0, 1], [2, 3]], "target": [0.3, 0.4]},
+    "DistanceDifference": {"pairs": [[0, 1], [1, 2]], "target": -0.1, "weights": [1.0, -0.5]},
     "Angle": {"triples": [[0, 1, 2]], "target": 1.9},
     "Dihedral": {"quads": [[0, 1, 2, 3]], "target": 0.5},
     "FixedAtoms": {"atoms": [0, 1], "target": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]},

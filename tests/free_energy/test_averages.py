@@ -34,9 +34,8 @@ def test_intervals_cover_as_often_as_they_say(memory):
     # Standard deviation of the counts: 0.027 and 0.013.
     assert within(found, 5.0, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.08)
     assert within(found, 5.0, norm.ppf(0.975)) == pytest.approx(0.95, abs=0.04)
-    # pymbar never says less than 1 and stops where the correlation first crosses 0: some 2/sqrt(1000) too much.
-    assert np.mean([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
-    assert np.mean([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
+    assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
+    assert np.median([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
 
 
 def test_a_small_slow_part_counts():
@@ -49,6 +48,7 @@ def test_a_small_slow_part_counts():
     assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.3)
 
 
+@pytest.mark.filterwarnings("ignore:.*independent ones")  # in one of 300, a single block has most of the spread
 def test_weights_that_belong_to_the_values():
     """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
     rng, b = np.random.default_rng(2), 1.0
@@ -83,7 +83,9 @@ def test_weights_mean_what_repetition_means():
 def test_the_beginning_can_be_left_out():
     rng = np.random.default_rng(5)
     x = ar1(rng, 4000, 0.5)[:, 0] + 20.0 * np.exp(-np.arange(4000) / 100)
-    biased, right = weighted_mean(x), weighted_mean(x, equilibration=True)
+    with pytest.warns(UserWarning, match="worth 5.* independent ones"):
+        biased = weighted_mean(x)
+    right = weighted_mean(x, equilibration=True)
     assert 200 <= right.start <= 1500 and right.n == 4000 - right.start
     assert abs(right.value[0]) < 4 * right.error[0] < 0.5 * abs(biased.value[0])
 
@@ -137,7 +139,8 @@ def test_a_series_that_never_changes_is_warned_of():
 def test_the_package_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymbar", None)
     with pytest.raises(UnsupportedError, match=r"kcons\[free-energy\]"):
-        averages.weighted_mean(np.arange(20.0))
+        averages.weighted_mean(np.arange(20.0), equilibration=True)
+    assert averages.weighted_mean(np.arange(64.0) % 3).error > 0  # errors take nothing but NumPy
 
 
 def test_windows_that_agree_do_so_with_the_right_probability():

@@ -9,6 +9,7 @@ from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis import ConstraintCheck, check_trajectory, load_trajectory, open_universe
 
 N = 30
+WATER = (("OW", 15.999), ("HW1", 1.008), ("HW2", 1.008))
 
 
 @pytest.fixture(scope="module")
@@ -60,21 +61,117 @@ def test_files_of_ase_are_told_from_broken_ones(tmp_path):
         load_trajectory(files.universe(N), path)
 
 
-def test_a_format_whose_package_is_missing(tmp_path, monkeypatch):
-    """As mmCIF without gemmi."""
+@pytest.mark.parametrize(
+    "ending,error,package",
+    [
+        ("cif", ImportError("MMCIF: please install gemmi"), "gemmi"),
+        ("h5md", RuntimeError("Please install h5py"), "h5py"),
+        ("gsd", ImportError("To read GSD files, please install gsd"), "gsd"),
+        ("h5md", ImportError("try installing it with 'pip install chemfiles'"), "chemfiles"),
+    ],
+)
+def test_a_format_whose_package_is_missing(tmp_path, monkeypatch, ending, error, package):
+    """The file is not to blame, however it begins; the message says what to install."""
 
     def missing(*args, **options):
-        raise ImportError("MMCIF: please install gemmi")
+        raise error
 
-    path = tmp_path / "a.pdb"
-    path.write_text("END\n")
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(b"\x89HDF\r\n" + bytes(2000))
     made = files.universe(N)
     monkeypatch.setattr(made, "load_new", missing)
-    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); install that package"):
+    with pytest.raises(InputError, match=rf"a\.{ending}.*; python -m pip install {package}, or give") as found:
         load_trajectory(made, path)
+    assert not isinstance(found.value, UnreadableError) and "cut off" not in str(found.value)
     monkeypatch.setattr("MDAnalysis.Universe", missing)
-    with pytest.raises(InputError, match=r"a\.pdb.*please install gemmi\); give a file such as"):
+    with pytest.raises(InputError, match=rf"a\.{ending}.*; python -m pip install {package}, or give"):
         open_universe(path)
+
+
+def test_the_extra_brings_h5py():
+    import tomllib
+    from pathlib import Path
+
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert any(name.startswith("h5py") for name in project["optional-dependencies"]["mdanalysis"])
+
+
+# -- formats ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["run.lammpstrj", "run.dump", "run.lammpstrj.gz", "run.LAMMPSTRJ"])
+def test_endings_of_lammps(tmp_path, x, name):
+    import gzip
+
+    text = files.write_text(tmp_path / "w.lammpsdump", files.whole(x)).read_bytes()
+    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith("gz") else text)
+    result = checked(tmp_path / name)
+    assert result.status == "kept" and len(result.frames) == 8 and "LAMMPSDUMP" in result.precision
+
+
+@pytest.mark.parametrize("name", ["w.rst7", "w.rst", "inpcrd", "w.crd7"])
+def test_restarts_of_amber(tmp_path, x, name):
+    """In text; those in NetCDF MDAnalysis does not read, which is said."""
+    words = [f"{value:12.7f}" for value in files.whole(x)[0].ravel()]
+    lines = ["water", str(3 * N), *("".join(words[k : k + 6]) for k in range(0, len(words), 6)), ""]
+    path = tmp_path / name
+    path.write_text("\n".join(lines))
+    if name == "w.crd7":
+        with pytest.raises(InputError, match=r"w\.crd7: its name tells no format of a trajectory .*--format NAME") as e:
+            checked(path)
+        assert e.value.item == "format" and "INPCRD" in str(e.value)
+        load_trajectory(files.universe(N), path, format="inpcrd")
+        with pytest.raises(InputError, match=r"no format 'INPCRT' \(did you mean 'INPCRD'\?\); there are .*XTC"):
+            load_trajectory(files.universe(N), path, format="INPCRT")
+        return
+    assert checked(path).status == "kept"
+    path.write_bytes(b"CDF\x02" + bytes(500))
+    if name != "inpcrd":
+        with pytest.raises(InputError, match="cannot read this trajectory"):
+            checked(path)
+
+
+def test_topologies_of_gromacs_and_amber_have_one_ending(tmp_path):
+    """A topology of GROMACS that stands by itself is read; one that includes others names what is missing."""
+    atoms = "".join(f"{k + 1} {name} 1 SOL {name} 1 0.0 {mass}\n" for k, (name, mass) in enumerate(WATER))
+    molecule = f"[ moleculetype ]\nSOL 2\n[ atoms ]\n{atoms}[ bonds ]\n1 2 1\n1 3 1\n"
+    path = tmp_path / "w.top"
+    path.write_text(f"; water\n{molecule}[ system ]\nwater\n[ molecules ]\nSOL {N}\n")
+    made = open_universe(path)
+    assert len(made.atoms) == 3 * N and len(made.bonds) == 2 * N
+    path.write_text('#include "amber03.ff/forcefield.itp"\n')
+    with pytest.raises(InputError, match=r"w\.top.*Could not find amber03\.ff/forcefield\.itp"):
+        open_universe(path)
+    path.write_text("%VERSION  VERSION_STAMP = V0001.000\n%FLAG TITLE\n")
+    with pytest.raises(InputError, match=r"w\.top: MDAnalysis cannot read this topology") as error:
+        open_universe(path)
+    assert "ITP" not in str(error.value)
+
+
+def test_files_of_dl_poly_have_no_ending(tmp_path, x):
+    y = files.whole(x)
+    lines = ["water", f"0 0 {3 * N}"]
+    for k in range(3):
+        lines.append(f"timestep {k} {3 * N} 0 0 0.001")
+        lines += [line for a, r in enumerate(y[k]) for line in (f"O {a + 1} 16.0 0.0", f"{r[0]:f} {r[1]:f} {r[2]:f}")]
+    for name in ("HISTORY", "first.run"):
+        (tmp_path / name).write_text("\n".join(lines) + "\n")
+    made = files.universe(N)
+    load_trajectory(made, tmp_path / "HISTORY")
+    assert made.trajectory.n_frames == 3
+    load_trajectory(made, tmp_path / "first.run", format="HISTORY")
+    assert made.trajectory.n_frames == 3
+
+
+def test_a_format_of_the_topology_can_be_named(tmp_path, x):
+    path = files.topology(tmp_path / "w.gro", N, x[0]).rename(tmp_path / "confout")
+    with pytest.raises(InputError, match=r"confout: its name tells no format of a topology .*--topology-format") as e:
+        open_universe(path)
+    assert e.value.item == "topology_format"
+    trajectory = files.write(tmp_path / "w.trr", x)
+    assert check_trajectory(trajectory, path, "none", topology_format="GRO", rank=False).status == "kept"
+    found = check_trajectory(path, path, "none", format="GRO", topology_format="gro", targets="topology", rank=False)
+    assert found.status == "kept"
 
 
 def test_netcdf_that_was_cut_off_says_so(tmp_path, x):
@@ -105,3 +202,28 @@ def test_a_trajectory_is_no_topology(tmp_path, x):
     with pytest.raises(InputError, match=r"w\.dcd says nothing of its atoms, .* takes the trajectory first"):
         check_trajectory(top, path)
     assert check_trajectory(path, top).n_atoms == 3 * N
+
+
+# -- headers that are not so ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [99_999_999_999, -5])
+def test_numbers_of_atoms_that_cannot_be(tmp_path, x, n):
+    """As topology and as trajectory: one sentence, and not the error of whoever wanted the memory."""
+    top = files.topology(tmp_path / "t.gro", N, x[0])
+    lines = top.read_text().splitlines()
+    lines[1] = str(n)
+    path = tmp_path / "w.gro"
+    path.write_text("\n".join(lines))
+    for run in (lambda: open_universe(path), lambda: open_universe(top, path)):
+        with pytest.raises(InputError, match=r"w\.gro"):
+            run()
+
+
+def test_a_reader_that_takes_the_number_of_atoms_from_the_topology(tmp_path, x):
+    """Data of LAMMPS: its header says 90 atoms, there is one."""
+    top, path = files.topology(tmp_path / "t.gro", N, x[0]), tmp_path / "w.data"
+    box = "".join(f"0 12 {a}lo {a}hi\n" for a in "xyz")
+    path.write_text(f"x\n\n90 atoms\n1 atom types\n\n{box}\nMasses\n\n1 16\n\nAtoms # full\n\n1 1 1 0 1 1 1\n")
+    with pytest.raises(InputError, match=r"w\.data has 1 atoms, .*t\.gro has 90"):
+        open_universe(top, path)

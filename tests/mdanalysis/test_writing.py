@@ -73,10 +73,13 @@ def read(path):
     return made
 
 
-@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "nc", "h5md"])
-def test_core_runs(tmp_path, ending):
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "nc", "scipy.nc", "h5md"])
+def test_core_runs(tmp_path, ending, monkeypatch):
     if ending == "h5md":
         pytest.importorskip("h5py")
+    if ending == "scipy.nc":  # written by SciPy where netCDF4 is not installed
+        monkeypatch.setattr("MDAnalysis.coordinates.TRJ.netCDF4", None)
+        ending = "nc"
     made, state, motion = system()
     path = tmp_path / f"r.{ending}"
     states = []

@@ -73,6 +73,7 @@ def test_console_snippets_run(page, text, tmp_path, monkeypatch, capsys):
         assert main.main(arguments) == 0, capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:.*independent ones")  # quick runs are short, and say so
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
 def test_example_runs(script, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

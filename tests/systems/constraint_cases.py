@@ -129,6 +129,13 @@ def swirl(atoms: object, exact: bool) -> kc.CustomVelocity:
 CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Distance": lambda: kc.Distance([[0, 1], [2, 3], [7, 1]]),
     "Distance moving": lambda: kc.Distance([[4, 6], [5, 0]], lambda t: [1 + 0.1 * np.sin(t), 2.0]),
+    "DistanceDifference": lambda: kc.DistanceDifference([[[0, 1], [1, 2]], [[3, 5], [5, 6]]]),
+    "DistanceDifference of a star and a pair": lambda: kc.DistanceDifference(
+        [[1, 0], [1, 2], [7, 1], [4, 6]], weights=[1.0, -0.5, 2.0, -1.0]
+    ),
+    "DistanceDifference around a ring, moving": lambda: kc.DistanceDifference(
+        [[0, 1], [1, 2], [2, 0]], lambda t: 4.0 + 0.1 * np.sin(t), weights=[1.0, -1.0, 1.5]
+    ),
     "Angle": lambda: kc.Angle([[0, 1, 2], [3, 4, 5], [7, 1, 6]]),
     "Dihedral": lambda: kc.Dihedral([[0, 1, 2, 3], [7, 6, 2, 4]]),
     "Sphere": lambda: kc.Sphere([0, 3], [[0.1, 0.2, -0.3], [1.0, 0.0, 3.0]]),

@@ -164,6 +164,9 @@ EXTRAS: dict[str, Extra] = {
     "wide linear combination": lambda rng, x: held.LinearCombination(_pick(rng, x, 5), rng.normal(size=(5, 3))),
     "centre of mass": lambda rng, x: held.CenterOfMass([_pick(rng, x, 4)]),
     "distance of centres": lambda rng, x: (lambda k: held.CenterDistance(k[:2], k[2:]))(_pick(rng, x, 5)),
+    "difference of distances": lambda rng, x: (
+        lambda k: held.DistanceDifference([[k[0], k[1]], [k[1], k[2]], [k[3], k[1]]], weights=[1.0, -1.0, 0.4])
+    )(_pick(rng, x, 4)),
     "radius of gyration": lambda rng, x: held.RadiusOfGyration(_pick(rng, x, 5)),
     "ellipsoid": lambda rng, x: held.Ellipsoid(
         _pick(rng, x, 1), 3 * _direction(rng), rng.uniform(1, 3, 3), np.linalg.qr(rng.normal(size=(3, 3)))[0], None

@@ -7,6 +7,7 @@ from kcons.constraints import (
     CenterDistance,
     Dihedral,
     Distance,
+    DistanceDifference,
     FixedAtoms,
     LinearCombination,
     LinearRelation,
@@ -25,6 +26,12 @@ ROWS = {
     "free angle": [Angle([[0, 1, 2]])],
     "free dihedral": [Dihedral([[0, 1, 2, 3]]), Distance([[3, 4]])],
     "centres": [CenterDistance([0, 1, 2], [3, 4, 5])],
+    "difference of lengths": [DistanceDifference([[0, 1], [1, 2]]), Distance([[3, 4]])],
+    "difference of held lengths": [Distance([[0, 1], [1, 2]]), DistanceDifference([[1, 2], [2, 3]])],
+    "difference of a star and a pair": [
+        DistanceDifference([[0, 2], [2, 3], [1, 2], [4, 5]], weights=[1.0, -1.0, 0.5, -2.0]),
+        Distance([[0, 1]]),
+    ],
     "centre of a molecule": [
         Distance([[0, 1], [1, 2], [2, 3]]),
         Dihedral([[0, 1, 2, 3]]),

@@ -36,7 +36,7 @@ def test_errors_of_correlated_series():
     errors = np.array([f.error for f in found])
     spread = np.std([f.value for f in found])
     assert spread == pytest.approx(truth, rel=0.2)
-    assert errors.mean() == pytest.approx(1.1 * truth, rel=0.15)  # the largest of four is a little large
+    assert errors.mean() == pytest.approx(truth, rel=0.15)
     assert (np.abs([f.value / f.error for f in found]) <= 3).mean() >= 0.98
 
 
@@ -136,7 +136,7 @@ TRAPPED = {
     "Nose-Hoover": (NoseHooverChain(1.0, 3.0), 1.0),
 }
 #: Steps with which the standard error is 0.04 or less.
-ENOUGH = {"Langevin": 16_000, "Nose-Hoover": 16_000}
+ENOUGH = {"Langevin": 24_000, "Nose-Hoover": 16_000}
 
 
 @pytest.mark.slow
@@ -160,6 +160,7 @@ def test_two_atoms_in_a_trap_to_one_percent(name):
 
 
 @pytest.mark.validation
+@pytest.mark.filterwarnings("ignore:no atom or body")
 def test_dumbbells_in_a_trap_by_the_general_estimator():
     held, x = dumbbells(2, force=quartic, potential=quartic_potential)
     x = x - x.mean(axis=0)

@@ -26,7 +26,7 @@ from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import State, System
 from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
-from kcons.thermostats.freedom import drift_velocity, open_directions
+from kcons.thermostats.freedom import LOOK_AT, drift_velocity, open_directions
 
 RNG = np.random.default_rng(11)
 SCATTERED = 3.0 * RNG.standard_normal((12, 3))
@@ -264,3 +264,89 @@ def test_a_sphere_has_no_open_direction_and_a_far_plane_two():
     x = np.array([[0.0, 0, 1.0], [3.0, 0.2, 0.1]])
     assert len(open_directions(system([Sphere([0], [0, 0, 0.0], 1.0)], x, [1.0, 1.0]).motion, x)) == 0
     assert len(open_directions(system([Plane([0], [0, 1.0, 1.0])], x, [1.0, 1.0]).motion, x)) == 2
+
+
+# -- bodies that do not feel each other -------------------------------------------------------------
+
+
+def within(reach, between=lambda i, j: True):
+    """Forces that push pairs of atoms apart, and are 0 beyond a reach; a trap for all."""
+
+    def force(x, t):
+        out = -0.1 * x
+        for i in range(len(x)):
+            for j in range(i):
+                d = x[i] - x[j]
+                r = np.sqrt(d @ d)
+                if between(i, j) and r < reach:
+                    push = (1.0 / r**7 - 1.0 / reach**7) * d / r
+                    out[i] += push
+                    out[j] -= push
+        return out
+
+    return force
+
+
+FAR_APART = 40.0 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1]])
+ON_SPHERES = np.linalg.qr(RNG.standard_normal((8, 3, 3)))[0][:, 0]
+PAIRS_FAR = np.repeat(FAR_APART, 2, axis=0) + np.tile([[0.0, 0, 0], [0, 0.3, 1.0]], (6, 1))
+
+
+@pytest.mark.parametrize(
+    ("rows", "x", "force"),
+    [
+        ([Sphere(range(8), [0, 0, 0], 1.0)], ON_SPHERES, lambda x, t: np.outer(x[:, 0], [0.7, 0, 0]) - [0, 0, 2.0]),
+        ([Distance(np.arange(12).reshape(6, 2))], PAIRS_FAR, quartic),
+        ([Distance([[0, 1], [0, 2]]), FixedAtoms([0])], SCATTERED[:3], quartic),
+        ([], SCATTERED, lambda x, t: -np.arange(1.0, 13.0)[:, None] * x),
+        ([Distance([[0, 1], [1, 2], [0, 2]])], SCATTERED[:5], lambda x, t: np.cos(x)),
+    ],
+    ids=["spheres", "dumbbells", "on a fixed atom", "oscillators", "triangle and atoms"],
+)
+def test_bodies_that_feel_no_other_are_warned_of_once(rows, x, force):
+    held = system(rows, x, np.ones(len(x)), force)
+    v = thermal_velocities(held, x, 1.0, 3)
+    for thermostat in (Isokinetic(1.0, momentum="free"), NoseHooverChain(1.0, 2.0, momentum="free")):
+        state = replace(held.initial_state(x, v), step=LOOK_AT - 1)
+        state = thermostat.step(held, state, 1e-3)
+        with pytest.warns(UserWarning, match=r"feels another.*Use Langevin"):
+            state = thermostat.step(held, state, 1e-3)
+        thermostat.step(held, state, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rows", "x", "force"),
+    [
+        ([], SCATTERED, repelling),
+        ([Distance(np.arange(12).reshape(6, 2))], SCATTERED, lambda x, t: waves(x) + repelling(x)),
+        ([], FAR_APART, within(3.0)),
+        ([Distance(np.arange(12).reshape(6, 2))], PAIRS_FAR, within(3.0)),
+        ([], FAR_APART, within(2.5, lambda i, j: {i, j} == {2, 5})),
+        ([], FAR_APART, within(2.5, lambda i, j: {i, j} == {0, 1})),
+        ([Distance([[0, 1]])], SCATTERED[:2], quartic),
+        ([CenterOfMass(range(12))], SCATTERED, quartic),
+    ],
+    ids=["cluster", "dumbbells", "gas", "gas of dumbbells", "one pair", "another pair", "one body", "tied"],
+)
+def test_bodies_that_feel_another_are_not(rows, x, force):
+    held = system(rows, x, np.ones(len(x)), force)
+    state = replace(held.initial_state(x, thermal_velocities(held, x, 1.0, 3)), step=LOOK_AT)
+    for thermostat in (Isokinetic(1.0, momentum="free"), NoseHooverChain(1.0, 2.0, momentum="free")):
+        thermostat.step(held, state, 1e-3)
+
+
+def test_fluids_in_cells_are_not_warned_of_and_cost_one_evaluation():
+    fluid, calls = LennardJones(range(8), 6.0), []
+    x = 3.0 * np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), 1).astype(float) + 0.1 * SCATTERED[:8]
+
+    def force(x, t):
+        calls.append(t)
+        return fluid.force(x)
+
+    held = System(Motion(ConstraintSet([], x, np.ones(8), cell=[6.0] * 3), x), force)
+    state = replace(held.initial_state(x, thermal_velocities(held, x, 1.0, 3)), step=LOOK_AT)
+    thermostat = Isokinetic(1.0, momentum="free")
+    state = thermostat.step(held, thermostat.start(held, state), 1e-3)
+    assert len(calls) == 3  # at the start, of the step, and with every second atom moved
+    thermostat.step(held, state, 1e-3)
+    assert len(calls) == 4

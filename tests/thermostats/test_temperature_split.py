@@ -279,7 +279,7 @@ def test_what_is_tied_to_space_is_left_out(name):
     x = np.array([[1.0, 0, 0], [1.3, 0.9, 0.2], [4.0, 0, 0], [4.5, 0.8, -0.1]])
     held = system([item, Distance([[0, 1], [2, 3]])], x, [1.0, 2.0, 1.0, 2.0], waves)
     split = TemperatureSplit(held)
-    for _ in range(32):
+    for _ in range(128):
         split.add(x)
     found = split.result()
     assert (found.shifts, found.turns) == (3, 2)

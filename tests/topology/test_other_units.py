@@ -14,6 +14,7 @@ X = np.array([[0.1, 0.2, 0.3], [1.2, 0.1, -0.2], [1.9, 1.1, 0.4], [0.7, 2.0, 1.3
 MASSES = np.array([1.0, 2.0, 3.0, 4.0])
 FAMILIES = [
     c.Distance([[0, 1]]),
+    c.DistanceDifference([[0, 1], [1, 2]]),
     c.Angle([[0, 1, 2]]),
     c.Dihedral([[0, 1, 2, 3]]),
     c.LinearRelation([3], [0, 1, 2], [0.2, 0.3, 0.5], None),

@@ -20,7 +20,7 @@ import numpy as np
 from kcons.comparison.averages.layers import Layers
 from kcons.comparison.machine import environment
 from kcons.comparison.progress import Watcher
-from kcons.comparison.study.asked import interruptible, picked
+from kcons.comparison.study.asked import interruptible, noted, picked
 from kcons.comparison.test_systems.system import Units
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError
@@ -242,7 +242,8 @@ def measure(
         return Stepped(status="failed", note=failure, **shown)
     if run.samples < FEWEST:
         return Stepped(status="partial", note=f"{run.samples} samples are too few for an error", **shown)
-    return Stepped(status="ok", **shown, **run.averages())
+    averages, note = noted(run.averages)
+    return Stepped(status="ok", note=note, **shown, **averages)
 
 
 def _refuse(layers: Layers, step: float, friction: float) -> None:

@@ -53,7 +53,7 @@ def table(runs: Sequence[Stepped], units: Units, title: str = "") -> Table:
             continue
         cells += [_percent(run, kind) for kind in kinds]
         cells.append(_pair(*(run.energy_off or run.energy), known))
-        cells.append(f"{run.correlation:,.0f}")
+        cells.append(f"{run.correlation:,.0f}" + (f" [{notes[run.note]}]" if run.note else ""))
         rows.append(cells)
     return Table(headings, rows, title=title, grouped=True)
 

@@ -76,12 +76,13 @@ def _cells(m: Sampled, notes: Mapping[str, int], kinds: Sequence[str]) -> list[s
     away = off(m)
     assert m.temperature_error is not None and m.temperature_standard_error is not None
     assert m.energy_error is not None and m.energy_standard_error is not None
+    doubt = f" [{notes[m.note]}]" if m.note else ""
     return [
         f"{m.setting:.4g}",
         _percent(m.temperature_error, m.temperature_standard_error),
         *(_percent(*m.kinds[name]) for name in kinds),
         _energy(m.energy_error, m.energy_standard_error),
-        Marked(f"{away:.1f}", "yellow" if away > 3 else ""),
+        Marked(f"{away:.1f}{doubt}", "yellow" if away > 3 or doubt else ""),
         step,
         f"{m.evaluations_to_goal:,.0f}",
         duration(m.seconds_to_goal or 0.0),

@@ -18,7 +18,7 @@ import numpy as np
 from kcons.comparison.averages.step_zero import Extrapolated, extrapolate
 from kcons.comparison.machine import environment
 from kcons.comparison.progress import Watcher
-from kcons.comparison.study.asked import interruptible, picked
+from kcons.comparison.study.asked import interruptible, noted, picked
 from kcons.comparison.test_systems.fluid import Fluid
 from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray
@@ -401,11 +401,15 @@ def _measured(
         note = f"{count} samples in the budget are too few for an error; give it more"
         return Sampled(status="partial", note=note, **common)
     counts = [round(part * count) for part in PARTS]
-    growth = [_moment(log, n, fluid, energy) for n in counts if n >= FEWEST]
+    # Errors of parts of a run rest on fewer samples than that of the whole, which has a note if they are too few.
+    told = [noted(lambda n=n: _moment(log, n, fluid, energy)) for n in counts if n >= FEWEST]  # type: ignore[misc]
+    growth = [moment for moment, _ in told]
+    kinds, doubt = noted(lambda: _kinds(log, fluid))
     last = growth[-1]
     waits = (last.temperature_standard_error / GOAL) ** 2
     return Sampled(
         status="ok",
+        note="; ".join(dict.fromkeys(filter(None, (told[-1][1], doubt)))),
         temperature_error=last.temperature_error,
         temperature_standard_error=last.temperature_standard_error,
         energy_error=last.energy_error,
@@ -413,7 +417,7 @@ def _measured(
         # By the median: other work on the machine comes in bursts.
         seconds_to_goal=waits * last.steps * common["step_seconds"],
         evaluations_to_goal=waits * last.evaluations,
-        kinds=_kinds(log, fluid),
+        kinds=kinds,
         growth=growth,
         **common,
     )

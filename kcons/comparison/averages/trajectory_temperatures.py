@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from kcons.comparison.averages.long_steps import DOUBT
 from kcons.comparison.averages.sampling import GOAL
+from kcons.comparison.study.asked import noted
 from kcons.comparison.test_systems import any_file
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.errors import InputError, UnsupportedError
@@ -93,7 +95,9 @@ def _along(
         sums += lengths, lengths**2
     mean, squares = sums / len(frames)
     stiff = free[squares - mean**2 < (STIFF * mean) ** 2]
-    found = split.result()
+    found, doubt = noted(split.result)
+    if doubt:
+        found = replace(found, left_out=(*found.left_out, doubt))
     if not len(stiff):
         return found
     i, j = stiff[0].tolist()
@@ -117,7 +121,7 @@ def sentences(found: SplitTemperatures, asked: float | None = None) -> list[str]
     if asked is not None:
         lines.append(_beside(asked, [(what, e) for what, e in kinds if e is not None]))
     unknown = max((e.error / abs(e.value) for _, e in kinds if e is not None), default=0.0)
-    if unknown > GOAL:
+    if GOAL < unknown < math.inf:
         frames = float(f"{found.samples * (unknown / GOAL) ** 2:.1g}")
         lines.append(f"errors of {GOAL:.0%} take some {frames:,.0f} frames as far apart as these")
     return [*lines, *found.left_out]

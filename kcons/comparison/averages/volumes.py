@@ -12,27 +12,24 @@ from numpy.typing import ArrayLike
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, run
-from kcons.thermostats import CellSystem, ConstantPressure, autocorrelation_time
+from kcons.thermostats import CellSystem, ConstantPressure, autocorrelation_time, mean
+from kcons.thermostats.correlated_series import FEWEST
 
-#: Of shorter series no error is known.
-FEWEST = 32
 #: Stretches of `every` steps in a turn, with and without a barostat each.
 STRETCHES = 6
 
 
 def mean_and_error(values: ArrayLike) -> tuple[float, float]:
-    """Mean of a series, and its standard error by the correlation time; NaN for a series of fewer than 32 values."""
+    """`thermostats.mean` of a series, with an error of NaN for fewer than 32 values."""
     series = np.asarray(values, dtype=float)
-    if len(series) < FEWEST:
-        return float(series.mean()), float("nan")
-    return float(series.mean()), float(series.std() * np.sqrt(autocorrelation_time(series) / len(series)))
+    return mean(series) if len(series) >= FEWEST else (float(series.mean()), float("nan"))
 
 
 def compressed(volumes: ArrayLike) -> tuple[float, float]:
     """<dV^2>/<V>, which is kT times the isothermal compressibility, and its error from that of the squares."""
     series = np.asarray(volumes, dtype=float)
-    mean, error = mean_and_error((series - series.mean()) ** 2)
-    return mean / float(series.mean()), error / float(series.mean())
+    square, error = mean_and_error((series - series.mean()) ** 2)
+    return square / float(series.mean()), error / float(series.mean())
 
 
 def pooled(pairs: Sequence[Sequence[float]]) -> tuple[float, float, float]:
@@ -51,10 +48,10 @@ def pooled(pairs: Sequence[Sequence[float]]) -> tuple[float, float, float]:
     """
     value, error = np.array(pairs, dtype=float).T
     w = error**-2
-    mean = float((w * value).sum() / w.sum())
+    middle = float((w * value).sum() / w.sum())
     more = len(value) - 1
-    scatter = float(np.sqrt((w * (value - mean) ** 2).sum() / more)) if more else float("nan")
-    return mean, float(w.sum() ** -0.5), scatter
+    scatter = float(np.sqrt((w * (value - middle) ** 2).sum() / more)) if more else float("nan")
+    return middle, float(w.sum() ** -0.5), scatter
 
 
 def slope_between(one: Mapping[str, Any], two: Mapping[str, Any]) -> tuple[float, float, float]:

@@ -1,11 +1,15 @@
-"""What is asked for by name, and work that Ctrl-C ends with what is done."""
+"""What is asked for by name, work that Ctrl-C ends with what is done, and warnings that become notes."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from kcons.errors import InputError, did_you_mean
+
+Found = TypeVar("Found")
 
 
 @contextmanager
@@ -24,6 +28,14 @@ def interruptible(done: Callable[[], int], planned: int, what: str, partial: boo
         if not (partial and done()):
             raise
         said["interrupted"] = f"interrupted: {done()} of {planned} {what} were measured"
+
+
+def noted(make: Callable[[], Found]) -> tuple[Found, str]:
+    """What `make` gives, and what it warned of, for a note beside the result: each warning once."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        found = make()
+    return found, "; ".join(dict.fromkeys(str(each.message) for each in said))
 
 
 def picked(names: Iterable[str] | None, known: Iterable[str], what: str, item: str) -> list[str]:

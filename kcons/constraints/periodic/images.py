@@ -4,7 +4,8 @@ Minimum images say it for a vector that is shorter than half the cell, and for n
 set-up:
 
 * A row is *plain* if a constant distance shorter than `NEARLY` half the cell is held between each two neighbours in
-  its list of atoms. Minimum images along the list are then right at any time, whatever images are stored.
+  its list of atoms. Minimum images along the list are then right at any time, whatever images are stored. Of a row that
+  names its `Constraint.links` these are the neighbours; where they do not follow the list, the row is no plain one.
 * All other rows are *whole* rows: distances nearly as long as half the cell and more (across a ring or an adsorbate),
   linear rows, free dihedrals and angles, centres of groups, moving targets. Their atoms are made whole along a
   spanning tree of the shortest links that the set has, held distances first, and the row takes positions in
@@ -216,7 +217,10 @@ class _Links:
         self, item: Constraint, start: int, x: FloatArray, lattice: FloatArray, half_width: float, time: float
     ) -> None:
         self.item, self.start, self.half_width, self.time = item, start, half_width, time
-        self.neighbours = np.stack([item.atoms[:, :-1], item.atoms[:, 1:]], axis=-1)
+        chain = np.stack([np.arange(item.width - 1), np.arange(1, item.width)], axis=1)
+        self.links = chain if item.links is None else item.links
+        self._in_line = np.array_equal(self.links, chain)
+        self.neighbours = item.linked
         raw = x[self.neighbours[..., 1]] - x[self.neighbours[..., 0]]
         nearest = minimum_image(raw, lattice)
         self.lengths = np.linalg.norm(nearest, axis=2)
@@ -256,13 +260,13 @@ class _Links:
         place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
         found = keys[place] == wanted if len(keys) else np.zeros(wanted.shape, bool)
         # The compiled solvers know minimum images of distances, angles and dihedrals only.
-        self.whole = np.logical_not(found.all(axis=1)) | (self.item.kind == RowKind.LINEAR)
+        self.whole = np.logical_not(found.all(axis=1)) | (self.item.kind == RowKind.LINEAR) | (not self._in_line)
 
     def offered(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Pairs of atoms, lengths (NaN: to be measured) and rows of the links offered to the tree."""
-        rows = np.repeat(np.arange(self.item.n_rows), self.item.width - 1)
+        rows = np.repeat(np.arange(self.item.n_rows), len(self.links))
         pairs, lengths = self.neighbours.reshape(-1, 2), self.lengths.ravel()
-        if 2 < self.item.width <= ALL_PAIRS_WIDTH and self.whole.any():
+        if self.item.links is None and 2 < self.item.width <= ALL_PAIRS_WIDTH and self.whole.any():
             a, b = np.triu_indices(self.item.width, 2)
             more = self.item.atoms[self.whole]
             pairs = np.concatenate([pairs, np.stack([more[:, a], more[:, b]], axis=-1).reshape(-1, 2)])
@@ -277,12 +281,13 @@ class _Links:
         item = self.item
         label = component[item.atoms[:, 0]]
         r = y[item.atoms]
-        apart = np.diff(r, axis=1)
+        apart = r[:, self.links[:, 1]] - r[:, self.links[:, 0]]
         cells = -np.round(apart @ lattice[1]).astype(np.int64)
         nearest = np.linalg.norm(apart + cells @ lattice[0], axis=2)
         differs = cells.any(axis=2)
         self._long = np.linalg.norm(apart, axis=2)[:, 0] >= NEARLY * self.half_width
-        self.windings[:, 1:] = np.cumsum(cells, axis=1)
+        for k, (before, after) in enumerate(self.links):
+            self.windings[:, after] = self.windings[:, before] + cells[:, k]
         if item.target is not None and item.holonomic:
             # The target tells which of the two is meant.
             other = r + self.windings @ lattice[0]
@@ -290,6 +295,8 @@ class _Links:
                 closing = np.abs(self._sigma(other)) < 0.5 * np.abs(self._sigma(r))
         else:
             bonds = (nearest < self.half_width) & (nearest <= BOND_LIKE * longest[label][:, None])
+            if item.links is not None:
+                bonds = nearest < self.half_width
             closing = (bonds | ~differs).all(axis=1)
             self._local = (nearest < self.half_width).all(axis=1)
             self._nearest = nearest

@@ -7,7 +7,8 @@ So no integral has to be done: differences of the free energy and their covarian
 
 The kernel is a product over coordinates of Matern kernels of u(x), an increasing function of the coordinate that is
 learned with it. Where the free energy changes quickly u does, and windows are proposed there. u' is a cubic B-spline
-with positive coefficients. A periodic coordinate is a circle, on which the distance is the chord.
+with positive coefficients. A periodic coordinate is a circle, on which the distance is the chord, and its kernel is a
+smoother one.
 """
 
 from __future__ import annotations
@@ -88,6 +89,15 @@ def _matern(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     decay = np.exp(-a)
     value = (1 + a + 0.4 * a**2 + a**3 / 15) * decay
     return value, -0.7 * (1 + a + a**2 / 3) * decay, 49 / 60 * (1 + a) * decay
+
+
+def _smoother(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Matern 11/2, for torsions: their free energies are sums of a few waves, without walls."""
+    a = np.sqrt(11 * square)
+    decay = np.exp(-a)
+    value = (1 + a + (4 / 9) * a**2 + a**3 / 9 + a**4 / 63 + a**5 / 945) * decay
+    slope = -(11 / 18) * (1 + a + (3 / 7) * a**2 + (2 / 21) * a**3 + a**4 / 105) * decay
+    return value, slope, (121 / 252) * (1 + a + 0.4 * a**2 + a**3 / 15) * decay
 
 
 class Points:
@@ -209,7 +219,7 @@ def _parts(
         first, second = 2 * radius * np.sin(away / radius), 2 * np.cos(away / radius)
     else:
         square, first, second = away**2, 2 * away, np.full_like(away, 2.0)
-    value, slope, bend = _matern(square)
+    value, slope, bend = _smoother(square) if periodic else _matern(square)
     along, twice = slope * first, bend * first**2 + slope * second
     return [[value, -along * dw], [along * du[:, None], -twice * du[:, None] * dw]]
 

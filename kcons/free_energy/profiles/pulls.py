@@ -22,8 +22,8 @@ from scipy.special import expit, logsumexp
 
 from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers, positive
 from kcons.errors import InputError
-from kcons.free_energy.averages import FEW_INDEPENDENT, pymbar
-from kcons.thermostats import Estimate
+from kcons.free_energy.averages import pymbar
+from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
 FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03

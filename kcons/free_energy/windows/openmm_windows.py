@@ -13,7 +13,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import app, unit
 
-from kcons.constraints import Angle, Constraint, Dihedral, Distance, Formula
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, Formula
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
@@ -248,9 +248,14 @@ def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:
     elif isinstance(item, Dihedral):
         force = openmm.CustomTorsionForce("theta")
         force.addTorsion(*atoms, [])
+    elif isinstance(item, DistanceDifference):
+        terms = (f"({w!r})*distance(p{i + 1},p{j + 1})" for (i, j), w in zip(item.slots, item.weights, strict=True))
+        force = openmm.CustomCompoundBondForce(item.width, "+".join(terms))
+        force.addBond(atoms, [])
     else:
         raise UnsupportedError(
-            f"{name} is {item!r}; windows in OpenMM hold a Distance, an Angle, a Dihedral or a Formula"
+            f"{name} is {item!r}; windows in OpenMM hold a Distance, a DistanceDifference, an Angle, a Dihedral or a "
+            "Formula"
         )
     force.setUsesPeriodicBoundaryConditions(periodic)
     return force

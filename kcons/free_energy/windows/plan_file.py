@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -12,6 +13,7 @@ from functools import partial
 from itertools import product
 from os import PathLike
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any
 
 import numpy as np
@@ -40,19 +42,21 @@ TABLES: dict[str, dict[str, str]] = {
     },
     "held": {"constrain": "a text", "fixed": "whole numbers", "distances": "pairs of whole numbers"},
     # What there is more to say of settings, they say themselves.
-    "sampling": {**dict.fromkeys((f.name for f in fields(Settings)), ""), "both_sides": "true or false"}
-    | {"approach": "a number, or numbers", "seed": ""},
+    "sampling": {**dict.fromkeys((f.name for f in fields(Settings)), "one value"), "both_sides": "true or false"}
+    | {"approach": "a number, or numbers", "seed": "one value"},
     "improve": {
         **dict.fromkeys(("error", "below"), "a number above 0"),
         **dict.fromkeys(("most", "at_once"), "a whole number above 0"),
     },
     "pulls": {
         **dict.fromkeys(("from", "to"), "a number, or numbers"),
-        **dict.fromkeys(("count", "steps"), ""),
+        **dict.fromkeys(("count", "steps"), "one value"),
         "both_ways": "true or false",
     },
     "workers": {"processes": "a whole number above 0", "scheduler": "a text"},
 }
+#: Windows of a plan, at most.
+MOST_WINDOWS = 100_000
 #: Steps of a pull unless they are given.
 _PULL = 20000
 FAMILIES: dict[str, type[Constraint]] = {"distance": Distance, "angle": Angle, "dihedral": Dihedral}
@@ -125,7 +129,8 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
     Raises
     ------
     InputError
-        No TOML, unknown or missing keys, files that are not there, coordinates without values.
+        No TOML, unknown or missing keys, files that are not there, coordinates without values, more than 100,000
+        windows.
     """
     path = as_path(file, "plan")
     try:
@@ -136,6 +141,10 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
         raise InputError(f"{path} cannot be read: {error}", item="plan") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no TOML: {error}", item="plan") from error
+    except RecursionError:
+        raise InputError(
+            f"{path}: lists or tables are too deep in each other; a plan needs two levels", item="plan"
+        ) from None
     _refuse_unknown(data)
     coordinates, values = {}, []
     for entry in data.get("coordinate", []):
@@ -151,6 +160,7 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
     workers = data.get("workers", {})
+    _refuse_more(math.prod(map(len, values)), "coordinate")
     targets = np.array(list(product(*values)))
     if "improve" in data and (len(coordinates) > 1 or len(targets) < 3):
         raise InputError(
@@ -172,6 +182,11 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
     )
 
 
+def _refuse_more(windows: int, item: str) -> None:
+    if windows > MOST_WINDOWS:
+        raise InputError(f"the plan has {windows:,} windows; give at most {MOST_WINDOWS:,}", item=item)
+
+
 def _refuse_unknown(data: Mapping[str, Any]) -> None:
     for table, content in data.items():
         _refuse(table, TABLES, "the plan")
@@ -180,12 +195,12 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
             raise InputError(f"write {brackets}", item=table)
         for entry in content if isinstance(content, list) else [content]:
             if not isinstance(entry, dict):
-                raise InputError(f"{table} is {entry!r}; write [{table}] and its keys below", item=table)
+                raise InputError(f"{table} is {short(entry)}; write [{table}] and its keys below", item=table)
             for key in entry:
                 _refuse(key, TABLES[table], f"[{table}]")
                 wanted = TABLES[table][key]
                 if not _is(entry[key], wanted):
-                    raise InputError(f"{key} of [{table}] is {entry[key]!r}; give {wanted}", item=key)
+                    raise InputError(f"{key} of [{table}] is {short(entry[key])}; give {wanted}", item=key)
     for key in ("error", "most") if "improve" in data else ():
         if key not in data["improve"]:
             raise InputError(f"[improve] has no {key}; give error (kJ/mol) and most, a number of windows", item=key)
@@ -193,9 +208,10 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
 
 def _is(value: Any, wanted: str) -> bool:
     """Whether a value of TOML is what is wanted."""
-    if wanted in ("a text", "a table", "true or false", ""):
-        kind = {"a text": str, "a table": dict, "true or false": bool, "": object}[wanted]
-        return isinstance(value, kind)
+    if wanted == "one value":
+        return not isinstance(value, dict | list)
+    if wanted in ("a text", "a table", "true or false"):
+        return isinstance(value, {"a text": str, "a table": dict, "true or false": bool}[wanted])
     if wanted == "pairs of whole numbers":
         return isinstance(value, list) and all(_is(pair, "whole numbers") and len(pair) == 2 for pair in value)
     if wanted == "a number, or numbers":
@@ -205,7 +221,7 @@ def _is(value: Any, wanted: str) -> bool:
     if wanted.endswith("numbers"):
         return isinstance(value, list) and bool(value) and all(_is(v, "a " + wanted[:-1]) for v in value)
     kinds = int if "whole" in wanted else (int, float)
-    number = isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, kinds) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
     return number and (value > 0 or "above 0" not in wanted)
 
 
@@ -232,6 +248,7 @@ def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, 
         places = np.array(entry["values"], dtype=np.float64)
     elif {"from", "to", "windows"} <= set(entry):
         turn = family == "dihedral" and abs(entry["to"] - entry["from"]) >= 360 - 1e-9
+        _refuse_more(entry["windows"], "windows")
         places = np.linspace(entry["from"], entry["to"], entry["windows"], endpoint=not turn)
     else:
         raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")

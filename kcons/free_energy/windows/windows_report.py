@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.free_energy.averages import FEW_INDEPENDENT
 from kcons.free_energy.profiles.pulls import Pulled
 from kcons.free_energy.windows.window_results import UNLIKELY, FreeEnergy, WindowResult
 from kcons.steppers.files import in_one_piece, text
+from kcons.thermostats.correlated_series import FEW_INDEPENDENT
 
 if TYPE_CHECKING:
     from rich.table import Table

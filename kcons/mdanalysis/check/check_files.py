@@ -28,6 +28,8 @@ def check_trajectory(
     *,
     targets: str | Path = "first",
     frames: str | None = None,
+    format: str | None = None,
+    topology_format: str | None = None,
     workers: int = 1,
     backend: str | None = None,
     **options: Any,
@@ -44,6 +46,8 @@ def check_trajectory(
         'topology': the coordinates in the topology's file; else as for `ConstraintCheck`.
     frames : str, optional
         'A:B:STEP' as in a slice; all by default.
+    format, topology_format : str, optional
+        Formats of the files, as MDAnalysis names them; by default what their names tell.
     workers : int
         How many read at the same time.
     backend : {'threads', 'multiprocessing', 'dask'}, optional
@@ -68,7 +72,7 @@ def check_trajectory(
     held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
     text = None
     if str(targets) == "topology":
-        universe = open_universe(topology)
+        universe = open_universe(topology, topology_format=topology_format)
         if not hasattr(universe, "trajectory"):
             raise InputError(
                 f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file",
@@ -79,10 +83,10 @@ def check_trajectory(
             precision = precision_of(topology, format_of(reader))
             options["target_error"] = precision.half_step(universe.atoms.positions)
         constraints, guessed = _rows(universe, constrain, held)
-        load_trajectory(universe, trajectory, topology)
+        load_trajectory(universe, trajectory, topology, format=format)
         given, text = "given", f"coordinates of {topology}"
     else:
-        universe = open_universe(topology, trajectory)
+        universe = open_universe(topology, trajectory, format=format, topology_format=topology_format)
         _go_to_first(universe, chosen.get("start"))
         constraints, guessed = _rows(universe, constrain, held)
         given = str(targets)

@@ -10,7 +10,7 @@ from kcons.constraints.target import FloatArray
 from kcons.mdanalysis.check.atom_names import AtomNames
 from kcons.mdanalysis.check.bound_rows import BoundRows
 from kcons.mdanalysis.check.files.file_precision import described
-from kcons.mdanalysis.check.findings import Part, by_unit, gaps_of, rms_of, row_result, verdict_of
+from kcons.mdanalysis.check.findings import Part, by_unit, first_alone, gaps_of, rms_of, row_result, verdict_of
 from kcons.mdanalysis.check.frames.deviations import UNITS
 from kcons.mdanalysis.check.reading import Reading
 from kcons.mdanalysis.check.result import CheckResult
@@ -89,6 +89,8 @@ def concluded(
             f"lengths are off by more than themselves, and {some}frames of {asked.names[0]} have no cell: molecules "
             "cut by a face of one look like this. Give a format that has the cell (not XYZ), or whole molecules"
         )
+    if alone := first_alone(table, part, rows.tolerance):
+        asked.remarks.append(alone)
     in_frame = (found.excess > 0).any(axis=0)
     frames = part.frames[in_frame]
     status = "tolerated" if beyond_file.any() else "kept"

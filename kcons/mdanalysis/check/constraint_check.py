@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -23,8 +25,8 @@ from kcons.mdanalysis.check.atom_names import AtomNames
 from kcons.mdanalysis.check.bound_rows import BoundRows
 from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.check.conclusions import Asked, concluded
-from kcons.mdanalysis.check.files.endings import intact_frames, last_offset, leftover
-from kcons.mdanalysis.check.files.file_precision import by_frame, precision_of_reader
+from kcons.mdanalysis.check.files.endings import damage_of, ending_of
+from kcons.mdanalysis.check.files.file_precision import by_frame, grid_of, precision_of_reader
 from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
 from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.findings import (
@@ -36,13 +38,12 @@ from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remark
 from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
-from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, quiet
 from kcons.mdanalysis.topology import host_of, require_angstrom, velocities_known
 from kcons.topology.rows_by_name import HeldRows
 
-#: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
-#: in how many frames at least.
-SAMPLES, SUMMED, MOST_SKIPPED = 32, 100, 8
+#: Frames, and atoms in each, that a grid of coordinates is looked for in.
+GRID_FRAMES, GRID_ATOMS = 5, 1000
 
 
 class _Remote:
@@ -158,14 +159,14 @@ class ConstraintCheck(AnalysisBase):
         self._wants_rank = rank
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
-        self._format = format_of(reader)
         called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         in_file = precision_of_reader(reader, precision)
         remarks += remarks_on(reader)
         of_frames = None
         if in_file.exact and precision is None:
             of_frames = by_frame(self._path, reader._xdr.offsets, in_file)
-        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames, velocities_known(reader))
+        self._may_be_on_grid = precision is None and not (in_file.step or in_file.digits)
+        self._reading = Reading(in_file, of_frames, self._masses, velocities_known(reader))
         self.asked = Asked(called, labels, mode, text, removed, int(worst), remarks)
         self._pass_of_means = False
 
@@ -200,12 +201,13 @@ class ConstraintCheck(AnalysisBase):
         self._to_the_end = (
             Path(self._path).is_file() and chosen["frames"] is None and _open_ended(start, stop, step, n_frames)
         )
-        self._bind(self._first(chosen))
+        frames_asked = self._numbers(chosen)
+        if self._may_be_on_grid:
+            self._look_for_grid(frames_asked)
+        self._bind(int(frames_asked[0]))
         in_blocks = blocks_of(self._trajectory, self._rows.table) is not None
         # The compiled look at a block sees damage by itself.
-        self._reading.intact = n_frames
-        if not in_blocks:
-            self._reading.intact = intact_frames(self._path, self._format, n_frames, self._trajectory.n_atoms)
+        self._reading.damage = None if in_blocks else damage_of(self._trajectory)
         options = with_backend(options, in_blocks)
         self._pass_of_means = self.asked.mode == "mean"
         with inherited(self, options["backend"]):
@@ -219,12 +221,13 @@ class ConstraintCheck(AnalysisBase):
     def __reduce_ex__(self, protocol: Any) -> Any:
         return short_pickle(self) or super().__reduce_ex__(protocol)
 
-    def _first(self, chosen: dict[str, Any]) -> int:
+    def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
+        """Frames to look at, at least one."""
+        numbers: Sequence[int]
         if chosen["frames"] is None:
             if chosen["step"] == 0:
                 raise InputError("step is 0; give another whole number", item="step")
             numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
-            first = numbers[0] if len(numbers) else None
         else:
             asked, count = np.asarray(chosen["frames"]), self._trajectory.n_frames
             if asked.dtype == bool and asked.shape == (count,):
@@ -237,14 +240,32 @@ class ConstraintCheck(AnalysisBase):
                 )
             for frame in asked[(asked < -count) | (asked >= count)]:
                 raise InputError(f"{self.asked.names[0]}: there is no frame {frame}; it has {count}", item="frames")
-            first = int(asked[0]) if len(asked) else None
-        if first is None:
+            numbers = asked.tolist()
+        if not len(numbers):
             raise InputError(
                 f"{self.asked.names[0]}: no frames are left by start, stop and step; it has "
                 f"{self._trajectory.n_frames}",
                 item="frames",
             )
-        return first
+        return numbers
+
+    def _look_for_grid(self, numbers: Sequence[int]) -> None:
+        """Take the grid that coordinates lie on, in frames from first to last, for the precision of the file."""
+        used = np.unique(np.concatenate([item.atoms.ravel() for item in self._given]))
+        used = used[:: -(-len(used) // GRID_ATOMS)]
+        seen = []
+        for k in np.unique(np.linspace(0, len(numbers) - 1, GRID_FRAMES).astype(int)).tolist():
+            # A frame that cannot be read, or has no numbers, is told of where it is looked at.
+            with quiet(), suppress(*READ_ERRORS):
+                seen.append(np.array(self._trajectory[numbers[k]].positions[used]))
+        step = grid_of(seen) if seen and np.isfinite(seen).all() else 0.0
+        self._reading.precision = replace(self._reading.precision, step=step)
+        remark = (
+            f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for their "
+            "precision, unless one is given"
+        )
+        if step and remark not in self.asked.remarks:
+            self.asked.remarks.append(remark)
 
     def _bind(self, frame: int) -> None:
         """Rows and their targets at one frame."""
@@ -326,7 +347,7 @@ class ConstraintCheck(AnalysisBase):
         """What lies behind the last frame, or keeps it from being read."""
         trajectory = self._trajectory
         n = trajectory.n_frames
-        broken = leftover(self._path, self._format, n, trajectory.n_atoms, last_offset(trajectory))
+        broken = self._reading.damage or ending_of(trajectory)
         try:
             with quiet():
                 trajectory[n - 1]

@@ -148,6 +148,39 @@ def row_result(table: RowTable, labels: AtomNames, row: int, part: Part) -> RowR
     )
 
 
+def first_alone(table: RowTable, part: Part, tolerance: float) -> str:
+    """What to say where the first frame alone differs; '' where it does not, or there are fewer than three.
+
+    Where targets come from it, all others are off; they agree if they differ among themselves by no more than rounding
+    and the tolerance, in the root mean square.
+
+    Parameters
+    ----------
+    table : RowTable
+    part : Part
+        All frames.
+    tolerance : float
+    """
+    found = part.found
+    off = (found.excess > 0).any(axis=0)
+    if len(off) < 3 or off[0] == off[1] or (off[1:] != off[1]).any():
+        return ""
+    spreads = []
+    for unit, name in enumerate(UNITS):
+        mine = table.units == unit
+        if off[1] and mine.any():
+            means = found.total[mine] / np.maximum(found.counted[mine] - 1, 1)
+            rms = float(np.sqrt(max(found.squares[unit, 1:].mean() - means @ means, 0.0) / mine.sum()))
+            if rms > found.rounding[unit].max() + tolerance * table.sizes[mine].min():
+                return ""
+            spreads.append(f"{rms:.1e} {name}")
+    among = f": the others agree to {' and '.join(spreads)} (root mean square)" if spreads else ""
+    return (
+        f"the first frame alone differs{among}. Programs such as LAMMPS write it before they hold the constraints; "
+        f"begin at frame {part.frames[1]} (--frames {part.frames[1]}:)"
+    )
+
+
 def verdict_of(
     status: str,
     tolerance: float,

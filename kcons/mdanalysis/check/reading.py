@@ -39,17 +39,17 @@ class Reading:
         Where it differs from frame to frame.
     masses : ndarray, shape (n_atoms,), or None
         For the kinetic energy.
-    intact : int
-        Frames before this one are not damaged.
     velocities : bool
         Whether velocities, where there are any, are in angstrom/ps.
+    damage : Break or None
+        Where the file is known to be damaged.
     """
 
     precision: FilePrecision
     by_frame: Any
     masses: FloatArray | None
-    intact: int
     velocities: bool = True
+    damage: Break | None = None
 
     def precision_at(self, frame: int) -> FilePrecision:
         """Of the coordinates of one frame."""
@@ -110,8 +110,9 @@ class Reading:
         previous = None
         for k, frame in enumerate(part.frames.tolist()):
             try:
-                if frame >= self.intact:
-                    raise OSError("its records or lines are damaged")
+                if self.damage is not None and frame >= self.damage.frame:
+                    part.broken = self.damage
+                    return k
                 ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
                 previous = frame
                 table.precision = self.precision_at(frame)

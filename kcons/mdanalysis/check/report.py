@@ -190,7 +190,7 @@ def refuse_others(folder: Path, trajectory: str | Path) -> None:
     try:
         data = json.loads(paths[0].read_text(encoding="utf-8"))
         owner = Path(data.get("file") or data["trajectory"]).resolve()
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise OccupiedError(f"{folder} has other files called {', '.join(FILES)}; {remedy}", item="out") from None
     if owner != Path(trajectory).resolve():
         raise OccupiedError(f"{folder} holds the check of {owner}; {remedy}", item="out")
@@ -203,16 +203,12 @@ def _put(
     refuse_others(folder, trajectory)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in FILES]
-    if not paths[0].exists():
-        try:
-            paths[0].open("x").close()
-        except FileExistsError:
-            raise OccupiedError(
-                f"another check writes into {folder}; give another folder (--out)", item="out"
-            ) from None
     whole = as_json({"file": str(Path(trajectory).resolve()), **data})
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
-    contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, text and f"{text}\n".encode(errors="replace")]
+    page = f"{text}\n".encode(errors="replace") if text else b""
+    contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, page]
+    if not paths[0].exists():
+        _claim(paths[0], contents[0])
     written = []
     for path, content in zip(paths, contents, strict=True):
         if not content:
@@ -222,3 +218,19 @@ def _put(
             file.write(content)
         written.append(path)
     return written
+
+
+def _claim(path: Path, content: bytes) -> None:
+    """Write a file that must not be there yet, by which a folder belongs to a check; nothing is left of a failure."""
+    try:
+        file = path.open("xb")
+    except FileExistsError:
+        raise OccupiedError(
+            f"another check writes into {path.parent}; give another folder (--out)", item="out"
+        ) from None
+    try:
+        with file:
+            file.write(content)
+    except BaseException:
+        path.unlink()
+        raise

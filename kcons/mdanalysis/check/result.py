@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from kcons.constraints.target import FloatArray
+from kcons.thermostats.correlated_series import slope
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,13 @@ class Drift:
 
 
 def fitted(times: FloatArray, values: FloatArray) -> Drift | None:
-    """Least squares of values against times; None for fewer than three times."""
+    """Least squares of values against times, which may depend on their neighbors; None for fewer than three times."""
     good = np.isfinite(values) & np.isfinite(times)
     t, y = times[good], values[good]
     if len(t) < 3 or not np.ptp(t) > 0:
         return None
-    d = t - t.mean()
-    slope = float(d @ y / (d @ d))
-    rest = y - y.mean() - slope * d
-    error = math.sqrt(float(rest @ rest) / (len(t) - 2) / float(d @ d))
-    return Drift(slope, error, slope * float(np.ptp(t)))
+    found = slope(t, y)
+    return Drift(found.value, found.error, found.value * float(np.ptp(t)))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.constraints import Distance
+from kcons.constraints import Distance, DistanceDifference
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
@@ -28,7 +28,7 @@ FAR = 0.25
 #: Rows off by no more than this are fulfilled as far as motions are concerned.
 OFF = 1e-9
 #: Rows that hold what bonds and angles are made of.
-_INTERNAL = ("Distance", "Angle", "Dihedral", "CenterDistance")
+_INTERNAL = ("Distance", "DistanceDifference", "Angle", "Dihedral", "CenterDistance")
 #: Gives the bonds of a system, shape (n, 2).
 Bonds = Callable[[], IntArray]
 #: Bonds and angles that are examined for being held by the rows, and rows of a cluster up to which they are.
@@ -242,23 +242,26 @@ class Geometry:
 
     @cached_property
     def _held_lengths(self) -> tuple[IntArray, FloatArray]:
-        """Pairs whose distance a row holds, i < j, and by which part of it they were off."""
+        """Pairs whose distance a row holds, alone or with others, i < j, and by which part of it they were off."""
         pairs, miss = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
         for item, first in zip(self.held.constraints, self.held.starts, strict=False):
-            if item.family == "Distance":
-                pairs.append(np.sort(item.atoms, axis=1))
-                miss.append(self.misfit[first : first + item.n_rows])
+            if isinstance(item, Distance | DistanceDifference):
+                named = item.pairs
+                pairs.append(np.sort(named.reshape(-1, 2), axis=1))
+                miss.append(np.repeat(self.misfit[first : first + item.n_rows], named.shape[1]))
         return np.concatenate(pairs), np.concatenate(miss)
 
     @cached_property
     def _moved_legs(self) -> set[tuple[int, int]]:
-        """(vertex, end) of the legs of angles that were off: other angles with such a leg change with them."""
+        """(vertex, end) of the legs of what was off and turns them: other angles with such a leg change with them."""
         legs: set[tuple[int, int]] = set()
         for item, first in zip(self.held.constraints, self.held.starts, strict=False):
             off = np.flatnonzero(self.misfit[first : first + item.n_rows] > 1e-6)
             if item.family == "Angle":
                 for i, j, k in item.atoms[off].tolist():
                     legs |= {(j, i), (j, k)}
+            elif isinstance(item, DistanceDifference):  # an atom that goes from one neighbor to another
+                legs |= {leg for i, k in item.pairs[off].reshape(-1, 2).tolist() for leg in ((i, k), (k, i))}
             elif item.family == "Distance":
                 for i, k in item.atoms[off].tolist():
                     for j in self.between(i, k):

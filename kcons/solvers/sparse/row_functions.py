@@ -145,6 +145,23 @@ def _torus(r, p, t, out):
     out[3] = f * z + g * p[5]
 
 
+def _distance_difference(r, p, t, out):
+    """sum w |r_i - r_j|; p holds the number of atoms, that of pairs, and of each pair i, j and w."""
+    for k in range(3 * int(p[0])):
+        out[1 + k] = 0.0
+    q = 0.0
+    for n in range(int(p[1])):
+        i, j, w = 3 * int(p[2 + 3 * n]), 3 * int(p[3 + 3 * n]), p[4 + 3 * n]
+        x, y, z = r[i] - r[j], r[i + 1] - r[j + 1], r[i + 2] - r[j + 2]
+        d = math.sqrt(x * x + y * y + z * z)
+        q += w * d
+        f = w / d
+        x, y, z = f * x, f * y, f * z
+        out[1 + i], out[2 + i], out[3 + i] = out[1 + i] + x, out[2 + i] + y, out[3 + i] + z
+        out[1 + j], out[2 + j], out[3 + j] = out[1 + j] - x, out[2 + j] - y, out[3 + j] - z
+    out[0] = q
+
+
 def _center_distance(r, p, t, out):
     """|sum w_i r_i|; p holds the number of atoms and the signed weights."""
     n = int(p[0])
@@ -232,6 +249,7 @@ FAMILIES: dict[str, Callable[..., None]] = {
     "Cylinder": _cylinder,
     "Ellipsoid": _ellipsoid,
     "Torus": _torus,
+    "DistanceDifference": _distance_difference,
     "CenterDistance": _center_distance,
     "RadiusOfGyration": _radius_of_gyration,
     "LinearVelocity": _linear_velocity,

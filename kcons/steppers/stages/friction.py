@@ -91,7 +91,8 @@ class Friction:
         angle = 0.5 * self._rate * h
         if not abs(angle) < 0.5 * _MOST:
             raise InputError(
-                f"friction of {self._rate:g} over a time of {h:g} leaves nothing of the velocities; use a shorter step",
+                f"friction leaves nothing of the velocities in a step of {self._rate * h:g} divided by its rate; use a "
+                "shorter step",
                 item="dt",
             )
         return 2.0 * math.sinh(angle) / self._rate if self._rate else h

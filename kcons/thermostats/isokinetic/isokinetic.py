@@ -21,11 +21,13 @@ from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
 from kcons.steppers.stepper import stays
 from kcons.thermostats.freedom import (
+    LOOK_AT,
     Momentum,
     carried,
     freedom,
     may_be,
     refuse_friction,
+    warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
 from kcons.thermostats.isokinetic import kick as closed_form
@@ -95,6 +97,7 @@ class Isokinetic(Splitting):
     UserWarning
         At the start of a run: total momentum is conserved but for a factor exp(U/2K), and not zero; or a temperature is
         asked for and forces exert no torque, so that the same holds of angular momentum. Neither samples a temperature.
+        After 20,000 steps: a temperature is asked for, and no body, which rows tie together, feels another.
 
     Notes
     -----
@@ -274,7 +277,10 @@ class Isokinetic(Splitting):
         still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
         if still is not None:
             return still
-        after = isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
+        begin = self.start(system, state)
+        if begin.step == LOOK_AT and self.thermal_energy is not None and self.atoms is None:
+            warn_of_bodies_apart(system, begin, stacklevel=5)
+        after = isokinetic_step(system, self._share(system), begin, dt, self._operations)
         asked = self.thermal_energy, self.kinetic_energy
         self._left = after.thermostat, *asked, after.velocities, after.positions
         return after

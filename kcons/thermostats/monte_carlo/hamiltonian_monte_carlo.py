@@ -235,7 +235,7 @@ class HamiltonianMonteCarlo(Portable):
         if still is not None:
             return still
         if dt < 0:
-            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+            raise InputError(f"the time step is {system.shown_time(dt)}; noise cannot be taken back", item="dt")
         held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
         held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
         # Positions without forces may be new ones, and what a state carries, or a file, that of other forces or places.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,10 +63,12 @@ class DualAveraging:
         second = self._told[(self.made + 1) // 2 :]
         return sum(second) / len(second)
 
-    def refuse_failure(self) -> None:
-        """Raise `ConvergenceError` where none of the second half of the proposals succeeded."""
+    def refuse_failure(self, shown: Callable[[float], str] = "{:.3g}".format) -> None:
+        """Raise `ConvergenceError` where none of the second half of the proposals succeeded; `shown` tells a time."""
         if not self.acceptance > 0:
-            raise ConvergenceError(f"no proposal succeeded with time steps down to {self.dt:.3g}; is the start sound?")
+            raise ConvergenceError(
+                f"no proposal succeeded with time steps down to {shown(self.dt)}; is the start sound?"
+            )
 
     def learn(self, probability: float) -> None:
         """A proposal with `dt` had this probability of being accepted."""
@@ -148,7 +151,7 @@ def tune(
         before = sum_of(state)
         state = sampler.step(system, state, search.dt)
         search.learn(sum_of(state) - before)
-    search.refuse_failure()
+    search.refuse_failure(system.shown_time)
     assert state.thermostat is not None
     held = np.zeros(SIZE)
     held[POTENTIAL] = state.thermostat[POTENTIAL]

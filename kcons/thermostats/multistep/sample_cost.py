@@ -7,16 +7,15 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import numbers, positive
 from kcons.errors import InputError
-
-#: Fewest values from which correlations are taken.
-FEWEST = 32
+from kcons.thermostats.correlated_series import FEWEST
 
 
 def autocorrelation_time(values: ArrayLike) -> float:
     """Statistical inefficiency 1 + 2 sum rho(k) of a series, in values: so many of them are one independent sample.
 
     The sum goes on as long as sums of two neighbouring correlations are positive and fall (Geyer's initial monotone
-    sequence). 1 for a series that does not change.
+    sequence). 1 for a series that does not change. It tells what a sample costs in a long run; the error of a mean,
+    which also knows of slow parts that noise hides, is that of `mean`.
 
     Raises
     ------

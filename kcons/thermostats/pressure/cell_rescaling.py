@@ -14,6 +14,9 @@ from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.centre_moves import work_of_shapes
 from kcons.thermostats.pressure.pieces import Pieces, lattice_of
 
+#: Standard deviations of the noise of a trial that fit into the largest change of a length, beside its mean of one.
+_WITHIN = 2.0
+
 
 class CellRescaling(Barostat):
     """Stochastic cell rescaling; needs the stress of the forces.
@@ -30,6 +33,8 @@ class CellRescaling(Barostat):
         As for `Barostat`.
     tau : float
         Time in which the volume relaxes. Where `every` steps are no longer short against it, fewer trials are accepted.
+        A trial changes no length by more than 9 %: where noise alone would do so, as of a few pieces, it relaxes
+        more slowly.
     compressibility : float
         beta_T; of water 4.5e-5/bar. A guess will do, it goes into the time of relaxation only.
 
@@ -60,6 +65,7 @@ class CellRescaling(Barostat):
         # What the measure of the states and the changing width of the noise ask for leaves N, not N + 1.
         slope = strains.diagonals @ pieces.moving - enthalpy / thermal_energy
         spread = self.compressibility * thermal_energy / (3 * strains.sizes * volume * self.tau) * self.every * abs(dt)
+        spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)
         wide = np.sqrt(2 * spread)
         # Bounded, so that from far away trials can still be taken back, and be accepted.
         return np.clip(spread * slope, -wide, wide), wide

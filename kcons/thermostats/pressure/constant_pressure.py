@@ -123,7 +123,9 @@ class ConstantPressure(Listed):
 
     def _advanced(self, system: System, state: State, dt: float, steps: int) -> State:
         if dt < 0:
-            raise InputError(f"the time step is {dt}; trials of a barostat cannot be taken back", item="dt")
+            raise InputError(
+                f"the time step is {system.shown_time(dt)}; trials of a barostat cannot be taken back", item="dt"
+            )
         state = self.start(system, state)
         assert isinstance(system, CellSystem)
         march = getattr(self.stepper, "march", None)

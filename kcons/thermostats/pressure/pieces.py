@@ -127,8 +127,8 @@ def find_pieces(
     if not n_atoms:
         raise UnsupportedError("no piece of the system could follow the cell: it has no atoms")
     constraint_set = motion.constraint_set
-    links = [_chained(c.atoms) for c in constraint_set.constraints if c.n_rows and c.width > 1]
-    nearest = [_chained(c.atoms if c.whole is None else c.atoms[~c.whole]) for c in constraint_set.constraints]
+    links = [c.linked.reshape(-1, 2) for c in constraint_set.constraints if c.n_rows and c.width > 1]
+    nearest = [(c.linked if c.whole is None else c.linked[~c.whole]).reshape(-1, 2) for c in constraint_set.constraints]
     if constraint_set.images is not None:
         tree = constraint_set.images
         nearest.append(np.stack([tree.parents, tree.atoms], axis=1))
@@ -205,11 +205,6 @@ def rows_open(motion: Motion, positions: FloatArray, time: float = 0.0) -> NDArr
         scale = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())[:, None]
         opened &= ~placed[:, None] | (change <= 1e-9 * scale)  # NaN: a surface not defined nearby has a place
     return opened
-
-
-def _chained(atoms: IntArray) -> IntArray:
-    """Neighbours in the lists of atoms, shape (n, 2)."""
-    return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
 
 
 def _joined(links: Iterable[IntArray]) -> IntArray:

@@ -100,7 +100,10 @@ def test_unreadable_files_and_unknown_names(tmp_path, capsys):
     (tmp_path / "empty.xyz").touch()
     assert "empty.xyz is empty" in plan(tmp_path / "empty.xyz", capsys=capsys)[2]
     (tmp_path / "run.odd").write_text("nothing")
-    assert "give a file such as PSF" in plan(tmp_path / "run.odd", capsys=capsys)[2]
+    assert (
+        "its name tells no format of a topology that MDAnalysis reads; rename it"
+        in plan(tmp_path / "run.odd", capsys=capsys)[2]
+    )
     assert plan("missing.gro", capsys=capsys)[2] == "kcons: there is no file missing.gro\n"
     assert "there is no test system 'watr'" in plan("watr", capsys=capsys)[2]
     assert "--forces is for files" in plan("ethanol", "--forces", "emt", capsys=capsys)[2]

@@ -1,6 +1,24 @@
 """Mutants of dynamics in ASE."""
 
 MUTANTS = [
+    (
+        "ase/dynamics.py",
+        'step == self.nsteps and np.array_equal(self.atoms.arrays["momenta"], self._momenta)',
+        "step == self.nsteps",
+        "tests/ase/test_logger.py::test_a_thermostat_that_leaves_total_momentum_alone",
+    ),
+    (
+        "thermostats/langevin.py",
+        "if thermostat.friction > 0:",
+        "if thermostat.friction >= 0:",
+        "tests/ase/test_logger.py::test_without_noise_the_log_is_of_the_end[0.0]",
+    ),
+    (
+        "ase/constraints_object.py",
+        "ConstraintsWithFixedAtoms if fixed else Constraints  #",
+        "Constraints  #",
+        "tests/ase/test_ase_objects.py::test_files_of_other_programs_have_the_fixed_atoms",
+    ),
     # -- ASE: what changes between steps --
     (
         "ase/dynamics.py",

@@ -33,6 +33,30 @@ MUTANTS = [
         "tests/mdanalysis/check/files/test_file_precision.py::test_a_wild_molecule_of_the_topology_excuses_no_other",
     ),
     (
+        "mdanalysis/check/files/endings.py",
+        '"GRO": n_atoms + 3,',
+        '"GRO": 2 * n_atoms + 6,',
+        "tests/mdanalysis/check/files/test_endings.py::test_what_lies_behind_the_only_frame_that_is_read",
+    ),
+    (
+        "mdanalysis/check/files/endings.py",
+        "word.isdigit() and int(word) == n_atoms",
+        "word.isdigit()",
+        "tests/mdanalysis/check/files/test_endings.py::test_a_frame_with_another_number_of_atoms",
+    ),
+    (
+        "mdanalysis/check/files/file_precision.py",
+        "_off_grid(x, 10 * step) > error",
+        "_off_grid(x, step) <= error",
+        "tests/mdanalysis/check/files/test_file_precision.py::test_what_is_no_grid",
+    ),
+    (
+        "mdanalysis/check/findings.py",
+        "if rms > found.rounding[unit].max() + tolerance * table.sizes[mine].min():",
+        "if rms > np.inf:",
+        "tests/mdanalysis/check/test_constraint_check.py::test_other_frames_that_are_off_are_not_the_first_alone",
+    ),
+    (
         "mdanalysis/check/frames/row_table.py",
         "np.where(periodic, 1.0, constraint_set.scale)",
         "np.where(periodic, 1.0, 1.0)",
@@ -122,6 +146,24 @@ MUTANTS = [
         '        here, step = ahead, ahead - here\n    return ""',
         "    return _straightened(constraint_set, numbers, *request[1::-1], rows)",
         "tests/motion/test_failures.py::test_a_dihedral_that_is_passed_in_small_parts_is_not_named",
+    ),
+    (
+        "constraints/periodic/images.py",
+        "| (not self._in_line)",
+        "",
+        "tests/constraints/test_distance_difference.py::test_each_pair_takes_its_shortest_image",
+    ),
+    (
+        "constraints/periodic/images.py",
+        "if self.item.links is None and 2 < self.item.width",
+        "if 2 < self.item.width",
+        "tests/constraints/test_distance_difference.py::test_pairs_of_a_row_need_not_be_near_each_other",
+    ),
+    (
+        "motion/restoring/kept_geometry.py",
+        "for leg in ((i, k), (k, i))",
+        "for leg in ()",
+        "tests/constraints/test_distance_difference.py::test_a_proton_goes_over_within_a_molecule_that_stays_as_it_is",
     ),
     (
         "constraints/periodic/images.py",

@@ -177,6 +177,37 @@ MUTANTS = [
         "tests/steppers/test_state.py::test_another_system_begins_a_thermostat_anew",
     ),
     (
+        "thermostats/correlated_series.py",
+        "more = [], [], np.expm1(_LOG_R)",
+        "more = [], [], 0.0 * _LOG_R",
+        "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[memory-3]",
+    ),
+    (
+        "thermostats/correlated_series.py",
+        "_ALIKE * float(blocks @ blocks)",
+        "float(blocks @ blocks)",
+        "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[smooth]",
+    ),
+    (
+        "thermostats/correlated_series.py",
+        "if carriers < FEW_INDEPENDENT else",
+        "if False else",
+        "tests/thermostats/test_correlated_series.py::test_heavy_tails_are_said",
+    ),
+    (
+        "thermostats/freedom.py",
+        "for k in range(1, NEARER + 1)",
+        "for k in range(1, 2)",
+        "tests/thermostats/test_freedom.py::test_bodies_that_feel_another_are_not[gas]",
+    ),
+    (
+        "thermostats/pressure/cell_rescaling.py",
+        "spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)",
+        "pass",
+        "tests/thermostats/pressure/test_cell_rescaling.py::test_noise_of_few_pieces_stays_within_what_a_trial_may_change"
+        "[anisotropic]",
+    ),
+    (
         "thermostats/temperature_split.py",
         "if not np.all(miss <= OFF):",
         "if False:",

@@ -104,6 +104,22 @@ def test_bands_over_many_sets_of_noise(name, n, error):
     assert 0.89 < (np.abs(away) < 1.96).mean() < 0.98
 
 
+@pytest.mark.parametrize(
+    ("seeds", "low", "high"),
+    [(range(6), 0.7, 1.3), pytest.param(range(40), 0.9, 1.15, marks=pytest.mark.validation)],
+    ids=["few", "many"],
+)
+def test_the_band_of_a_torsion_of_few_windows(seeds, low, high):
+    """Twelve windows, four for each wave of the fastest part: the band was 1.8 times what profiles are off by."""
+    case, found = CASES["torsion"], []
+    for seed in seeds:
+        profile = made(case, 12, 1.0, seed, zero=case.grid(12)[3])
+        away = profile.F - (case.F(profile.x) - case.F(profile.zero))
+        found.append((away[20:200:20] ** 2, profile.error[20:200:20] ** 2))
+    square, said = np.mean(found, axis=(0, 2))
+    assert low <= math.sqrt(square / said) <= high
+
+
 @pytest.mark.parametrize("name", ["Lennard-Jones", "torsion"])
 def test_splines_are_of_fourth_order(name):
     case, errors = CASES[name], []

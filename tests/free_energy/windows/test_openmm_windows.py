@@ -10,7 +10,7 @@ import pytest
 from openmm import app
 from openmm_systems import DATA
 
-from kcons.constraints import Angle, Dihedral, Distance, Formula, Plane
+from kcons.constraints import Angle, Dihedral, Distance, DistanceDifference, Formula, Plane
 from kcons.errors import InputError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import OpenMMWindows, Series, Settings, Window
 
@@ -50,13 +50,14 @@ def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
     [
         (Distance([[4, 14]]), 0.26),
         (Angle([[6, 8, 14]]), 2.0),
+        (DistanceDifference([[4, 14], [16, 6]]), -0.016),
         (Formula("sqrt((x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2)", [[4, 14]]), 0.26),
     ],
-    ids=["distance", "angle", "formula"],
+    ids=["distance", "angle", "difference", "formula"],
 )
 def test_other_coordinates(tmp_path, coordinate, target):
     windows = sampler({"q": coordinate})
-    assert windows.scales.tolist() == ([10.0] if isinstance(coordinate, Distance) else [1.0])
+    assert windows.scales.tolist() == ([1.0] if isinstance(coordinate, Angle | Formula) else [10.0])
     settings = Settings(relax=5, pull=20, equilibration=10, production=32, every=1)
     windows.sample(Window(0, "down", (target + 0.02,), (target,), 7), settings, tmp_path / "window.npz")
     series = Series.load(tmp_path / "window.npz")
@@ -64,7 +65,7 @@ def test_other_coordinates(tmp_path, coordinate, target):
 
 
 def test_coordinates_that_cannot_be_held():
-    with pytest.raises(UnsupportedError, match=r"p is <Plane.*Distance, an Angle, a Dihedral or a Formula"):
+    with pytest.raises(UnsupportedError, match=r"p is <Plane.*Distance, .*a Dihedral or a Formula"):
         sampler({"p": Plane([0], (0, 0, 1))})
     with pytest.raises(UnsupportedError, match=r"r is .*one row"):
         sampler({"r": Distance([[0, 1], [1, 2]])})

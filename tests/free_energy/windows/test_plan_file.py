@@ -188,6 +188,19 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
             '[[coordinate]]\nname = "turn"\nangle = [2, 0, 1]\nvalues = [100.0]\n[workers]',
             "two coordinates",
         ),
+        ("windows = 12", "windows = 2000000000", "the plan has 2,000,000,000 windows; give at most 100,000"),
+        ("windows = 12", f"windows = 1{'0' * 400}", "windows of .coordinate. is 1000.*; give a whole number above 0"),
+        (
+            "[workers]",
+            "".join(f"[[coordinate]]\ndistance = [0, {k}]\nfrom=1\nto=2\nwindows=90000\n" for k in range(1, 5))
+            + "[workers]",
+            "the plan has 787,320,000,000,000,000,000 windows",
+        ),
+        ("to = 180", f"to = 1{'0' * 400}", r"to of \[coordinate\] is 10{10,30}\.\.\.0+; give a number"),
+        ("timestep = 0.5", f"timestep = 1{'0' * 400}", "give a positive number"),
+        ("timestep = 0.5", f"timestep.{'.'.join('a' * 3000)} = 0.5", r"timestep of \[sampling\] is .*give one value"),
+        ("[workers]", f"a = {'[' * 5000}{']' * 5000}\n[workers]", "lists or tables are too deep in each other"),
+        ("[workers]", f"a = {'{b = ' * 5000}1{'}' * 5000}\n[workers]", "lists or tables are too deep in each other"),
     ],
 )
 def test_wrong_plans(folder, old, new, match):

@@ -35,7 +35,7 @@ def conclusion(off, *, tolerance=0.0, broken=None, worst=1, rank=2, found_at_sta
         table.look(part.found, k, x[k].ravel(), None, None, part.times[k])
     table.collect(part.found)
     asked = Asked(("run", "top"), AtomNames(files.universe(1)), "given", "as given", None, worst, ["said before"])
-    return concluded(part, rows, asked, Reading(PRECISION, None, None, 2), rank, np.ones(3), 9)
+    return concluded(part, rows, asked, Reading(PRECISION, None, None), rank, np.ones(3), 9)
 
 
 def test_kept_tolerated_and_violated():

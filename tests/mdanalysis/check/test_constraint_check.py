@@ -7,7 +7,7 @@ import pytest
 import water_files as files
 from water_files import mda
 
-from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, LinearRelation
+from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, DistanceDifference, LinearRelation
 from kcons.errors import InputError
 from kcons.mdanalysis import ConstraintCheck, constraints_of, load_trajectory
 
@@ -214,6 +214,7 @@ def test_rows_of_all_kinds(water):
         Distance(files.pairs(N), files.targets(N)),
         Dihedral([[1, 0, near_by, near_by + 1]]),
         CenterOfMass([0, 1, 2]),
+        DistanceDifference([[0, near_by], [1, near_by + 1]]),
     ]
     result = checked(water["dcd"], rows, worst=500)
     found = {row.row: row for row in result.worst}
@@ -224,8 +225,11 @@ def test_rows_of_all_kinds(water):
     for axis in range(3):
         expected = np.abs(middle[:, axis]).max()
         assert found[N + axis].largest == pytest.approx(expected, abs=2e-6)
+    apart = [np.linalg.norm(near(x[:, near_by + k] - x[:, k]), axis=1) for k in (0, 1)]
+    expected = np.abs(apart[0] - apart[1] - (apart[0] - apart[1])[0]).max()
+    assert found[4 * N + 7].largest == pytest.approx(expected, abs=2e-6) and expected > 0.01
     kinds = {unit.unit: unit.n_rows for unit in result.units}
-    assert kinds == {"Å": 3 * N + 6, "rad": N + 1}
+    assert kinds == {"Å": 3 * N + 7, "rad": N + 1}
     assert set(result.series) >= {"largest Å", "largest rad", "rms Å", "rms rad"}
 
 
@@ -344,3 +348,33 @@ def test_cells_that_are_none_and_cells_that_end(tmp_path, ending):
     result = checked(path, rows)
     assert result.status == "violated" and result.first_violated_frame == 4
     assert any(f"2 of 6 frames of {path} have no cell" in remark for remark in result.remarks), result.remarks
+
+
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr"])
+@pytest.mark.parametrize("targets", ["given", "first", "mean"])
+def test_a_first_frame_that_alone_is_off_is_told_in_a_line(tmp_path, ending, targets):
+    """As of LAMMPS, which writes the first frame before it holds the constraints; a verdict it is all the same."""
+    x = files.whole(files.water(N, 12, seed=3))
+    x[0] += np.random.default_rng(1).normal(0, 0.02 if ending == "xtc" else 2e-3, x[0].shape)
+    path = files.write(tmp_path / f"a.{ending}", x, side=None)
+    rows = Distance(files.pairs(N), files.targets(N))
+    result = checked(path, rows, targets=targets)
+    told = [remark for remark in result.remarks if remark.startswith("the first frame alone differs")]
+    assert result.status == "violated"
+    # The mean of all has a part of the first in it.
+    assert len(told) == 1 or targets == "mean"
+    assert all("begin at frame 1 (--frames 1:)" in remark for remark in told)
+    assert ("agree to" in "".join(told)) == (targets == "first")
+    later = checked(path, rows, targets=targets, run={"start": 1})
+    assert later.status in ("kept", "tolerated") and not any("alone" in remark for remark in later.remarks)
+
+
+@pytest.mark.parametrize("targets", ["given", "first"])
+@pytest.mark.parametrize("wrong", [[5], [0, 5], [3, 4, 5, 6, 7, 8, 9, 10, 11], list(range(1, 12)), list(range(12))])
+def test_other_frames_that_are_off_are_not_the_first_alone(tmp_path, targets, wrong):
+    """Random errors of other frames, also where it is all of them."""
+    x = files.whole(files.water(N, 12, seed=3))
+    x[wrong] += np.random.default_rng(1).normal(0, 2e-3, x[wrong].shape)
+    path = files.write(tmp_path / "a.dcd", x, side=None)
+    result = checked(path, Distance(files.pairs(N), files.targets(N)), targets=targets)
+    assert result.status == "violated" and not any("alone" in remark for remark in result.remarks)

@@ -15,6 +15,7 @@ from kcons.mdanalysis import load_trajectory
 from kcons.mdanalysis.check.files.file_precision import FilePrecision
 from kcons.mdanalysis.check.frames.row_table import RowTable
 from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remarks_on
+from kcons.mdanalysis.check.result import Break
 
 N, FRAMES = 6, 7
 PRECISION = FilePrecision("DCD")
@@ -34,7 +35,7 @@ def table(x):
 
 
 def read(trajectory, numbers, x, **options):
-    reading = Reading(PRECISION, None, None, options.pop("intact", FRAMES))
+    reading = Reading(PRECISION, None, None, **options)
     with ProgressBar(total=len(numbers), verbose=False) as bar:
         return reading.read(trajectory, np.array(numbers), table(x), True, bar)
 
@@ -61,14 +62,14 @@ def test_reading_stops_at_a_break(tmp_path, recwarn):
         assert part.frames.tolist() == [0, 1, 2, 3] and len(part.times) == part.found.by_frame.shape[2] == 4
         assert part.broken.frame == 4 and not part.broken.ends
         assert "position of atom 5" in part.broken.reason
-    part = read(opened(tmp_path / "b.trr", x), range(FRAMES), x[0], intact=2)
+    part = read(opened(tmp_path / "b.trr", x), range(FRAMES), x[0], damage=Break(2, "a line is missing"))
     assert part.frames.tolist() == [0, 1] and part.broken.ends
 
 
 def test_precision_of_frames():
     other = FilePrecision("XTC", 0.01, exact=True)
-    assert Reading(PRECISION, None, None, 2).precision_at(1) is PRECISION
-    assert Reading(PRECISION, [PRECISION, other], None, 2).precision_at(1) is other
+    assert Reading(PRECISION, None, None).precision_at(1) is PRECISION
+    assert Reading(PRECISION, [PRECISION, other], None).precision_at(1) is other
 
 
 def test_reasons_of_a_break():

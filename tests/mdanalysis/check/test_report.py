@@ -96,3 +96,20 @@ def test_plot_of_one_frame_and_of_nothing_wrong(folder, tmp_path):
     assert max(result.series["largest Å"]) < 1e-12 and result.status == "incomplete"
     report.plot(result, tmp_path / "p.png")
     assert (tmp_path / "p.png").stat().st_size > 5000
+
+
+def test_a_full_disk_leaves_nothing_that_blocks_the_folder(folder, tmp_path):
+    """Files may grow to some bytes only, as on a disk that is full."""
+    resource = pytest.importorskip("resource")
+    result = check_trajectory(folder / "good.xtc", folder / "t.gro", "none", rank=False)
+    report.plot(result, tmp_path / "drawn.png")  # with all that has to be imported or kept
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for write in (report.write, lambda _, out: report.write_failure(folder / "good.xtc", "no" * 200, out)):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
+        try:
+            with pytest.raises(OSError):
+                write(result, tmp_path / "out")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert not list((tmp_path / "out").iterdir())
+    assert len(report.write(result, tmp_path / "out")) == 2

@@ -308,6 +308,7 @@ def test_kinetic_energy_is_constant():
 
 
 @pytest.mark.validation
+@pytest.mark.filterwarnings("ignore:no atom or body")
 def test_kinetic_energy_is_constant_over_a_million_steps():
     assert constancy(1_000_000, 1000) <= 1e-13
 

@@ -10,6 +10,7 @@ from pressure_systems import METHANE, cells_of, gas, no_force, p_value, round_sh
 from scipy import stats
 
 from kcons.errors import InputError
+from kcons.thermostats import mean
 from kcons.thermostats.langevin import wound
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
 from kcons.thermostats.pressure.barostat import Place
@@ -125,6 +126,20 @@ def test_volumes_of_other_kinds(kind):
     barostat = CellRescaling(pressure, 8.0, 1 / pressure, every=1, seed=2, kind=kind)
     volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 1200))
     assert p_value(volumes, stats.gamma(n + 1, scale=1 / pressure)) > 0.01
+
+
+@pytest.mark.parametrize("kind", ["isotropic", "anisotropic", "flexible"])
+def test_noise_of_few_pieces_stays_within_what_a_trial_may_change(kind):
+    """Three pieces would change lengths by far more than 9 % in a trial, and all were rejected."""
+    n, side = 3, 12.0
+    system, x = gas(n=n, side=side, force=no_force, potential=round_shape, stress=round_stress)
+    pressure = (n + 1) / side**3
+    barostat = CellRescaling(pressure, 0.05, 1 / pressure, every=1, seed=2, kind=kind)
+    state = started(system, x, barostat)
+    volumes = np.linalg.det(cells_of(system, state, barostat, 3000))
+    found = mean(volumes)
+    assert len(np.unique(volumes)) > 0.6 * len(volumes)
+    assert abs(found.off((n + 1) / pressure)) < 3.5 and found.error < 0.2 * side**3
 
 
 def test_far_from_the_pressure_it_goes_there():

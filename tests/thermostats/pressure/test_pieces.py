@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pressure_systems import METHANE, gas, placed
 
-from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, Plane, Sphere
+from kcons.constraints import Angle, CenterOfMass, Distance, DistanceDifference, FixedAtoms, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion
@@ -69,6 +69,15 @@ def test_rows_tie_whatever_they_are():
     x = placed(METHANE, 2, 12.0, 3)
     system = system_of([Angle([[1, 0, 2]]), Distance([[4, 5]])], x)
     assert len(find_pieces(system, x, ALL)) == 10 - 2 - 1
+
+
+def test_lengths_of_a_difference_tie_their_own_atoms():
+    """Two bonds whose lengths alone are compared move apart."""
+    x = placed(METHANE, 2, 12.0, 3)
+    label = find_pieces(system_of(DistanceDifference([[0, 1], [5, 6]]), x), x, ALL).label
+    assert label[0] == label[1] != label[5] == label[6]
+    assert len(set(label.tolist())) == 8
+    assert len(find_pieces(system_of(DistanceDifference([[0, 1], [1, 5]]), x), x, ALL)) == 8
 
 
 def test_planes_are_open_in_the_plane():

@@ -1,13 +1,16 @@
-"""Where a trajectory ends: whole frames, and what was cut off behind them.
+"""Where a trajectory ends: whole frames, and what lies behind them.
 
 MDAnalysis does not tell: it counts the whole frames of DCD and of text formats, and those of XTC and TRR up to the
-first that it does not recognise.
+first that it does not recognise. Of formats of structures, such as GRO, it reads one frame.
 """
 
 from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,30 @@ from MDAnalysis.lib.util import anyopen
 
 from kcons.mdanalysis.check.files.file_precision import XTC_MAGIC
 from kcons.mdanalysis.check.result import Break
+from kcons.mdanalysis.loading import format_of
+
+
+def ending_of(reader: Any) -> Break | None:
+    """`leftover` of the file of a reader, or of the first file of a chain that has one."""
+    return _first(reader, lambda r, path: leftover(path, format_of(r), r.n_frames, r.n_atoms, _offset(r)))
+
+
+def damage_of(reader: Any) -> Break | None:
+    """`damage` of the file of a reader, or of the first file of a chain that has one."""
+    return _first(reader, lambda r, path: damage(path, format_of(r), r.n_frames, r.n_atoms))
+
+
+def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:
+    """What is found first; in a chain of files, frames are counted from its beginning."""
+    parts, begin = getattr(reader, "readers", None) or [reader], 0
+    for part in parts:
+        path = str(getattr(part, "filename", None) or "")
+        found = look(part, path) if os.path.isfile(path) else None
+        if found is not None:
+            where = f"{path}: " if len(parts) > 1 else ""
+            return replace(found, frame=begin + found.frame, reason=where + found.reason)
+        begin += part.n_frames
+    return None
 
 
 def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, last_offset: int | None) -> Break | None:
@@ -42,9 +69,14 @@ def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, la
             end = last_offset + _xtc_frame_size(path, last_offset)
         elif file_format == "TRR" and last_offset is not None:
             end = last_offset + _trr_frame_size(path, last_offset)
+        elif more := _behind_the_only_frame(path, file_format, n_atoms):
+            return Break(
+                1,
+                f"MDAnalysis reads one frame of {file_format} files, and {more}; write the frames as XTC, DCD or PDB",
+                ends=False,
+            )
         else:
-            whole, more = _lines(path, file_format, n_atoms)
-            return None if more <= 0 or whole is None else Break(whole, f"{more} lines follow the last whole frame")
+            return None
     except (OSError, EOFError, struct.error) as error:
         return Break(n_frames, f"its frames cannot be followed ({error})")
     if end < size:
@@ -54,81 +86,125 @@ def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, la
     return None
 
 
-def intact_frames(path: str | Path, file_format: str, n_frames: int, n_atoms: int) -> int:
-    """Frames of a DCD file up to the first whose records are not where they must be; frames of a text file whose lines
-    are all there, to their ends; all frames of other formats.
+def damage(path: str | Path, file_format: str, n_frames: int, n_atoms: int) -> Break | None:
+    """The first frame of a DCD file whose records are not where they must be; of a text file the first whose lines are
+    not all there, to their ends, or that has another number of atoms. None where there is no such frame, and for other
+    formats.
 
     The reader does not look: it takes what it finds for coordinates.
     """
-    if not os.path.isfile(path):
-        return n_frames
     if file_format != "DCD":
         try:
-            whole = _lines(path, file_format, n_atoms)[0]
+            return _text_break(path, file_format, n_atoms)
         except (OSError, EOFError):
-            return n_frames
-        return n_frames if whole is None else min(n_frames, whole)
+            return None
     try:
         order, ends, opening = _dcd_records(path, n_frames)
     except struct.error:
-        return n_frames
+        return None
     if len(ends) < 2:
-        return n_frames
+        return None
     size = ends[1] - ends[0]
     with open(path, "rb") as file:
         for k in range(1, n_frames):
             file.seek(ends[0] + (k - 1) * size)
             word = file.read(4)
             if len(word) < 4 or struct.unpack(order + "i", word)[0] != opening:
-                return k
-    return n_frames
+                return Break(k, "its records are damaged")
+    return None
 
 
-def _lines(path: str | Path, file_format: str, n_atoms: int) -> tuple[int | None, int]:
-    """Whole frames of a text format whose frames have equal numbers of lines, and lines that follow them.
+def _behind_the_only_frame(path: str | Path, file_format: str, n_atoms: int) -> str:
+    """What lies behind the frame of a format of which MDAnalysis reads one; '' if nothing does."""
+    if file_format == "CIF":
+        import gemmi
 
-    None for other formats; of PDB, whose frames may differ, only a last line without an end is seen.
+        of_atoms = [block.find_values("_atom_site.pdbx_PDB_model_num") for block in gemmi.cif.read(str(path))]
+        models = sum(len(set(numbers)) for numbers in of_atoms)
+        return f"this one has {models}" if models > 1 else ""
+    if file_format == "COOR":
+        more = os.path.getsize(path) - 4 - 24 * n_atoms
+        return f"{more} bytes follow it" if more > 0 else ""
+    if file_format not in ("GRO", "INPCRD", "CONFIG", "PQR", "PDBQT"):
+        return ""
+    lines = atoms = models = 0
+    with anyopen(str(path), "rb") as file:
+        for number, line in enumerate(file, 1):
+            lines = number if line.strip() else lines
+            atoms += line.startswith((b"ATOM", b"HETATM"))
+            models += line.startswith(b"MODEL")
+    if file_format in ("PQR", "PDBQT"):
+        if models > 1:
+            return f"this one has {models}"
+        return f"{atoms - n_atoms} atoms follow it" if atoms > n_atoms else ""
+    # At most: title, number of atoms and a cell; of INPCRD two atoms a line, with velocities.
+    most = {"GRO": n_atoms + 3, "INPCRD": 3 + 2 * ((n_atoms + 1) // 2)}.get(file_format)
+    if most is None:
+        most = 5 + n_atoms * (2 + int(_line(path, 1).split()[0]))
+    return f"{lines - most} lines follow it" if lines > most else ""
+
+
+def _text_break(path: str | Path, file_format: str, n_atoms: int) -> Break | None:
+    """Where the whole frames of a text format end whose frames have equal numbers of lines; None for other formats.
+
+    Of PDB, whose frames may differ, only a last line without an end is seen.
     """
-    if file_format not in ("XYZ", "LAMMPSDUMP", "TXYZ", "TRJ", "PDB"):
-        return None, 0
-    frames, lines, blank, second, models = 0, 0, 0, b"", 0
-    line = b""
+    if file_format == "PDB":
+        return _pdb_break(path)
+    if file_format not in ("XYZ", "LAMMPSDUMP", "TXYZ", "TRJ"):
+        return None
+    # Lines of a title; those of a frame besides its atoms, and which of them says how many atoms there are.
+    title, more, count = {"XYZ": (0, 2, 0), "LAMMPSDUMP": (0, 9, 3), "TXYZ": (0, 1, 0), "TRJ": (1, 0, -1)}[file_format]
+    per_frame = n_atoms + more
+    if file_format == "TRJ":
+        # Ten numbers a line; a line of three for the cell may follow.
+        per_frame = -(-3 * n_atoms // 10)
+        per_frame += _all_numbers(_line(path, 1 + per_frame), 3)
+    elif file_format == "TXYZ":
+        # Six numbers of the cell may follow the number of atoms.
+        per_frame += _all_numbers(_line(path, 1), 6)
+    lines, blank, line, wrong = -title, 0, b"", None
     with anyopen(str(path), "rb") as file:
         for line in file:
-            lines += 1
             blank = 0 if line.strip() else blank + 1
-            second = line if lines == 2 else second
+            if count >= 0 and lines % per_frame == count and wrong is None and line.endswith(b"\n"):
+                word = next(iter(line.split()), b"")
+                if not (word.isdigit() and int(word) == n_atoms):
+                    wrong = lines // per_frame, line
+            # Empty lines at the end are no frame.
+            if wrong is not None and not blank:
+                said = wrong[1].decode(errors="replace").strip()
+                return Break(
+                    wrong[0], f"it has {said!r:.40} where its number of atoms has to be, {n_atoms}", ends=False
+                )
+            lines += 1
+    lines -= blank
+    whole = (lines - (not line.endswith(b"\n"))) // per_frame
+    more = lines - whole * per_frame
+    return Break(whole, f"{more} lines follow the last whole frame") if more > 0 else None
+
+
+def _pdb_break(path: str | Path) -> Break | None:
+    models, line = 0, b""
+    with anyopen(str(path), "rb") as file:
+        for line in file:
             models += line.startswith(b"MODEL")
-    ended = line.endswith(b"\n")
-    if file_format == "PDB":
-        return (max(models, 1) - 1, 1) if line.startswith((b"ATOM", b"HETATM")) and not ended else (None, 0)
-    head = 0
-    if file_format == "TRJ":
-        # Ten numbers a line, below a title; a line of three for the cell may follow.
-        head, per_frame = 1, -(-3 * n_atoms // 10)
-        per_frame += _trj_has_cell(path, per_frame)
-    elif file_format == "TXYZ":
-        # The number of atoms; six numbers of the cell may follow.
-        per_frame = n_atoms + 1 + _all_numbers(second, 6)
-    else:
-        per_frame = n_atoms + (2 if file_format == "XYZ" else 9)
-    lines -= blank + head
-    frames = (lines - (not ended)) // per_frame
-    return frames, lines - frames * per_frame
+    if line.startswith((b"ATOM", b"HETATM")) and not line.endswith(b"\n"):
+        return Break(max(models, 1) - 1, "its last line has no end")
+    return None
+
+
+def _line(path: str | Path, number: int) -> bytes:
+    """A line of a text file, counted from 0; b'' behind its end."""
+    with anyopen(str(path), "rb") as file:
+        found: bytes = next(islice(file, number, None), b"")
+    return found
 
 
 def _all_numbers(line: bytes, n: int) -> bool:
     """Whether a line consists of n numbers with points."""
     words = line.split()
     return len(words) == n and all(b"." in word for word in words)
-
-
-def _trj_has_cell(path: str | Path, per_frame: int) -> bool:
-    with anyopen(str(path), "rb") as file:
-        for number, line in enumerate(file):
-            if number == 1 + per_frame:
-                return _all_numbers(line, 3)
-    return False
 
 
 def _dcd_announced(path: str | Path) -> int:
@@ -208,7 +284,7 @@ def _trr_frame_size(path: str | Path, offset: int) -> int:
     return int(begin + 52 + (16 if double else 8) + sum(blocks))
 
 
-def last_offset(reader: Any) -> int | None:
+def _offset(reader: Any) -> int | None:
     """Where the last frame of an XTC or TRR file begins."""
     offsets = getattr(getattr(reader, "_xdr", None), "offsets", None)
     return int(offsets[-1]) if offsets is not None and len(np.atleast_1d(offsets)) else None

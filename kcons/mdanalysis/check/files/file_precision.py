@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from MDAnalysis.lib.util import anyopen, guess_format
+from MDAnalysis.lib.util import anyopen
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.mdanalysis.loading import format_of
+from kcons.mdanalysis.loading import format_named, format_of
 
 #: Formats whose numbers are floats in nanometres, which MDAnalysis turns into angstrom, in single precision again.
 _NANOMETRES = {"TRR", "H5MD", "TNG"}
@@ -29,6 +29,10 @@ _DECIMALS = {"PDB": 3, "ENT": 3, "PDBQT": 3, "XPDB": 3, "PQR": 3, "TRJ": 3, "MDC
 XTC_MAGIC = (1995, 2023)
 #: Atoms of a text file whose numbers are looked at.
 MOST_READ = 1000
+#: Steps, in angstrom, that coordinates may have had before they came into a file of floats.
+GRIDS = (0.1, 0.01, 0.001, 0.0001)
+#: Logarithm of the chance, at most, that numbers which were not rounded lie on such a grid.
+BY_CHANCE = -30.0
 #: Half the distance of neighbouring single precision numbers is at most this part of the power of two below them.
 HALF_UNIT = 2.0**-24
 
@@ -185,17 +189,10 @@ def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision
     changed = bool(getattr(reader, "transformations", ()))
     if name == "MEMORY":
         # Read from a file at once; what was done to the coordinates since is not known.
-        name, changed = _format_named(path), True
+        name, changed = format_named(path), True
     found = precision_of(path, name, step)
     # What a transformation did to the coordinates no longer lies on the grid of the file.
     return replace(found, exact=False) if changed else found
-
-
-def _format_named(path: str) -> str:
-    try:
-        return str(guess_format(path))
-    except ValueError:
-        return "MEMORY"
 
 
 def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:
@@ -239,6 +236,28 @@ def _xtc_precision(file: BinaryIO, offset: int = 0) -> float:
     if magic not in XTC_MAGIC or not 1 <= precision < 1e8:
         return 1000.0
     return float(precision)
+
+
+def grid_of(coordinates: ArrayLike) -> float:
+    """Step of the decimal grid that single precision numbers lie on, as after a conversion from XTC or text.
+
+    All must lie on it, as far as their precision tells, and most not on one that is ten times as coarse: coordinates
+    that were rounded end in any digit, those that a person wrote do not. 0 where there is no such grid.
+    """
+    x = np.abs(np.asarray(coordinates, dtype=np.float64).ravel())
+    x = x[x > 0]
+    # Of integers of XTC through nanometres to angstrom, and of one format to the next: a rounding each.
+    error = 8 * HALF_UNIT * np.ldexp(1.0, np.frexp(x)[1] - 1)
+    for step in GRIDS:
+        if (_off_grid(x, step) <= error).all():
+            rounded = (_off_grid(x, 10 * step) > error).mean() > 0.5 if len(x) else False
+            return step if rounded and np.log(2 * error / step).sum() < BY_CHANCE else 0.0
+    return 0.0
+
+
+def _off_grid(x: FloatArray, step: float) -> FloatArray:
+    result: FloatArray = np.abs(x - np.rint(x / step) * step)
+    return result
 
 
 def _third_line(path: str | Path) -> str:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ class TargetFile:
         try:
             text = self.path.read_text(encoding="utf-8")
             data = json.loads(text) if self.path.suffix.lower() == ".json" else tomllib.loads(text)
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, RecursionError) as error:
             raise InputError(f"{path}: no readable TOML or JSON ({error})", item="targets") from None
         self.rules = self._rules(data)
 
@@ -129,7 +130,7 @@ class TargetFile:
         if not isinstance(patterns, list) or len(patterns) != width or not all(isinstance(p, str) for p in patterns):
             raise InputError(f"{where}: {by[0]} must be {width} names, not {patterns!r}", item=by[0])
         value = entry["value"]
-        top = 180.0 if kind == "angle" else math.inf
+        top = 180.0 if kind == "angle" else sys.float_info.max
         if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < top:
             what = "an angle between 0 and 180 degrees" if kind == "angle" else "a positive length"
             raise InputError(f"{where}: value is {value!r}; give {what}", item="value")

@@ -9,7 +9,7 @@ import water_files as files
 from water_files import mda
 
 from kcons.constraints import Distance
-from kcons.errors import UnreadableError
+from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis import ConstraintCheck, load_trajectory
 
 N = 30
@@ -162,4 +162,187 @@ def test_nan_coordinates_end_what_can_be_read(tmp_path, x):
     assert result.status == "incomplete" and "frame 5 cannot be used, nor what follows: position" in result.verdict
 
 
-# -- parameter files --------------------------------------------------------------------------------
+# -- formats of structures --------------------------------------------------------------------------
+
+
+def gro(x):
+    lines = [f"    1SOL     OW{k + 1:5d}{r[0]:8.3f}{r[1]:8.3f}{r[2]:8.3f}" for k, r in enumerate(0.1 * x)]
+    return "\n".join(["water", str(len(x)), *lines, "   1.20000   1.20000   1.20000", ""])
+
+
+def gro_with_velocities(x):
+    return gro(x).replace("\n   1.2", "  0.1000  0.2000  0.3000\n   1.2")
+
+
+def inpcrd(x):
+    words = [f"{value:12.7f}" for value in x.ravel()]
+    return "\n".join([" ", str(len(x)), *("".join(words[k : k + 6]) for k in range(0, len(words), 6)), ""])
+
+
+def inpcrd_with_velocities(x):
+    return inpcrd(np.concatenate([x, x])).replace(f"\n{2 * len(x)}\n", f"\n{len(x)}\n") + 6 * "  12.0000000" + "\n"
+
+
+def config(x):
+    return "water\n 0 0 0\n" + "".join(f"O {k}\n {r[0]:f} {r[1]:f} {r[2]:f}\n" for k, r in enumerate(x)) + "\n"
+
+
+def pdbqt(x):
+    lines = [f"ATOM  {k + 1:5d}  OW  SOL     1    {r[0]:8.3f}{r[1]:8.3f}{r[2]:8.3f}" for k, r in enumerate(x)]
+    return "\n".join([*lines, "END", ""])
+
+
+def coor(x):
+    return struct.pack("=i", len(x)) + x.astype("=f8").tobytes()
+
+
+def cif(x, model=1):
+    pytest.importorskip("gemmi")
+    names = "group_PDB id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id label_entity_id "
+    names += "label_seq_id Cartn_x Cartn_y Cartn_z occupancy B_iso_or_equiv auth_seq_id auth_asym_id pdbx_PDB_model_num"
+    head = "data_water\nloop_\n" + "".join(f"_atom_site.{name}\n" for name in names.split()) if model == 1 else ""
+    return head + "".join(
+        f"ATOM {k + 1} O OW . SOL A 1 1 {r[0]:.3f} {r[1]:.3f} {r[2]:.3f} 1 0 1 A {model}\n" for k, r in enumerate(x)
+    )
+
+
+#: Writers of one frame in formats of which MDAnalysis reads one, and what is said of two.
+STRUCTURES = {
+    "gro": (gro, "93 lines"),
+    "velocities.gro": (gro_with_velocities, "93 lines"),
+    "inpcrd": (inpcrd, "lines follow"),
+    "velocities.inpcrd": (inpcrd_with_velocities, "lines follow"),
+    "config": (config, "lines follow"),
+    "pdbqt": (pdbqt, "90 atoms follow"),
+    "coor": (coor, "2164 bytes"),
+    "cif": (cif, "this one has 2"),
+}
+#: Of others: two frames are as many atoms, or there is one frame by definition.
+ALL_ATOMS = {"CRD", "PQR", "FHIAIMS", "IN"}
+ONE_BY_DEFINITION = {"DATA", "DMS", "MMTF", "TPR", "OPENMMAPP", "OPENMMSIMULATION", "PARMED"}
+#: Other names of formats above.
+SAME = {"NAMDBIN", "RESTRT", "MMCIF", "CIF.GZ", "MMCIF.GZ"}
+
+
+def test_every_format_of_structures_is_known():
+    """A reader that MDAnalysis gets must find its place here, and in the check."""
+    from MDAnalysis.coordinates.base import SingleFrameReaderBase
+
+    known = {name.rpartition(".")[2].upper() for name in STRUCTURES} | ALL_ATOMS | ONE_BY_DEFINITION | SAME
+    found = {
+        name
+        for name, reader in mda._READERS.items()
+        if isinstance(reader, type) and issubclass(reader, SingleFrameReaderBase)
+    }
+    assert len(found) > 10 and found <= known
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_what_lies_behind_the_only_frame_that_is_read(tmp_path, x, name):
+    """The second frame is off by 0.3 Å: not looked at, it makes the check incomplete, unless it is not asked for."""
+    write, words = STRUCTURES[name]
+    one, other = files.whole(x)[:2]
+    other[4] += 0.3
+    path = tmp_path / f"w.{name}"
+    frames = [write(one), write(other, 2) if name == "cif" else write(other)]
+    data = [frame if isinstance(frame, bytes) else frame.encode() for frame in frames]
+    path.write_bytes(data[0])
+    assert checked(path).status == "kept"
+    path.write_bytes(data[0] + data[1])
+    result = checked(path)
+    assert result.status == "incomplete" and result.broken.frame == 1
+    assert "MDAnalysis reads one frame of" in result.verdict and words in result.verdict
+    assert "ends too early" not in result.verdict and "write the frames as XTC, DCD or PDB" in result.gaps[0]
+    assert checked(path, stop=1).status == "kept"
+
+
+@pytest.mark.parametrize("ending", ["crd", "pqr"])
+def test_two_frames_that_are_read_as_twice_the_atoms(tmp_path, x, ending):
+    path = tmp_path / f"w.{ending}"
+    made = files.universe(N)
+    for name in ("charges", "radii"):
+        made.add_TopologyAttr(name, np.ones(3 * N))
+    made.atoms.positions = files.whole(x)[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made.atoms.write(str(path))
+    assert checked(path).status == "kept"
+    path.write_bytes(2 * path.read_bytes())
+    with pytest.raises(InputError, match=rf"w\.{ending}"):
+        checked(path)
+
+
+# -- chains -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "xyz", "gro"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_each_file_of_a_chain_has_an_end(tmp_path, x, ending, which):
+    """A part that was cut off, or has more frames than are read, is not hidden by the next."""
+    y = files.whole(x)
+    paths = [tmp_path / f"{k}.{ending}" for k in range(2)]
+    for path in paths:
+        if ending == "gro":
+            path.write_text(gro(y[0]))
+        else:
+            files.write(path, y, side=None)
+    made = files.universe(N)
+    rows = Distance(files.pairs(N), files.targets(N))
+
+    def whole_chain():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            made.load_new([str(path) for path in paths])
+            return ConstraintCheck(made, rows).run().check
+
+    assert whole_chain().status == "kept"
+    data = paths[which].read_bytes()
+    paths[which].write_bytes(2 * data if ending == "gro" else data[:-20])
+    result = whole_chain()
+    assert result.status == "incomplete"
+    assert result.broken.frame == {"gro": 1 + which}.get(ending, 7 + 8 * which)
+    # The reader of XTC says so itself where it comes to the end.
+    assert f"{which}.{ending}: " in result.broken.reason or ending == "xtc"
+
+
+# -- numbers of atoms -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["xyz", "arc", "lammpsdump"])
+@pytest.mark.parametrize("wrong", ["fewer", "more", "two frames more", "says fewer", "an empty line"])
+def test_a_frame_with_another_number_of_atoms(tmp_path, x, ending, wrong):
+    """The reader counts lines: atoms of one frame would be taken for those of the next."""
+    make = files.write if ending == "xyz" else files.write_text
+    options = {"side": None} if ending == "xyz" else {}
+    path = make(tmp_path / f"w.{ending}", files.whole(x), **options)
+    text = path.read_text()
+    size = len(text.splitlines()) // 8
+    lines = text.splitlines()
+    at = 3 * size + {"xyz": 0, "arc": 0, "lammpsdump": 3}[ending]  # where the fourth frame says how many atoms it has
+    first = 3 * size + size - 3 * N  # its first atom
+    if wrong == "fewer":
+        lines[at] = lines[at].replace("90", "89")
+        del lines[first]
+    elif wrong == "more":
+        lines[at] = lines[at].replace("90", "91")
+        lines.insert(first, lines[first])
+    elif wrong == "two frames more":
+        lines[at] = lines[at].replace("90", str(90 + 2 * size))
+        lines[first:first] = 2 * size * [lines[first]]
+    elif wrong == "says fewer":
+        lines[at] = lines[at].replace("90", "89")
+    else:
+        lines.insert(3 * size, "")
+    path.write_text("\n".join(lines) + "\n")
+    result = checked(path)
+    assert result.status == "incomplete" and result.frames == [0, 1, 2] and result.broken.frame == 3
+    assert "frame 3 cannot be used, nor what follows" in result.verdict or ending == "lammpsdump"
+    assert "where its number of atoms has to be, 90" in result.verdict or ending == "lammpsdump"
+    # Frames beyond, which may lie where the reader looks for them, are no better.
+    assert checked(path, step=2).frames == [0, 2]
+
+
+def test_empty_lines_at_the_end_are_no_frame(tmp_path, x):
+    path = files.write(tmp_path / "w.xyz", files.whole(x), side=None)
+    path.write_text(path.read_text() + "\n\n \n")
+    assert checked(path).status == "kept"

@@ -447,3 +447,75 @@ def test_coordinates_of_xtc_in_memory_and_of_several_files(tmp_path, how):
         result = ConstraintCheck(made, BOND).run().check
         assert result.precision == "XTC stores coordinates in steps of 0.01 Å (0.001 nm)"
         assert result.status == ("violated" if broken and how == "memory" else "kept"), result.verdict
+
+
+# -- grids of coordinates that were rounded before --------------------------------------------------
+
+
+def rounded(decimals, frames=8, shift=0.0):
+    """As a file with so many decimals in angstrom holds them."""
+    return np.round(whole(frames) + shift, decimals)
+
+
+@pytest.mark.parametrize("ending", ["dcd", "trr", "nc"])
+@pytest.mark.parametrize("decimals", [1, 2, 3, 4])
+@pytest.mark.parametrize("targets", ["first", "given"])
+def test_coordinates_that_were_rounded_before_they_came_into_a_file_of_floats(tmp_path, ending, decimals, targets):
+    """Rigid water that was written as XTC or text first is kept; a bond that is off by more than that is not."""
+    x = rounded(decimals)
+    result = checked(files.write(tmp_path / f"a.{ending}", x, side=None), targets=targets)
+    assert result.status in ("kept", "tolerated"), result.verdict
+    step = 10.0**-decimals
+    assert f"grid of {step:g} Å" in result.remarks[0] and f"steps of {step:.3g} Å" in result.precision
+    assert result.units[0].bound < (4 if targets == "first" else 2) * np.sqrt(3) * 0.5 * step * 1.2
+    bond = x[3, 4] - x[3, 3]
+    x[3, 4] += np.round(10 * step * bond / np.linalg.norm(bond), decimals)
+    wrong = checked(files.write(tmp_path / f"b.{ending}", x, side=None), targets=targets)
+    assert wrong.status == "violated" and wrong.worst[0].frame == 3
+
+
+def test_a_converted_xtc_says_what_the_xtc_says(tmp_path):
+    """Through MDAnalysis' reader, in a cell, far from the origin."""
+    path = files.write(tmp_path / "a.xtc", files.water(N, 8, seed=2) + 150.0)
+    made = files.universe(N)
+    load_trajectory(made, path)
+    frames = np.array([ts.positions.copy() for ts in made.trajectory])
+    one, other = checked(path), checked(files.write(tmp_path / "a.dcd", frames))
+    assert one.status == other.status == "kept"
+    assert other.units[0].largest == pytest.approx(one.units[0].largest, abs=5e-5)
+    assert other.units[0].bound == pytest.approx(one.units[0].bound, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["floats", "one frame of them", "by hand", "few", "the precision is given"])
+def test_what_is_no_grid(tmp_path, kind):
+    """A frame that lies on one among others; numbers that a person wrote; numbers that are too few to tell."""
+    x, options, row = rounded(3), {}, BOND
+    if kind == "floats":
+        x = whole()
+    elif kind == "one frame of them":
+        x[1:] = whole()[1:]
+    elif kind == "by hand":
+        corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        x = np.tile((3.0 * np.arange(N)[:, None, None] + corners).reshape(-1, 3), (8, 1, 1))
+        x[4, 4] += [0.01, 0.0, 0.0]
+        row = Distance(files.pairs(N))
+    elif kind == "few":
+        x, row = x[:1], Distance([[0, 1]], files.OH)
+        x[0, :2] = [[1.25, 0.0, 0.0], [1.25, 0.957, 0.0]]
+    else:
+        options = {"precision": 1e-5}
+    result = checked(files.write(tmp_path / "a.dcd", x, side=None), row, **options)
+    assert not any("grid" in remark for remark in result.remarks)
+    assert kind == "the precision is given" or "single precision" in result.precision
+    assert (result.status == "violated") == (kind != "floats")
+
+
+def test_frames_that_are_looked_at_have_the_grid(tmp_path):
+    """Frames on a grid behind others that are not: whether they are looked at decides."""
+    x = whole(12)
+    x[6:] = np.round(x[6:], 2)
+    path = files.write(tmp_path / "a.dcd", x, side=None)
+    assert checked(path).status == "violated"
+    assert checked(path, run={"start": 6}).status == "kept"
+    assert checked(path, run={"frames": [7, 9]}).status == "kept"
+    assert "single precision" in checked(path, run={"stop": 6}).precision

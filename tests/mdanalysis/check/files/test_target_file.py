@@ -50,6 +50,8 @@ def test_targets_from_a_file(tmp_path, x):
         ("[[length]]\nelements=['O','H']\nvalue=-1", "positive length"),
         ("[[angle]]\nelements=['H','O','H']\nvalue=190", "between 0 and 180"),
         ("[[length]]\nelements=['O','H']\nvalue=1\nforce=2", "residue is optional"),
+        (f"[[length]]\nelements=['O','H']\nvalue=1{'0' * 400}", "positive length"),
+        (f"a={'[' * 5000}{']' * 5000}", "no readable TOML"),
     ],
 )
 def test_parameter_files_that_are_wrong(tmp_path, text, match):

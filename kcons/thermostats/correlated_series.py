@@ -1,0 +1,207 @@
+"""Errors of means and slopes of values along a run, which depend on their neighbors.
+
+The error of a mean follows from the spectrum of the series at frequency zero. A spectrum is described by three numbers:
+a level N, and a Lorentzian of one memory that makes it R N at frequency zero,
+
+    S(f) = N (1 + (R - 1) L(f)),   L(0) = 1.
+
+R > 1 is something slow, beside whatever noise there is; R < 1 are values that swing back; R = 1 are independent values.
+All memories from a third of a block to a sixth of the series, and all R, are tried on the means of 16 to 127 blocks,
+by the likelihood of what is left when the mean (or the line) is taken out. The error is the average over all of them:
+a slow part that a run barely shows counts as far as the run leaves it likely.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.arguments import numbers
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+
+#: Fewest values that `mean` takes an error from, and independent ones below which it is not to be relied on.
+FEWEST, FEW_INDEPENDENT = 32, 10
+#: Fewest blocks of a long series. They are joined in pairs while neighbors are so alike and `_JOINED` remain: what
+#: matters is how the spectrum begins, not how smooth a series is from value to value.
+_BLOCKS, _JOINED, _ALIKE = 64, 16, 0.6
+#: Shortest memory in blocks, longest as a part of the series, and how many are tried between them.
+_SHORTEST, _LONGEST, _MEMORIES = 0.35, 1 / 6, 12
+#: ln R. Before the values are seen R is 1 within a factor of 7 or so (a Cauchy distribution of this width).
+_LOG_R: FloatArray = np.linspace(-math.log(16.0), math.log(512.0), 40)
+_WIDTH = 2.0
+#: Before the values are seen a memory t has the density t^-0.25 in ln t. Chosen, with the bounds of R, so that errors
+#: are right on average for series of 20 memories and more, whether all of a series is slow or a small part of it.
+_SLOWER = 0.25
+#: Spread relative to the values below which it is rounding.
+_ROUNDING = 1e-13
+
+
+class Estimate(NamedTuple):
+    """A mean and its standard error."""
+
+    value: float
+    error: float
+
+    def off(self, expected: float, error: float = 0.0) -> float:
+        """Distance from `expected` (known to `error`) in standard errors; infinite where both are known exactly."""
+        away, doubt = self.value - expected, math.hypot(self.error, error)
+        if not doubt:
+            return math.copysign(math.inf, away) if away else 0.0
+        return away / doubt
+
+
+class Spread(NamedTuple):
+    """Of the mean of a series.
+
+    Attributes
+    ----------
+    error : float
+        Standard error.
+    independent : float
+        As many independent values would give the same error. Where fewer than 10 blocks make up the spread, as of a
+        distribution with heavy tails, at most so many.
+    """
+
+    error: float
+    independent: float
+
+
+class _Memory(NamedTuple):
+    """Lorentzians of one memory, as covariances between blocks: along their axes, and of the mean or the slope."""
+
+    sizes: FloatArray
+    axes: FloatArray
+    own: float
+
+
+@lru_cache(maxsize=16)
+def _memories(blocks: int, degree: int) -> tuple[list[_Memory], float]:
+    """For each memory, and for independent blocks of unit variance the variance of the mean or of the slope."""
+    t = np.arange(blocks, dtype=np.float64)
+    design = np.vander(t - t.mean(), degree + 1)
+    inside = np.linalg.qr(design, mode="complete")[0][:, degree + 1 :]
+    rule = np.linalg.pinv(design)[0]
+    apart = np.abs(np.subtract.outer(t, t)).astype(np.int64)
+    found = []
+    for memory in np.geomspace(_SHORTEST, blocks * _LONGEST, _MEMORIES):
+        a = 1.0 / memory
+        # Means over blocks of exp(-|t|/memory); the sum over all lags is 1.
+        lags = memory * (np.cosh(a) - 1.0) * np.exp(-a * t)
+        lags[0] = 1.0 - memory * (1.0 - np.exp(-a))
+        covariance = lags[apart]
+        sizes, axes = np.linalg.eigh(inside.T @ covariance @ inside)
+        found.append(_Memory(sizes, axes.T @ inside.T, float(rule @ covariance @ rule)))
+    return found, float(rule @ rule)
+
+
+def _means(values: FloatArray, size: int) -> FloatArray:
+    count = len(values) // size
+    return np.asarray(values[: size * count].reshape(count, size).mean(axis=1))
+
+
+def _error(values: FloatArray, degree: int) -> tuple[float, FloatArray]:
+    """Standard error of the mean (degree 0), or of the slope by the index (1); the blocks it was taken from.
+
+    Of values whose mean, and slope, is 0.
+    """
+    size = max(len(values) // _BLOCKS, 1)
+    blocks = _means(values, size)
+    while len(blocks) >= 2 * _JOINED and blocks[1:] @ blocks[:-1] > _ALIKE * float(blocks @ blocks):
+        size *= 2
+        blocks = _means(values, size)
+    count = len(blocks)
+    memories, plain = _memories(count, degree)
+    logarithms, errors, more = [], [], np.expm1(_LOG_R)
+    for k, memory in enumerate(memories):
+        spectrum = 1.0 + more[:, None] * memory.sizes
+        level = ((memory.axes @ blocks) ** 2 / spectrum).sum(axis=1) / len(memory.sizes)
+        level = np.maximum(level, np.finfo(float).tiny)
+        longer = k / (_MEMORIES - 1) * math.log(count * _LONGEST / _SHORTEST)
+        likely = -0.5 * (len(memory.sizes) * np.log(level) + np.log(spectrum).sum(axis=1))
+        logarithms.append(likely - np.log1p((_LOG_R / _WIDTH) ** 2) - _SLOWER * longer)
+        errors.append(np.sqrt(level * (plain + more * memory.own)))
+    weights = np.exp(np.array(logarithms) - np.max(logarithms))
+    error = float((weights * errors).sum() / weights.sum())
+    return error * (size * count / len(values)) ** (0.5 + degree) * size**-degree, blocks
+
+
+def spread(series: FloatArray) -> Spread:
+    """Error of the mean of finite values, shape (n,) with n >= 3; 0 where they differ by rounding."""
+    off = series - series.mean()
+    variance = float(off @ off) / (len(off) - 1)
+    if not variance > (_ROUNDING * float(np.abs(series).max())) ** 2:
+        return Spread(0.0, float(len(series)))
+    off = off / math.sqrt(variance)
+    error, blocks = _error(off, 0)
+    squares = (blocks - blocks.mean()) ** 2
+    # The number of blocks where these are normal; 3 where one has all of the spread.
+    carriers = 3.0 * float(squares.sum()) ** 2 / max(float((squares**2).sum()), np.finfo(float).tiny)
+    independent = 1.0 / error**2
+    return Spread(
+        error * math.sqrt(variance), min(independent, carriers) if carriers < FEW_INDEPENDENT else independent
+    )
+
+
+def checked(series: FloatArray, item: str) -> FloatArray:
+    """The same series, if an error can be taken from it; `InputError` otherwise."""
+    if series.ndim != 1 or len(series) < FEWEST:
+        raise InputError(f"{series.shape} {item} are too few for an error; give {FEWEST} or more", item=item)
+    if not np.isfinite(series).all():
+        bad = int(np.argmin(np.isfinite(series)))
+        raise InputError(f"number {bad} of {item} is not finite; leave it out", item=item)
+    return series
+
+
+def few(n: int, independent: float) -> str | None:
+    """What is to be said of an error from so few independent values; None of one that is all right."""
+    if independent >= FEW_INDEPENDENT:
+        return None
+    return (
+        f"{n} values are worth {independent:.1f} independent ones, or a few of them make up the spread: the error is "
+        "not to be relied on. Sample longer"
+    )
+
+
+def mean(values: ArrayLike) -> Estimate:
+    """Mean of correlated values with its standard error.
+
+    Parameters
+    ----------
+    values : array_like, shape (n,)
+        At equal distances along a run.
+
+    Raises
+    ------
+    InputError
+        Fewer than 32 values; a NaN or infinity.
+
+    Warns
+    -----
+    UserWarning
+        Fewer than 10 independent values.
+    """
+    series = checked(numbers(values, "values"), "values")
+    found = spread(series)
+    doubt = few(len(series), found.independent)
+    if doubt:
+        warnings.warn(doubt, UserWarning, stacklevel=2)
+    return Estimate(float(series.mean()), found.error)
+
+
+def slope(times: FloatArray, values: FloatArray) -> Estimate:
+    """Slope of values by least squares; n >= 3 finite values at about equal distances."""
+    t = times - times.mean()
+    square = float(t @ t)
+    steep = float(t @ values) / square
+    left = values - values.mean() - steep * t
+    n, size = len(t), float(np.sqrt(np.mean(left * left)))
+    if not size > _ROUNDING * float(np.abs(values).max()):
+        return Estimate(steep, size / math.sqrt(square))
+    error = size * _error(left / size, 1)[0]
+    return Estimate(steep, error * math.sqrt(n * (n * n - 1) / 12.0 / square))

@@ -1,0 +1,230 @@
+"""What kcons holds, as objects that ASE, its file formats and other programs know."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bcc100, molecule
+from ase.calculators.emt import EMT
+from ase.constraints import (
+    FixAtoms,
+    FixBondLengths,
+    FixCartesian,
+    FixedLine,
+    FixedPlane,
+    FixInternals,
+    FixSubsetCom,
+    Hookean,
+)
+from ase.io import read, write
+from ase.vibrations import Vibrations
+
+from kcons.ase import (
+    Constraints,
+    ConstraintsWithFixedAtoms,
+    constrain,
+    from_ase_constraints,
+    to_ase_constraints,
+)
+from kcons.constraints import (
+    Angle,
+    CenterOfMass,
+    Dihedral,
+    Distance,
+    DistanceDifference,
+    FixedAtoms,
+    Line,
+    LinearCombination,
+    Plane,
+    Sphere,
+)
+from kcons.errors import InputError, UnsupportedError
+
+FORMATS = {
+    "vasp": "POSCAR",
+    "aims": "geometry.in",
+    "turbomole": "coord",
+    "extxyz": "a.xyz",
+    "castep-cell": "a.cell",
+    "espresso-in": "pw.in",
+}
+
+
+def slab() -> Atoms:
+    """Four atoms of iron at the bottom, and hydrogen on top."""
+    atoms = bcc100("Fe", (2, 2, 3), vacuum=5.0, periodic=True)
+    atoms.info.clear()
+    atoms += Atoms("H2", atoms.positions[-1] + np.array([[0, 0, 1.5], [0, 0.1, 2.24]]))
+    return atoms
+
+
+def fixed_in(atoms: Atoms) -> list[int]:
+    """As all that reads `FixAtoms` finds them."""
+    return sorted(i for c in atoms.constraints if isinstance(c, FixAtoms) for i in c.index.tolist())
+
+
+HELD = {
+    "alone": [FixedAtoms([3, 0, 1, 2])],
+    "with others": [Distance([[12, 13]]), FixedAtoms([0, 1]), FixedAtoms([2, 3])],
+}
+
+
+@pytest.mark.parametrize("held", HELD.values(), ids=HELD)
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::UserWarning")
+def test_files_of_other_programs_have_the_fixed_atoms(tmp_path, form, held):
+    """The same file as with ASE's own FixAtoms."""
+    ours, plain = slab(), slab()
+    constrain(ours, held)
+    plain.set_constraint(FixAtoms([0, 1, 2, 3]))
+    options = {"pseudopotentials": {"Fe": "Fe.upf", "H": "H.upf"}} if form == "espresso-in" else {}
+    texts = []
+    for name, atoms in (("ours", ours), ("plain", plain)):
+        folder = tmp_path / name
+        folder.mkdir()
+        write(folder / FORMATS[form], atoms, format=form, **options)
+        texts.append((folder / FORMATS[form]).read_text())
+    lines, expected = ([line for line in text.splitlines() if "#" not in line] for text in texts)
+    assert lines == expected
+    if form not in ("castep-cell", "espresso-in"):
+        assert fixed_in(read(tmp_path / "ours" / FORMATS[form], format=form)) == [0, 1, 2, 3]
+
+
+def test_the_object_follows_what_it_holds():
+    atoms = slab()
+    held = constrain(atoms, HELD["with others"])
+    assert isinstance(held, ConstraintsWithFixedAtoms) and fixed_in(atoms) == [0, 1, 2, 3]
+    assert held.get_indices().tolist() == [0, 1, 2, 3]  # as what asks FixAtoms expects
+    assert held.touched.tolist() == [0, 1, 2, 3, 12, 13]
+    assert atoms.get_number_of_degrees_of_freedom() == 3 * 14 - 12 - 1
+    for twin in (atoms.copy(), copy.deepcopy(atoms), pickle.loads(pickle.dumps(atoms))):
+        assert fixed_in(twin) == [0, 1, 2, 3]
+        assert repr(twin.constraints) == repr(atoms.constraints)
+    assert fixed_in(atoms[[2, 12, 13, 5]]) == [0]
+    assert fixed_in(atoms.repeat((2, 1, 1))) == [0, 1, 2, 3, 14, 15, 16, 17]
+    (molecule_alone,) = atoms[12:].constraints
+    assert type(molecule_alone) is Constraints and not isinstance(molecule_alone, FixAtoms)
+    held.constraints = (Distance([[12, 13]]),)
+    assert type(held) is Constraints and fixed_in(atoms) == []
+    held.constraints = (FixedAtoms([5]),)
+    assert fixed_in(atoms) == [5]
+
+
+def test_atoms_can_be_deleted_as_with_fix_atoms():
+    atoms = slab()
+    constrain(atoms, HELD["with others"])
+    places = atoms.positions.copy()
+    del atoms[[1, 4]]
+    assert fixed_in(atoms) == [0, 1, 2]
+    (held,) = atoms.constraints
+    assert held.engine(atoms).constraint_set.n_rows == 9 + 1
+    assert atoms.get_distance(10, 11) == pytest.approx(np.linalg.norm(places[12] - places[13]))
+    assert held.todict()["kwargs"]["constraints"][0]["atoms"] == [[10, 11]]
+    del atoms[-1]
+    assert [row.family for row in held.constraints] == ["FixedAtoms", "FixedAtoms"]
+    del atoms[[0, 1, 2]]
+    assert not atoms.constraints
+    bound = molecule("H2O")
+    constrain(bound, Distance([[0, 1]]))
+    with pytest.raises(RuntimeError, match="Remove constraint"):
+        del bound[2]
+
+
+def test_two_objects_on_the_same_atoms_are_still_refused():
+    atoms = slab()
+    constrain(atoms, [FixedAtoms([0]), Distance([[12, 13]])])
+    with pytest.raises(UnsupportedError, match="ConstraintsWithFixedAtoms acts on atom 12"):
+        constrain(atoms, Distance([[12, 11]]))
+
+
+@pytest.mark.filterwarnings("ignore:Vibrations displaces")
+def test_vibrations_leave_out_the_fixed_atoms_alone(tmp_path):
+    atoms = slab()
+    atoms.calc = EMT()
+    constrain(atoms, HELD["with others"])
+    assert Vibrations(atoms, name=str(tmp_path / "v")).indices.tolist() == list(range(4, 14))
+
+
+# -- plain objects -----------------------------------------------------------------------------------------
+
+
+def plain_kinds(atoms: Atoms, **options) -> list[str]:
+    return [type(item).__name__ for item in to_ase_constraints(atoms, **options)]
+
+
+ROWS = {
+    "FixAtoms": [FixedAtoms([8]), FixedAtoms([7])],
+    "FixBondLengths": [Distance([[0, 1]]), Distance([[1, 2]], 1.43)],
+    "FixInternals": [
+        *(Distance([[0, 1]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])),
+        DistanceDifference([[0, 4], [1, 5]], weights=[1.0, -2.0]),
+    ],
+    "FixedPlane FixedPlane": [Plane([4, 5], [0, 1, 2]), Plane([6], [1, 0, 0])],
+    "FixedLine": [Line([4, 5], None, [0, 1, 2])],
+    "FixCartesian FixCartesian": [
+        LinearCombination([[3], [5]], [[0, 0, 2.0]]),
+        LinearCombination([[3]], [[1.0, 0, 0]]),
+    ],
+    "FixSubsetCom": [CenterOfMass([0, 1, 2])],
+    "FixAtoms FixBondLengths": [FixedAtoms([8]), Distance([[0, 1]])],
+}
+
+
+@pytest.mark.parametrize("names", ROWS)
+def test_ase_objects_take_the_same_away(names):
+    """Their degrees of freedom, and the forces that they leave, where they are single or share no atoms."""
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    held = constrain(atoms, ROWS[names], project=True)
+    before = held.todict()
+    found = to_ase_constraints(atoms)
+    assert [type(item).__name__ for item in found] == names.split()
+    assert not any(isinstance(item, Constraints) for item in found)
+    plain = atoms.copy()
+    plain.calc = EMT()
+    plain.set_constraint(found)
+    assert plain.get_number_of_degrees_of_freedom() == atoms.get_number_of_degrees_of_freedom()
+    if names == "FixInternals":  # which takes rotations away from forces, too
+        found[0].initialize(plain)
+        for each in found[0].constraints:
+            each.setup_jacobian(plain.positions)
+            each.adjust_positions(plain.positions, plain.positions.copy())
+            assert each.sigma == pytest.approx(0.0, abs=1e-10)
+    elif names != "FixSubsetCom":  # which takes the mean of accelerations away, and not of forces
+        assert plain.get_forces() == pytest.approx(atoms.get_forces(), abs=1e-6)
+    # And back: the same rows with the same targets.
+    back = Constraints(from_ase_constraints(plain)).engine(atoms).constraint_set
+    expected = held.engine(atoms).constraint_set
+    rows = [each.jacobian(atoms.positions).toarray() for each in (back, expected)]
+    assert np.linalg.matrix_rank(np.vstack(rows)) == len(rows[0]) == len(rows[1])
+    assert np.abs(back.value(atoms.positions)).max() < 1e-12
+    assert held.todict() == before and atoms.constraints == [held]
+
+
+def test_what_no_object_of_ase_holds_is_named():
+    atoms = molecule("CH3CH2OH")
+    spring = Hookean(a1=4, a2=5, rt=2.0, k=1.0)
+    atoms.set_constraint(spring)
+    constrain(atoms, [FixedAtoms([0]), Sphere([1], [0.0, 0.0, 0.0])])
+    with pytest.raises(UnsupportedError, match=r"no object of ASE holds <Sphere\(1\)>"):
+        to_ase_constraints(atoms)
+    with pytest.raises(InputError, match="missing must be"):
+        to_ase_constraints(atoms, missing="ignore")
+    assert plain_kinds(atoms, missing="leave out") == ["Hookean", "FixAtoms"]
+    two_planes = molecule("CH3CH2OH")
+    constrain(two_planes, [Plane([3], [0, 0, 1.0]), Plane([3], [0, 1.0, 0])])
+    with pytest.raises(UnsupportedError, match="Plane"):
+        to_ase_constraints(two_planes)
+    half = molecule("CH3CH2OH")
+    constrain(half, [CenterOfMass([0, 1], axes=(0, 2)), LinearCombination([0, 1], [[1.0, 0, 0], [1.0, 0, 0]])])
+    assert plain_kinds(half, missing="leave out") == []
+
+
+def test_each_kind_is_one_of_ase():
+    """The names above are classes of ASE."""
+    known = (FixAtoms, FixBondLengths, FixCartesian, FixedLine, FixedPlane, FixInternals, FixSubsetCom)
+    assert {name for names in ROWS for name in names.split()} == {each.__name__ for each in known}

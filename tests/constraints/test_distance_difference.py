@@ -1,0 +1,291 @@
+"""Differences and sums of distances, against numbers that were worked out by hand and by other means."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from ase import Atoms, units
+from ase.calculators.lj import LennardJones
+from ase.constraints import FixInternals
+from scipy.optimize import minimize
+
+from kcons import ConstraintSet, Motion
+from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities, from_ase_constraints
+from kcons.constraints import Distance, DistanceDifference, FixedAtoms, Formula, from_dict
+from kcons.constraints.constraint_set import rows_like
+from kcons.errors import ImageError, InputError, SingularGeometryError
+
+#: Chlorine, hydrogen, bromine.
+TRANSFER = [[0, 1], [1, 2]]
+X = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 12.0]])  # 5 apart, then 12
+M = np.array([35.0, 1.0, 80.0])
+
+
+def test_value_gradient_and_curvature_by_hand():
+    row = DistanceDifference(TRANSFER, weights=[2.0, -1.0])
+    held = ConstraintSet(row, X, M)
+    assert held.measure(X) == pytest.approx([2 * 5 - 12], abs=1e-15)
+    expected = [[-1.2, -1.6, 0.0], [1.2, 1.6, 1.0], [0.0, 0.0, -1.0]]
+    assert held.jacobian(X).toarray().reshape(3, 3) == pytest.approx(np.array(expected), abs=1e-15)
+    # Across the first pair at speed 1: 2 * 1/5; across the second at speed 3: -9/12.
+    v = np.array([[0.8, -0.6, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    assert held.curvature(X, v) == pytest.approx([2 * 1 / 5 - 9 / 12], abs=1e-15)
+
+
+def test_it_holds_what_a_formula_holds():
+    text = "sqrt((x1-x2)**2+(y1-y2)**2+(z1-z2)**2) - 0.5*sqrt((x2-x3)**2+(y2-y3)**2+(z2-z3)**2)"
+    both = [DistanceDifference(TRANSFER, weights=[1.0, -0.5]), Formula(text, [[0, 1, 2]], target=None)]
+    first, second = (Motion(ConstraintSet(row, X, M), X) for row in both)
+    y = X + 0.2 * np.random.default_rng(1).normal(size=X.shape)
+    assert first.project_positions(y, X) == pytest.approx(second.project_positions(y, X), abs=1e-13)
+    f, v = np.random.default_rng(2).normal(size=(2, 3, 3))
+    v = first.project_velocities(X, v)
+    assert first.acceleration(X, v, f) == pytest.approx(second.acceleration(X, v, f), abs=1e-13)
+
+
+def test_the_nearest_point_is_that_of_a_minimizer():
+    """`restore_positions` for a far target, against SLSQP, which knows nothing of kcons."""
+    row = DistanceDifference(TRANSFER, -4.0)
+    held = ConstraintSet(row, X, M)
+    found = Motion(held, X, degenerate="raise").restore_positions(X, bonds=[])
+
+    def difference(y: np.ndarray) -> float:
+        a, b, c = y.reshape(3, 3)
+        return math.dist(a, b) - math.dist(b, c)
+
+    best = minimize(
+        lambda y: np.sum(M[:, None] * (y.reshape(3, 3) - X) ** 2),
+        X.ravel(),
+        constraints={"type": "eq", "fun": lambda y: difference(y) + 4.0},
+        options={"ftol": 1e-15, "maxiter": 500},
+    )
+    assert difference(found.ravel()) == pytest.approx(-4.0, abs=1e-12)
+    assert found == pytest.approx(best.x.reshape(3, 3), abs=1e-6)
+
+
+def test_it_comes_back_from_its_data():
+    row = DistanceDifference([[[1, 0], [1, 2]], [[4, 3], [4, 5]]], [-0.5, 0.25], weights=[1.0, -2.0])
+    again = from_dict(json.loads(json.dumps(row.todict())))
+    x = np.random.default_rng(0).normal(size=(6, 3))
+    lengths = np.linalg.norm(x[[1, 1, 4, 4]] - x[[0, 2, 3, 5]], axis=1)
+    for item in (row, again, row.select([0, 1]), row.renumbered(np.arange(6))):
+        assert item.measure(x[item.atoms], 0.0) == pytest.approx(lengths[[0, 2]] - 2 * lengths[[1, 3]], abs=1e-14)
+        assert item.target.tolist() == [-0.5, 0.25]
+    assert row.select([1]).measure(x[row.select([1]).atoms], 0.0) == pytest.approx(lengths[2] - 2 * lengths[3])
+    held = ConstraintSet([Distance([[0, 1]]), row.with_target(None)], x, np.ones(6))
+    assert rows_like(held, DistanceDifference([[4, 3], [4, 5]], weights=[1.0, -2.0]), "d") == [2]
+    with pytest.raises(InputError, match="not among"):
+        rows_like(held, DistanceDifference([[4, 3], [4, 5]]), "d")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: DistanceDifference([0, 1, 2]), "pairs of atoms"),
+        (lambda: DistanceDifference([[0.0, 1.0], [1.0, 2.0]]), "pairs of atoms"),
+        (lambda: DistanceDifference([]), "pairs of atoms"),
+        (lambda: DistanceDifference([[0, 1], [2, 2]]), "atom 2 twice"),
+        (lambda: DistanceDifference([[0, 1], [1, 0]]), "add the weights"),
+        (lambda: DistanceDifference([[0, 1]]), "give 1 finite number"),
+        (lambda: DistanceDifference(TRANSFER, weights=[1.0, 0.0]), "give 2 finite numbers"),
+        (lambda: DistanceDifference(TRANSFER, weights=[1.0, np.nan]), "give 2 finite numbers"),
+        (lambda: DistanceDifference([[[0, 1], [1, 2]], [[3, 4], [5, 6]]]), "rows 0 and 1 share atoms"),
+        (lambda: DistanceDifference([[0, -1], [1, 2]]), "negative"),
+        (lambda: from_dict(DistanceDifference(TRANSFER).todict() | {"slots": [[0, 1], [1, 3]]}), "do not belong"),
+        (lambda: from_dict(DistanceDifference(TRANSFER).todict() | {"slots": 3}), "slots are pairs"),
+        (lambda: from_dict(DistanceDifference(TRANSFER).todict() | {"weights": ["a", 1]}), "numbers"),
+        (lambda: ConstraintSet(DistanceDifference(TRANSFER, -1.0, weights=[1, 1]), X, M), "not positive"),
+    ],
+)
+def test_what_is_no_such_row_is_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_undefined_places_are_refused():
+    y = X.copy()
+    y[1] = y[2]
+    with pytest.raises(SingularGeometryError, match="atoms 1 and 2 of row 0"):
+        ConstraintSet(DistanceDifference(TRANSFER), y, M)
+    # |ab| + |bc| - |ac| is 0 on a line, and least there.
+    line = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
+    with pytest.raises(SingularGeometryError, match="vanishes"):
+        ConstraintSet(DistanceDifference([[0, 1], [1, 2], [0, 2]], weights=[1, 1, -1]), line, M)
+
+
+# -- periodic cells ----------------------------------------------------------------------------------------
+
+
+def lengths_in(cell: np.ndarray, x: np.ndarray, pairs: list[list[int]]) -> np.ndarray:
+    """By looking at all 27 images."""
+    shifts = np.stack(np.meshgrid(*3 * [[-1, 0, 1]]), axis=-1).reshape(-1, 3) @ cell
+    inside = np.linalg.solve(cell.T, x.T).T % 1.0 @ cell
+    return np.array([np.linalg.norm(inside[i] - inside[j] + shifts, axis=1).min() for i, j in pairs])
+
+
+#: A chain, a star, two pairs that lie anywhere, a star and a pair.
+PATTERNS = {
+    "chain": [[0, 1], [1, 2]],
+    "star": [[1, 0], [1, 2], [1, 3]],
+    "apart": [[0, 1], [2, 3]],
+    "star and pair": [[0, 1], [1, 2], [3, 1], [4, 5]],
+}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_each_pair_takes_its_shortest_image(pattern):
+    """In random cells, atoms stored in any image, and none, one or all of the distances held: value and a motion."""
+    pairs = PATTERNS[pattern]
+    far = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        cell = 5.0 * np.eye(3) + 0.5 * rng.normal(size=(3, 3))
+        n = 1 + max(max(pair) for pair in pairs)
+        x = rng.uniform(-4, 4, size=(n, 3))
+        for i, j in pairs:  # along the tree of the pattern
+            step = rng.normal(size=3)
+            x[max(i, j)] = x[min(i, j)] + rng.uniform(0.6, 1.8) * step / np.linalg.norm(step)
+        x += rng.integers(-2, 3, size=(n, 3)) @ cell
+        weights = rng.choice([-1.0, 1.0], len(pairs)) * rng.uniform(0.5, 2.0, len(pairs))
+        rows = [DistanceDifference(pairs, weights=weights)]
+        if seed % 3:
+            rows.append(Distance(pairs[: None if seed % 3 == 2 else 1]))  # all, or one of them
+        masses = rng.uniform(1, 20, n)
+        held = ConstraintSet(rows, x, masses, cell=cell)
+        assert held.target()[0] == pytest.approx(weights @ lengths_in(cell, x, pairs), abs=1e-12)
+        motion = Motion(held, x)
+        y = x + 0.02 * rng.normal(size=x.shape)
+        found = motion.project_positions(y, x)
+        assert weights @ lengths_in(cell, found, pairs) == pytest.approx(held.target()[0], abs=1e-11)
+        far += bool(np.linalg.norm(x[0] - x[-1]) > held.half_width)
+    assert far > 20
+
+
+def test_pairs_of_a_row_need_not_be_near_each_other():
+    """Two bonds at the two ends of a long cell: nothing says how far one may be from the other."""
+    cell = np.diag([20.0, 6.0, 6.0])
+    x = np.array([[0.5, 0, 0], [1.5, 0, 0], [10.4, 3.0, 3.0], [11.6, 3.0, 3.0]])
+    held = ConstraintSet(DistanceDifference([[0, 1], [2, 3]]), x, np.ones(4), cell=cell)
+    assert held.target() == pytest.approx([-0.2], abs=1e-14)
+    motion = Motion(held, x)
+    for shift in range(12):  # the second bond goes around the first
+        there = x + np.array([[0, 0, 0], [0, 0, 0], [shift, 0, 0], [shift, 0, 0]])
+        there[3, 0] += 0.1
+        found = motion.project_positions(there, x + (there - x).round())
+        assert math.dist(*found[:2]) - math.dist(*found[2:]) == pytest.approx(-0.2, abs=1e-12)
+
+
+def test_a_pair_that_reaches_half_the_cell_is_refused():
+    cell = 6.0 * np.eye(3)
+    x = np.array([[0.0, 0, 0], [2.6, 0, 0], [2.6, 1.0, 0]])
+    motion = Motion(ConstraintSet(DistanceDifference(TRANSFER), x, np.ones(3), cell=cell), x)
+    with pytest.raises(ImageError, match="atoms 0 and 1"):
+        motion.project_positions(x + np.array([[0, 0, 0], [0.7, 0, 0], [0.7, 0.7, 0]]), x)
+    x[0, 1] = 2.6
+    with pytest.raises(InputError, match="half the box"):
+        ConstraintSet(DistanceDifference(TRANSFER), x, np.ones(3), cell=cell)
+
+
+# -- with ASE ----------------------------------------------------------------------------------------------
+
+
+def proton() -> Atoms:
+    atoms = Atoms("ClHBr", [[0, 0, 0], [1.45, 0.1, 0], [3.05, 0, 0.2]])
+    atoms.calc = LennardJones(sigma=1.3, epsilon=0.05)
+    return atoms
+
+
+def test_bondcombos_become_this_row_and_go_back():
+    atoms = proton()
+    combos = [[None, [[0, 1, 1.0], [1, 2, -1.0]]], [3.0, [[0, 2, 1.0], [0, 1, 0.5], [1, 2, -0.25]]]]
+    atoms.set_constraint(FixInternals(bondcombos=combos[:1]))
+    (row,) = from_ase_constraints(atoms)
+    assert row == row and row.family == "DistanceDifference" and row.target is None
+    value = FixInternals.get_bondcombo(atoms, combos[0][1])
+    atoms.set_constraint()
+    held = constrain(atoms, row)
+    assert held.constraints[0].target_at(0.0) == pytest.approx([value], abs=1e-14)
+    data = held.todict()
+    assert data["name"] == "FixInternals"
+    ((target, pairs),) = data["kwargs"]["bondcombos"]
+    assert target == pytest.approx(value, abs=1e-14) and pairs == combos[0][1]
+    atoms.set_constraint(FixInternals(bondcombos=combos))
+    _, other = from_ase_constraints(atoms)
+    wanted = FixInternals.get_bondcombo(atoms, combos[1][1])
+    assert other.target.tolist() == [3.0]
+    assert other.measure(atoms.positions[other.atoms], 0.0) == pytest.approx([wanted], abs=1e-14)
+
+
+def test_a_run_keeps_it_and_its_kinetic_energy_is_that_of_the_degrees_of_freedom():
+    atoms = proton()
+    constrain(atoms, DistanceDifference(TRANSFER, -0.2), project=True)
+    draw_velocities(atoms, 100, rng=1)
+    dynamics = ConstrainedDynamics(atoms, 0.5 * units.fs)
+    before = atoms.get_total_energy()
+    dynamics.run(200)
+    assert atoms.get_distance(0, 1) - atoms.get_distance(1, 2) == pytest.approx(-0.2, abs=1e-12)
+    assert atoms.get_total_energy() == pytest.approx(before, abs=1e-4)
+    assert dynamics.degrees_of_freedom == 8
+
+
+def test_a_target_that_moves_carries_the_proton_over():
+    atoms = proton()
+    start = atoms.get_distance(0, 1) - atoms.get_distance(1, 2)
+    row = DistanceDifference(TRANSFER, lambda t: start + 0.05 * t)
+    dynamics = ConstrainedLangevin(
+        atoms, 0.5 * units.fs, temperature_K=50, friction=0.02 / units.fs, rng=2, constraints=[row]
+    )
+    dynamics.run(100)
+    now = atoms.get_distance(0, 1) - atoms.get_distance(1, 2)
+    assert now == pytest.approx(start + 0.05 * dynamics.get_time(), abs=1e-11)
+    assert now > start + 0.2
+
+
+def test_the_bonds_of_a_difference_may_change_when_it_is_restored():
+    """The row asks for other lengths of its bonds; those that it does not name stay."""
+    atoms = Atoms("OHHOHH", [[0, 0, 0], [0.97, 0, 0], [-0.3, 0.92, 0], [2.7, 0, 0], [3.1, 0.8, 0.3], [3.1, -0.5, 0.7]])
+    atoms.info["bonds"] = [[0, 1], [0, 2], [3, 4], [3, 5]]
+    constrain(atoms, DistanceDifference([[0, 1], [1, 3]], 0.0), project=True)
+    assert atoms.get_distance(0, 1) == pytest.approx(atoms.get_distance(1, 3), abs=1e-12)
+    assert atoms.get_distance(0, 2) == pytest.approx(np.hypot(0.3, 0.92), rel=0.0125)
+
+
+def test_replicas_each_have_their_own():
+    atoms = proton()
+    atoms.set_cell([6.0, 5.0, 5.0])
+    atoms.pbc = True
+    atoms.positions[:, 0] += 4.9  # Br is in the next cell
+    atoms.wrap()
+    constrain(atoms, DistanceDifference(TRANSFER))
+    value = atoms.constraints[0].constraints[0].target_at(0.0)
+    twice = atoms.repeat((2, 1, 1))
+    (held,) = twice.constraints
+    rows = held.engine(twice).constraint_set
+    assert rows.target() == pytest.approx(np.repeat(value, 2), abs=1e-12)
+    lengths = lengths_in(twice.cell.array, twice.positions, rows.constraints[0].atoms[:, :2].tolist())
+    assert lengths == pytest.approx(2 * [proton().get_distance(0, 1)], abs=1e-12)
+
+
+def test_beside_fixed_atoms_and_held_lengths():
+    x = np.array([[0.0, 0, 0], [1.0, 0.2, 0], [2.3, 0, 0.1], [3.2, 0.4, 0.3]])
+    rows = [FixedAtoms([0]), Distance([[2, 3]]), DistanceDifference([[[0, 1], [1, 2]]])]
+    held = ConstraintSet(rows, x, np.arange(1.0, 5.0))
+    motion = Motion(held, x)
+    assert motion.rank == 5
+    found = motion.project_positions(x + 0.1 * np.random.default_rng(3).normal(size=x.shape), x)
+    assert np.abs(held.value(found)).max() < 1e-13
+
+
+def test_a_proton_goes_over_within_a_molecule_that_stays_as_it_is():
+    """Malonaldehyde, halfway between its two enols: no atom but the proton moves by more than 0.03."""
+    places = [[-1.29, 0.55, 0], [-0.60, 1.27, 0], [1.27, 0.75, 0], [-1.16, -0.74, 0], [0.05, -1.40, 0]]
+    atoms = Atoms("OHOCCCHHH", [*places, [1.20, -0.48, 0], [-2.12, -1.26, 0], [0.10, -2.48, 0], [2.17, -1.02, 0]])
+    atoms.info["bonds"] = [[0, 1], [0, 3], [3, 4], [4, 5], [5, 2], [3, 6], [4, 7], [5, 8]]
+    before = atoms.positions.copy()
+    constrain(atoms, DistanceDifference(TRANSFER, 0.0), project=True)
+    assert atoms.get_distance(0, 1) == pytest.approx(atoms.get_distance(1, 2), abs=1e-12)
+    moved = np.linalg.norm(atoms.positions - before, axis=1)
+    assert moved[1] > 0.3 and np.delete(moved, 1).max() < 0.03

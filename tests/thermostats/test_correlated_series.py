@@ -1,0 +1,158 @@
+"""Stated errors are those that repeated runs have, for every public estimator."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+from thermostat_systems import system
+
+from kcons.errors import InputError
+from kcons.free_energy import weighted_mean
+from kcons.thermostats import TemperatureSplit, configurational_temperature, mean
+from kcons.thermostats.correlated_series import slope, spread
+
+
+def fading(rng, n, memory, d=1):
+    """Correlations exp(-t/memory), variance 1, shape (n, d)."""
+    keep = math.exp(-1 / memory)
+    noise = math.sqrt(1 - keep**2) * rng.standard_normal((n, d))
+    noise[0] = rng.standard_normal(d)
+    return lfilter([1.0], [1.0, -keep], noise, axis=0)
+
+
+def two_state(rng, n, memory):
+    """-1 and 1, with the same correlations."""
+    turns = rng.random(n) < 0.5 * (1 - math.exp(-1 / memory))
+    return np.cumprod(np.where(turns, -1, 1)) * rng.choice([-1, 1])
+
+
+def swinging(rng, n, period, memory):
+    keep = math.exp(-1 / memory)
+    return lfilter([1.0], [1.0, -2 * keep * math.cos(2 * math.pi / period), keep**2], rng.standard_normal(2 * n))[n:]
+
+
+#: Each spans 20 of its slowest times or more.
+SERIES = {
+    "independent": lambda rng: rng.standard_normal(64),
+    "many independent": lambda rng: rng.standard_normal(1000),
+    "memory 3": lambda rng: fading(rng, 64, 3.0)[:, 0],
+    "memory 10": lambda rng: fading(rng, 400, 10.0)[:, 0],
+    "memory of a twentieth": lambda rng: fading(rng, 400, 20.0)[:, 0],
+    "hidden states": lambda rng: rng.standard_normal(2000) + math.sqrt(0.1) * two_state(rng, 2000, 100.0),
+    "rarely seen states": lambda rng: rng.standard_normal(4000) + 0.1 * two_state(rng, 4000, 100.0),
+    "fast and slow": lambda rng: fading(rng, 4000, 3.0)[:, 0] + math.sqrt(0.2) * two_state(rng, 4000, 100.0),
+    "states alone": lambda rng: rng.standard_normal(400) + two_state(rng, 400, 20.0),
+    "swings": lambda rng: swinging(rng, 2000, 10.0, 20.0),
+    "smooth": lambda rng: gaussian_filter1d(rng.standard_normal(300), 5.0)[50:-50],
+}
+
+
+def scatter(found, expected=0.0):
+    """Root mean square of what estimates are off by, over that of their errors."""
+    value, error = np.array(found).T
+    return math.sqrt(((value - expected) ** 2).mean() / (error**2).mean())
+
+
+@pytest.mark.filterwarnings("ignore:.*independent ones")
+@pytest.mark.parametrize("name", SERIES, ids=lambda name: name.replace(" ", "-"))
+def test_errors_are_as_large_as_they_say(name):
+    rng = np.random.default_rng(1)
+    series = [SERIES[name](rng) for _ in range(600)]
+    assert 0.88 <= scatter([mean(values) for values in series]) <= 1.15
+    for values in series[:3]:
+        assert weighted_mean(values).error[0] == pytest.approx(mean(values).error, rel=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:.*independent ones")
+def test_errors_with_weights():
+    """The slow motion is in values and weights: a mean with the weights exp(b y) of normal y is that of y + b."""
+    rng, found = np.random.default_rng(2), []
+    for _ in range(400):
+        y = fading(rng, 600, 15.0)[:, 0]
+        mean_of = weighted_mean(y + rng.standard_normal(600), log_weights=0.5 * y)
+        found.append((mean_of.value[0], mean_of.error[0]))
+    assert 0.9 <= scatter(found, 0.5) <= 1.15
+
+
+@pytest.mark.filterwarnings("ignore:.*independent ones")
+def test_errors_of_ratios():
+    """Above and below the line depend on each other, and both on something slow."""
+    rng, found = np.random.default_rng(3), []
+    for _ in range(400):
+        slow = fading(rng, 800, 20.0, 2)
+        below = 2.0 + slow[:, 0] + rng.standard_normal(800)
+        found.append(configurational_temperature(0.7 * below + slow[:, 1] + 0.5 * slow[:, 0] ** 2 - 0.5, below))
+    assert 0.9 <= scatter(found, 0.7) <= 1.15
+
+
+@pytest.mark.filterwarnings("ignore:temperature of")
+def test_errors_of_temperatures_by_kind_of_motion():
+    """Two atoms in a trap, which forget where they were in 4 samples."""
+    stiff, kT = np.array([[1.0, 2.0, 3.0], [2.0, 1.0, 0.5]]), 0.8
+    held = system([], np.zeros((2, 3)), [1.0, 2.0], lambda x, t: -stiff * x)
+    rng, found = np.random.default_rng(4), []
+    for _ in range(120):
+        split = TemperatureSplit(held, displacement=1e-3)
+        for x in fading(rng, 160, 4.0, 6).reshape(-1, 2, 3) * np.sqrt(kT / stiff):
+            split.add(x, -stiff * x)
+        found.append(split.result().shift)
+    assert 0.88 <= scatter(found, kT) <= 1.15
+
+
+@pytest.mark.parametrize("name", ["independent", "memory 10", "fast and slow", "smooth"])
+def test_errors_of_slopes(name):
+    rng, found = np.random.default_rng(5), []
+    for _ in range(400):
+        values = SERIES[name](rng)
+        times = 3.0 + 0.1 * np.arange(len(values))
+        found.append(slope(times, values + 2.0 * times))
+    assert 0.85 <= scatter(found, 2.0) <= 1.15
+    assert slope(np.arange(5.0), 2.0 - np.arange(5.0)) == pytest.approx((-1.0, 0.0), abs=1e-12)
+
+
+def test_few_independent_values_are_said():
+    rng = np.random.default_rng(6)
+    with pytest.warns(UserWarning, match="400 values are worth .* independent ones"):
+        mean(fading(rng, 400, 100.0)[:, 0])
+    assert np.mean([spread(rng.standard_normal(64)).independent < 10 for _ in range(200)]) == 0
+
+
+def test_heavy_tails_are_said():
+    """One of 2,000 values makes up most of the spread: nobody knows the error of that."""
+    rng = np.random.default_rng(7)
+    told = [spread(rng.standard_t(1.0, 2000)).independent < 10 for _ in range(200)]
+    assert np.mean(told) > 0.5
+    values = rng.standard_normal(2000)
+    values[700] = 1e4
+    with pytest.warns(UserWarning, match="a few of them make up the spread"):
+        mean(values)
+
+
+def test_ratios_without_a_denominator_have_no_error():
+    rng = np.random.default_rng(8)
+    below = rng.standard_normal(200)
+    with pytest.warns(UserWarning, match="mean curvature of 200 samples is 0 within 3 standard errors"):
+        found = configurational_temperature(1.0 + rng.standard_normal(200), below - below.mean() + 0.02)
+    assert found.error == math.inf and found.off(0.5) == 0.0
+
+
+def test_units_and_offsets_do_not_matter():
+    values = fading(np.random.default_rng(9), 500, 5.0)[:, 0]
+    one, other = spread(values), spread(1e-9 * values + 3.0)
+    assert other.error == pytest.approx(1e-9 * one.error, rel=1e-6)
+    assert other.independent == pytest.approx(one.independent, rel=1e-6)
+
+
+@pytest.mark.parametrize("count", [3, 5, 16, 31, 64, 127, 128, 1001])
+def test_series_of_any_length_have_an_error(count):
+    values = np.random.default_rng(count).standard_normal(count)
+    assert 0.3 < spread(values).error * math.sqrt(count) < 3.0
+
+
+def test_what_is_no_number_is_refused():
+    with pytest.raises(InputError, match="number 3 of values is not finite"):
+        mean([1.0, 2.0, 3.0, math.nan] * 10)
