@@ -32,7 +32,7 @@ from kcons.cli.progress import Bars
 from kcons.comparison import Potential, environment, layers, long_steps, long_steps_report, processor_of
 from kcons.constraints import Distance
 
-PDB = Path(__file__).resolve().parent.parent / "tests" / "data" / "alanine-dipeptide-implicit.pdb"
+PDB = Path(__file__).resolve().parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"
 KT, FS = 300 * units.kB, units.fs
 ENERGY, LENGTH = units.kJ / units.mol, units.nm
 #: Edge of the box, and how far expensive and cheap forces reach in space, in nm.

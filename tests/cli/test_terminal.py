@@ -14,7 +14,7 @@ C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
 
 
 #: What the commands below import.
-IMPORTED = ("kcons.cli.main", "kcons.comparison.test_systems", "kcons.comparison.methods.methods", "rich.table")
+IMPORTED = ("kcons.cli.main", "kcons.comparison.test_systems", "kcons.comparison.methods", "rich.table")
 
 
 def said(line, where="", **variables):

@@ -78,12 +78,12 @@ def test_a_method_of_ones_own_is_compared(registry):
 
 def test_what_is_wrong_with_a_method_is_said(registry):
     with pytest.raises(InputError, match="engine is 'gromacs'; there are arrays, ASE, OpenMM"):
-        add_method("mine", lambda system, dt: None, engine="gromacs")
+        add_method("wrong", lambda system, dt: None, engine="gromacs")
     with pytest.raises(InputError, match="force_evaluations is 0; give 1 or more"):
-        add_method("mine", lambda system, dt: None, force_evaluations=0)
+        add_method("wrong", lambda system, dt: None, force_evaluations=0)
     with pytest.raises(InputError, match="kind is 'bath'; there are trajectory, baseline, thermostat"):
-        add_method("mine", lambda system, dt: None, kind="bath")
-    assert "mine" not in registry
+        add_method("wrong", lambda system, dt: None, kind="bath")
+    assert "wrong" not in registry
     with pytest.raises(InputError, match=r"there is no method 'ratle' \(did you mean 'rattle'"):
         choose(["ratle"])
     with pytest.raises(InputError, match="no method is named"):
