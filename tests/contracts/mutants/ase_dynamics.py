@@ -3,6 +3,30 @@
 MUTANTS = [
     # -- ASE: what changes between steps --
     (
+        "ase/respect.py",
+        "elif not self._scaled(x, cell):",
+        "elif False:",
+        "tests/ase/test_edits.py::test_an_edit_between_runs_is_refused",
+    ),
+    (
+        "ase/respect.py",
+        "return known is not None and _same(known, x) and cell.tobytes() == self._cell",
+        "return known is not None",
+        "tests/ase/test_edits.py::test_an_edit_between_runs_is_refused",
+    ),
+    (
+        "ase/constraints_object.py",
+        "        self._watch.between_steps = True\n\n    def _project_covector",
+        "\n    def _project_covector",
+        "tests/ase/test_edits.py::test_an_edit_is_named_before_a_class",
+    ),
+    (
+        "ase/constraints_object.py",
+        "frame = moves_far(old, new) and fulfilled(held, new, bound.touched)",
+        "frame = False",
+        "tests/ase/test_edits.py::test_frames_on_the_constraints_are_taken",
+    ),
+    (
         "ase/dynamics.py",
         "self.time, all_masses=True)",
         "self.time)",
