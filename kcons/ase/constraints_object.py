@@ -14,7 +14,7 @@ from ase import Atoms
 from ase.constraints import FixConstraint
 
 import kcons.constraints as families
-from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
+from kcons.ase.binding import Binding, applied_forces, bind, check_company, shared, touched_atoms
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, fulfilled, moves_far, warn_of_displacements
@@ -117,11 +117,13 @@ class Constraints(FixConstraint):
             check_company(atoms.constraints, self, bound)
         return bound
 
-    def _bind(self, atoms: Atoms) -> Binding:
+    def _bind(self, atoms: Atoms, *, alone: bool = False) -> Binding:
+        """An engine for these atoms; `alone` one that no other object has."""
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
-        bound = bind(given, atoms, self.degenerate)
-        bound.owner = ref(self)
+        bound = (bind if alone else shared)(given, atoms, self.degenerate)
+        if bound.owner() is None:
+            bound.owner = ref(self)
         self.constraints = bound.given
         self._repeated, self._binding = None, bound
         self._forget()
@@ -248,7 +250,7 @@ class Constraints(FixConstraint):
         bound = self._binding
         if bound is not None and bound.fits(atoms):
             new = numbers(cell, "cell")
-            mine = bound if bound.serves(self, atoms.cell.array, new) else self._bind(atoms)
+            mine = bound if bound.serves(self, atoms.cell.array, new) else self._bind(atoms, alone=True)
             mine.follow_cell(atoms, new)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
