@@ -217,24 +217,30 @@ def alike(one: Any, other: Any) -> bool:
 
 def holding(item: Any) -> Any:
     """What a constraint of ASE or kcons holds; nothing for those that only add forces."""
-    if isinstance(item, FORCES_ONLY):
-        return None
     if hasattr(item, "engine"):  # of kcons, whose rows are never changed
         return item.constraints
+    if isinstance(item, FORCES_ONLY):
+        return None
     own = vars(item)
     return [own.get(name) for name in _HELD]
 
 
 def company(present: Sequence[Any]) -> Company:
     """Constraints, each with what it holds now."""
-    return tuple((item, deepcopy(holding(item)) if not hasattr(item, "engine") else holding(item)) for item in present)
+    return tuple((item, holding(item) if hasattr(item, "engine") else deepcopy(holding(item))) for item in present)
 
 
 def same_company(present: Sequence[Any], known: Company) -> bool:
     """Whether these are the same constraints, and hold what they held."""
     if len(present) != len(known):
         return False
-    return all(item is one and alike(holding(item), held) for item, (one, held) in zip(present, known, strict=True))
+    for item, (one, held) in zip(present, known, strict=True):
+        if item is not one:
+            return False
+        now = holding(item)
+        if now is not held and not alike(now, held):
+            return False
+    return True
 
 
 def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:

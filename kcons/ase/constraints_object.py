@@ -182,14 +182,11 @@ class Constraints(FixConstraint):
         InputError
             The atoms were moved past the constraints in another way; see `restore`.
         """
-        if rand:
-            return
-        x, cell, watch = atoms.arrays["positions"], atoms.cell.array, self._watch
-        if self._last is not None and self._last() is atoms and watch.knows(x, cell):
-            watch.between_steps = False
-            return
+        x, cell = atoms.arrays["positions"], atoms.cell.array
+        if rand or not self._watch.in_another(cell):
+            return  # other edits are seen where positions are set
         bound = self._bound(atoms)
-        if not watch.look(bound.motion.constraint_set, x, cell):
+        if not self._watch.look(bound.motion.constraint_set, x, cell):
             try:
                 self._move(atoms, bound.motion, bound.motion.project_positions(x, x))
             except ConvergenceError as error:

@@ -33,6 +33,8 @@ FRAME = 0.3
 #: A correction (in Angstrom) below which the residual is not even looked at.
 _SMALL = 0.1
 
+_FLOAT = np.dtype(np.float64)
+
 #: Modules of ASE that displace atoms one by one and never ask constraints.
 DISPLACING = ("ase.vibrations.vibrations", "ase.phonons")
 _warned: WeakSet[object] = WeakSet()
@@ -76,6 +78,10 @@ class Watch:
         known = self._accepted
         return known is not None and _same(known, x) and cell.tobytes() == self._cell
 
+    def in_another(self, cell: FloatArray) -> bool:
+        """Whether positions were accepted in another cell than this."""
+        return self._accepted is not None and cell.tobytes() != self._cell
+
     def know(self, x: FloatArray, cell: FloatArray) -> None:
         """Accept positions that are on the constraints."""
         self._accepted, self._cell = x.copy(), cell.tobytes()
@@ -108,7 +114,7 @@ class Watch:
     def _scaled(self, x: FloatArray, cell: FloatArray) -> bool:
         """Whether positions are those accepted last but for a change of the cell that took them along."""
         known = self._accepted
-        if known is None or known.shape != x.shape or cell.tobytes() == self._cell:
+        if known is None or known.shape != x.shape or not self.in_another(cell):
             return False
         before = Cell(np.frombuffer(self._cell).reshape(3, 3)).complete()
         moved = known @ np.linalg.solve(before, Cell(cell).complete())
@@ -123,7 +129,8 @@ class Watch:
             raise InputError(
                 f"{off}: they were moved past the constraints since the last step, as atoms.positions[...] = ..., "
                 "set_distance, rotate_dihedral and set_positions(..., apply_constraint=False) do; going on from there "
-                "would turn the correction into velocity. Call Constraints.restore(atoms) first",
+                "would turn the correction into velocity. Call Constraints.restore(atoms) first, or make new "
+                "constraints that hold what they are at now",
                 item="positions",
                 atoms=held.row_atoms(row),
             )
@@ -184,7 +191,7 @@ class Watch:
 
     def _check_correction(self, held: ConstraintSet, x: FloatArray) -> None:
         asked = self._asked
-        if asked is None or not float(np.abs(asked - x).max(initial=0.0)) > _SMALL:
+        if asked is None or not _differ(asked, x, _SMALL):
             self._absurd = 0
             return
         miss = np.abs(held.value(asked)) / held.scale
@@ -232,7 +239,7 @@ def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) ->
 
 def moves_far(old: FloatArray, new: FloatArray) -> bool:
     """Whether an atom is asked to go farther than a time step takes it."""
-    return _differ(old, new, FRAME)
+    return old.shape == new.shape and _differ(old, new, FRAME)
 
 
 def fulfilled(held: ConstraintSet, x: FloatArray, touched: IntArray) -> bool:
@@ -254,8 +261,8 @@ def _same(a: FloatArray, b: FloatArray) -> bool:
 
 
 def _differ(a: FloatArray, b: FloatArray, much: float) -> bool:
-    """Whether a coordinate differs by more than `much`, or is not finite."""
-    if a.dtype == b.dtype == np.float64 and a.flags.c_contiguous and b.flags.c_contiguous:
+    """Whether a coordinate differs by more than `much`, or is not finite; of arrays of one shape."""
+    if a.dtype is b.dtype is _FLOAT and a.flags.c_contiguous and b.flags.c_contiguous:
         return bool(differ(a, b, much))
     return not bool((np.abs(a - b) <= much).all())
 
