@@ -90,6 +90,12 @@ def lent(array: FloatArray) -> FloatArray:
     return view
 
 
+def kept(array: NDArray[Any]) -> NDArray[Any]:
+    """The array itself, which nobody can change from now on."""
+    array.setflags(write=False)
+    return array
+
+
 def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
     """Refuse arrays that results cannot be written into.
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import kept, numbers
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import FloatArray, Target
@@ -408,7 +408,7 @@ def _held(item: LinearRows, point: ArrayLike) -> FloatArray:
     points = _for_each(point, item.n_rows, "point")
     if not np.all(np.isfinite(points)):
         raise InputError(f"{item.family}: point is not finite", item="point")
-    return np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points))
+    return kept(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))
 
 
 def _positive(item: Constraint, name: str, values: FloatArray) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import check_call, has_units, numbers, positive
+from kcons.constraints.arguments import check_call, has_units, kept, numbers, positive
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -140,7 +140,7 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
     if not np.all(np.isfinite(array)):
         row = int(np.flatnonzero(~np.isfinite(array.ravel()))[0])
         raise InputError(f"the target of row {row} is not finite: {array.ravel()[row]}", item="target")
-    return np.array(np.broadcast_to(array, (rows,)), order="C")
+    return kept(np.array(np.broadcast_to(array, (rows,)), order="C"))
 
 
 # -- derivatives that a user gave, and central differences for those that were not given --------------
