@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING, Any
 from kcons import __version__
 from kcons.cli import check, completion, doctor, freeenergy, listing, scan, studies, warmup
 from kcons.cli.parser import Parser
-from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
+from kcons.cli.terminal import (
+    Terminated,
+    console,
+    ended_in_order,
+    names,
+    numbers,
+    patient_streams,
+    rendered,
+    say_written,
+    show,
+    warnings_in_a_line,
+)
 from kcons.errors import InputError, KconsError, did_you_mean, with_extra
 
 #: Options of `kcons compare` and `kcons plan` by what can be run.
@@ -31,7 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     The exit status: 0; of `check`, 1 for a violation and 3 where not all could be told; of `scan` and
-    `freeenergy`, 3 where some points or windows failed; 2 for an error that the user can mend; 130 when interrupted.
+    `freeenergy`, 3 where some points or windows failed; 2 for an error that the user can mend; 130 when interrupted,
+    143 when terminated.
     """
     try:
         with patient_streams():
@@ -51,7 +63,8 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser.print_help()
         return 0
     try:
-        return int(chosen.run(chosen))
+        with ended_in_order(), warnings_in_a_line():
+            return int(chosen.run(chosen))
     except ModuleNotFoundError as error:
         explained = with_extra(error, f"kcons {chosen.command}")
         if not isinstance(explained, KconsError):
@@ -70,9 +83,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     except MemoryError as error:
         print(f"kcons: there is not enough memory: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("kcons: interrupted", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        ended, status = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
+        kept = getattr(chosen, "kept", None)
+        more = f"; finished {kept} are kept: run again to resume" if kept else ""
+        print(f"kcons: {ended}{more}", file=sys.stderr)
+        return status
 
 
 def commands() -> dict[str, Parser]:
@@ -196,7 +212,11 @@ def _compare(chosen: argparse.Namespace) -> int:
     folder: Path = chosen.out or Path(f"compare-{Path(chosen.scene or '').stem}")
     if chosen.dt is not None and not chosen.dt:
         raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
-    asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt, **_molecules(chosen)}
+    asked = {
+        "system": _system(chosen.scene),
+        **{name: getattr(chosen, name) for name in ("size", "seed", "quick", "dt")},
+        **_molecules(chosen),
+    }
     target: float | None = chosen.target_error
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
@@ -209,7 +229,7 @@ def _compare(chosen: argparse.Namespace) -> int:
             return _test_system(argparse.Namespace(**{**vars(chosen), "forces": forces}))
 
         folder = chosen.out or folder.with_name(f"{folder.name}-steps")  # beside what compares trajectories
-        return studies.compare_steps(chosen, budget, folder, with_forces)
+        return studies.compare_steps(chosen, budget, folder, asked["system"], with_forces)
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
@@ -228,14 +248,22 @@ def _compare(chosen: argparse.Namespace) -> int:
         )
     if chosen.criterion == "drift" and target is not None:
         raise InputError("--target-error is an error of trajectories; leave --criterion drift out", item="criterion")
+    return _compare_trajectories(chosen, budget, folder, asked)
+
+
+def _compare_trajectories(chosen: argparse.Namespace, budget: float, folder: Path, asked: dict[str, Any]) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison.methods import methods
     from kcons.comparison.methods.snippets import code
+    from kcons.comparison.study import report_files
     from kcons.comparison.work_precision import answer, measure, recommendation, report
     from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
 
     methods.chosen(chosen.methods)  # complain before any work
     _check_name(chosen)
+    results = report_files.results(folder, "compare", asked["system"])
+    results.refuse_others()
+    target: float | None = chosen.target_error
     with Bars() as watcher:
         compiling = "" if measure.kernels_cached() else "; compiling kernels (once)"
         with watcher.piece(f"building the test system{compiling}", 1):
@@ -279,8 +307,14 @@ def _compare(chosen: argparse.Namespace) -> int:
     for words in first:
         terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(report.table(result, narrow=not report.fits(result, terminal.width)), explained, terminal)
-    say_written(report.write(result, folder, tables=[*first, rendered(report.table(result)), explained]))
+    with results.taken():
+        say_written(report.write(result, folder, tables=[*first, rendered(report.table(result)), explained]))
     return 130 if "interrupted" in result.settings else 0
+
+
+def _system(scene: str | None) -> str:
+    """What results belong to: a test system by name, or a file by its path."""
+    return str(Path(scene).resolve()) if scene and Path(scene).is_file() else str(scene)
 
 
 def _expression(chosen: argparse.Namespace) -> str:
@@ -329,8 +363,8 @@ def _compare_all(chosen: argparse.Namespace) -> int:
         return 0
     folder: Path = chosen.out or Path("compare-all")
     items = parts_of_the_whole.chosen(chosen.only)
-    folder.mkdir(parents=True, exist_ok=True)
-    with Bars() as watcher:
+    results = whole.results(folder)
+    with results.taken(), Bars() as watcher:
         path = whole.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)
     print(f"wrote {path}, and beside it JSON, PNG and TXT of every part")
     return 0
@@ -341,11 +375,14 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     from kcons.comparison import test_systems
     from kcons.comparison.averages import report as sampling_report
     from kcons.comparison.averages import sampling
+    from kcons.comparison.study import report_files
     from kcons.comparison.work_precision import answer
 
     sampling.chosen(chosen.methods)  # complain before any work
     _check_name(chosen)
     _take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
+    results = report_files.results(folder, "compare", asked["system"])
+    results.refuse_others()
     fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
     if chosen.dt is not None:
         fluid = fluid.with_time_steps(chosen.dt)
@@ -367,7 +404,8 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     for words in first:
         terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(table, explained, terminal)
-    say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
+    with results.taken():
+        say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
     return 130 if "interrupted" in result.settings else 0
 
 

@@ -13,6 +13,7 @@ from kcons.errors import InputError
 if TYPE_CHECKING:
     from kcons.comparison.averages.layers import Layers
     from kcons.comparison.test_systems import TestSystem
+    from kcons.steppers.files import ResultFolder
 
 
 def add(commands: Any) -> None:
@@ -57,63 +58,75 @@ def _hard_cases(chosen: argparse.Namespace) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison import hard_cases
     from kcons.comparison.hard_cases import report
+    from kcons.comparison.hard_cases.study import FORMAT
 
     cases = hard_cases.chosen(chosen.only)
     if chosen.list:
         for case in cases.values():
             print(f"{case.number}  {case.title}: {case.limit}")
         return 0
-    chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "hard_cases.json"
-    with Bars() as watcher:
-        result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
-    show(report.table(result), report.summary(result), console())
-    say_written([kept, *report.write(result, chosen.out)])
+    with _results(kept, FORMAT).taken():
+        with Bars() as watcher:
+            result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
+        show(report.table(result), report.summary(result), console())
+        say_written([kept, *report.write(result, chosen.out)])
     return 0
+
+
+def _results(kept: Path, form: str) -> ResultFolder:
+    from kcons.steppers.files import ResultFolder
+
+    names = [kept.with_suffix(f".{kind}").name for kind in ("json", "png", "html")]
+    return ResultFolder(kept.parent, kept.name, {"format": form}, names, f"a {kept.stem} study")
 
 
 def _stability(chosen: argparse.Namespace) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison import stability
     from kcons.comparison.stability import report
+    from kcons.comparison.stability.study import FORMAT
 
-    chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "stability.json"
-    with Bars() as watcher:
-        found = stability.run(
-            only=chosen.only, test_systems=chosen.scenes, quick=chosen.quick, kept=kept, watcher=watcher
-        )
-    result = stability.digest(found)
-    if chosen.into:
-        before, result = stability.put_into(result, chosen.into[0])
-        for page in chosen.into[1:]:
-            report.renew(page, before, result)
-        say_written(chosen.into)
-    print(report.text(result))
-    say_written([kept, *report.write(result, chosen.out)])
+    with _results(kept, FORMAT).taken():
+        with Bars() as watcher:
+            found = stability.run(
+                only=chosen.only, test_systems=chosen.scenes, quick=chosen.quick, kept=kept, watcher=watcher
+            )
+        result = stability.digest(found)
+        if chosen.into:
+            before, result = stability.put_into(result, chosen.into[0])
+            for page in chosen.into[1:]:
+                report.renew(page, before, result)
+            say_written(chosen.into)
+        print(report.text(result))
+        say_written([kept, *report.write(result, chosen.out)])
     return 0
 
 
 def compare_steps(
-    chosen: argparse.Namespace, budget: float, folder: Path, with_forces: Callable[[str], TestSystem]
+    chosen: argparse.Namespace, budget: float, folder: Path, system: str, with_forces: Callable[[str], TestSystem]
 ) -> int:
     """Bias against evaluations of the expensive forces; `with_forces` makes the test system of a file."""
     from kcons.cli.progress import Bars
     from kcons.comparison.averages import long_steps
     from kcons.comparison.averages import long_steps_report as report
+    from kcons.comparison.study import report_files
 
     long_steps.chosen(chosen.methods)  # complain before any work
     if chosen.fast is None:
         raise InputError("--slow needs --fast: give the cheap forces, too", item="fast")
     if chosen.slow == chosen.fast:
         raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
+    results = report_files.results(folder, "compare", system)
+    results.refuse_others()
     with Bars() as watcher:
         with watcher.piece("building the system", 1):
             layers = _layers(chosen, with_forces)
         unit = layers.units.time_unit
         steps = None if chosen.dt is None else [dt * unit for dt in chosen.dt]
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
-        asked = {"slow": chosen.slow, "fast": chosen.fast, "size": chosen.size, "quick": chosen.quick}
+        asked = {"system": system, "slow": chosen.slow, "fast": chosen.fast, "size": chosen.size, "quick": chosen.quick}
         result = long_steps.compare(
             layers,
             methods=chosen.methods,
@@ -129,7 +142,8 @@ def compare_steps(
     if stopped:
         explained = f"{stopped}\n{explained}"
     show(table, explained, console())
-    say_written(report.write(result, folder, tables=[rendered(table), explained]))
+    with results.taken():
+        say_written(report.write(result, folder, tables=[rendered(table), explained]))
     return 130 if stopped else 0
 
 

@@ -41,6 +41,7 @@ def test_compare_writes_table_plot_and_json(tmp_path, capsys):
     assert data["scene"]["atoms"] == 5
     assert data["scene"]["rank"] == 4
     assert data["settings"] == {
+        "system": "chain",
         "methods": ["rattle", "verlet"],
         "budget_seconds": 20.0,
         "size": 4,
@@ -291,3 +292,36 @@ def test_ctrl_c_before_anything_is_done(tmp_path, monkeypatch, capsys):
 def test_criteria_that_do_not_fit(words, said, capsys):
     assert run("compare", *words) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["compare", "chain", "--methods", "rattle"], ["compare.json", "compare.png", "compare.txt"]),
+        (["compare", "thermostat", "--methods", "langevin"], ["compare.json", "compare.png", "compare.txt"]),
+        (["compare", "thermostat-water", "--fast", "3.8", "--methods", "spheres"], ["compare.json", "compare.txt"]),
+        (["compare", "--all", "--quick"], ["index.html", "chain-1e2.json", "chain-1e2.png"]),
+        (["hardcases", "--quick", "--only", "X06"], ["hard_cases.json", "hard_cases.png", "hard_cases.html"]),
+        (["stability", "--quick", "--only", "fuzz"], ["stability.json", "stability.png", "stability.html"]),
+    ],
+    ids=lambda given: "-".join(given[:2]),
+)
+def test_results_of_others_are_not_overwritten(words, names, tmp_path, capsys):
+    """Before anything is measured."""
+    for name in names:
+        other = tmp_path / name / name
+        other.parent.mkdir()
+        other.write_text("precious")
+        assert run(*words, "--out", other.parent) == 2
+        assert f"other files called {name}; give another folder (--out)" in capsys.readouterr().err
+        assert [path.name for path in other.parent.iterdir()] == [name] and other.read_text() == "precious"
+
+
+def test_a_comparison_replaces_that_of_the_same_system_alone(tmp_path, capsys):
+    words = ("--methods", "rattle", "--dt", 10, "--out", tmp_path)
+    assert run("compare", "chain", "--size", 3, *words) == 0
+    assert run("compare", "chain", "--size", 4, *words) == 0
+    before = (tmp_path / "compare.json").read_bytes()
+    assert run("compare", "sphere", *words) == 2
+    assert "has a comparison of other system (chain); give another folder (--out)" in capsys.readouterr().err
+    assert (tmp_path / "compare.json").read_bytes() == before

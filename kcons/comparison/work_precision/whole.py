@@ -28,6 +28,7 @@ from kcons.comparison.work_precision.parts_of_the_whole import PLAN, Item
 from kcons.comparison.work_precision.recommendation import sharpen
 from kcons.comparison.work_precision.timing_rounds import FULL_ROUNDS, QUICK_ROUNDS
 from kcons.errors import InputError, KconsError
+from kcons.steppers.files import ResultFolder
 
 FORMAT = "kcons-report-1"
 #: Digits that go to files.
@@ -96,6 +97,13 @@ def run(
         # An interrupted run has a page, too, and it shows whatever is in the folder.
         path = _page(folder)
     return path
+
+
+def results(folder: Path) -> ResultFolder:
+    """The folder of the whole comparison; whose it is says the first part that is there."""
+    names = [f"{item.key}.{kind}" for item in PLAN for kind in ("json", "png", "txt")]
+    record = next((name for name in names[::3] if (folder / name).exists()), names[0])
+    return ResultFolder(folder, record, {"format": FORMAT}, [*names, "index.html"], "a whole comparison")
 
 
 def key_of(item: Item, quick: bool) -> dict[str, Any]:
