@@ -170,8 +170,11 @@ class LocalProjections:
         """c of A v = c at local positions; None if it is 0."""
         return self.rows.velocity_target(x, time) if self.plan.driven else None
 
-    def nearest(self, x: FloatArray, time: float, work: Work) -> None:
-        """Bring `x` to the nearest point on the constraints in the mass metric, in place, for no more than `work`."""
+    def nearest(self, x: FloatArray, time: float, work: Work) -> float:
+        """Bring `x` to the nearest point on the constraints in the mass metric, in place, for no more than `work`.
+
+        What it returns is said at `FarStart.restore`.
+        """
         if len(self.plan.pinned):
             x[self.plan.pinned] = self.plan.pinned_targets(self.rows.target(time) if self._moving else None)
         start = FarStart(
@@ -185,6 +188,6 @@ class LocalProjections:
         )
         self._rescuers.work = work
         try:
-            start.restore(x, time)
+            return start.restore(x, time)
         finally:
             self._rescuers.work = None
