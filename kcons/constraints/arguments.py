@@ -87,10 +87,10 @@ def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArra
 
 def out_of_range(values: FloatArray) -> tuple[int, str] | None:
     """The first row with a value that is not finite or larger than `LARGEST`, and what to say of it; None without."""
-    bad = ~(np.abs(values) <= LARGEST)
-    if not bad.any():
+    good = np.abs(values) <= LARGEST
+    if good.all():
         return None
-    first = np.argwhere(bad)[0]
+    first = np.argwhere(~good)[0]
     value = float(values[tuple(first)])
     said = f"{value:g}, of which the square overflows; choose other units" if math.isfinite(value) else "not finite"
     return int(first[0]) if len(first) else 0, said

@@ -143,8 +143,8 @@ MUTANTS = [
     ),
     (
         "constraints/arguments.py",
-        "bad = ~(np.abs(values) <= LARGEST)",
-        "bad = ~np.isfinite(values)",
+        "good = np.abs(values) <= LARGEST",
+        "good = np.isfinite(values)",
         "tests/constraints/test_target.py::test_numbers_whose_squares_overflow_are_refused",
     ),
     (
