@@ -17,7 +17,7 @@ import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import Watch, fulfilled, warn_of_displacements
+from kcons.ase.respect import Watch, require_on_surface, warn_of_displacements
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_form
 from kcons.constraints import Constraint
@@ -129,6 +129,7 @@ class Constraints(FixConstraint):
 
     def _forget(self) -> None:
         """What is known of the positions is void."""
+        self._on_surface = False
         self._watch = Watch()
         #: Calls of each hook until its result is certified.
         self._positions_due = self._momenta_due = 0
@@ -136,72 +137,44 @@ class Constraints(FixConstraint):
     # -- ASE's hooks ----------------------------------------------------------------------------
 
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
-        """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
-
-        Where atoms are asked to go far, and these gradients do not lead there, positions that fulfil the constraints
-        already are taken as they are, but for what the digits of a file leave: this is a frame, and no step.
-
-        Raises
-        ------
-        InputError
-            The atoms were moved past the constraints before; see `restore`.
-        """
+        """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails."""
         bound = self._bound(atoms)
         bound.check(new, "position")
-        old, cell, held = atoms.arrays["positions"], atoms.cell.array, bound.motion.constraint_set
+        old = atoms.arrays["positions"]
+        if not self._on_surface:
+            require_on_surface(bound.motion.constraint_set, old)
+            self._on_surface = True
         asked = self._watch.ask(new)
         try:
-            self._watch.look(held, old, cell)
             _in_place(bound.motion.project_positions, new, new, old)
-        except (ConvergenceError, InputError, UnsupportedError) as error:
-            if not fulfilled(held, new, bound.touched):
-                if isinstance(error, ConvergenceError):
-                    error.add_note("In ASE: a smaller timestep or maxstep")
-                raise
-            _in_place(bound.motion.project_positions, new, new, asked)
-        if self._positions_due <= 0:
-            _certify_positions(bound.motion, new, asked)
-            self._positions_due = CHECK_EVERY
-        self._positions_due -= 1
-        self._watch.accept(asked, new, cell, atoms)
-
-    def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
-        """Leave forces of dynamics, and noise, as they are; atoms that are off the constraints are put right.
-
-        ASE asks for these forces before it makes a step from the positions. What is off the constraints by little, or
-        was scaled together with the cell, goes back here, so that no step makes velocities of it.
-
-        Raises
-        ------
-        InputError
-            Atoms were moved past the constraints, and farther than that; see `restore`.
-        """
-        if rand:
-            return
-        x, cell, watch = atoms.arrays["positions"], atoms.cell.array, self._watch
-        if self._last is not None and self._last() is atoms and watch.knows(x, cell):
-            watch.between_steps = False
-            return
-        bound = self._bound(atoms)
-        if not self._watch.look(bound.motion.constraint_set, x, cell):
-            self.restore(atoms)
+            if self._positions_due <= 0:
+                _certify_positions(bound.motion, new, asked)
+                self._positions_due = CHECK_EVERY
+            self._positions_due -= 1
+        except ConvergenceError as error:
+            error.add_note(
+                "In ASE: a smaller timestep or maxstep; or, if the atoms were placed anew, atoms.positions[:] = ... "
+                "followed by Constraints.restore(atoms)"
+            )
+            raise
+        self._watch.accept(asked, new, bound.cell, atoms)
 
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
 
         Raises
         ------
-        InputError
-            The atoms are off the constraints, or were moved past them since the last step; see `restore`.
         UnsupportedError
-            They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
+            The atoms are off the constraints, or were moved past them: only dynamics set momenta, and such
+            dynamics do not respect constraints.
         """
         bound = self._bound(atoms)
         bound.check(momenta, "momentum")
         if momenta.shape == (bound.n_atoms, 3):  # otherwise the engine complains
-            held, x = bound.motion.constraint_set, atoms.arrays["positions"]
-            self._watch.look(held, x, atoms.cell.array)
-            self._watch.check_momenta(held, x)
+            if not self._on_surface:
+                require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
+                self._on_surface = True
+            self._watch.check_momenta(bound.motion.constraint_set, bound.cell, atoms.arrays["positions"])
         try:
             if bound.weights is None or momenta.shape != bound.weights[0].shape:
                 # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
@@ -247,7 +220,6 @@ class Constraints(FixConstraint):
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
         self._bound(atoms).check(forces, "force")
         self._project_covector(atoms, forces)
-        self._watch.between_steps = True
 
     def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:
         _in_place(self._bound(atoms).motion.project_forces, values, atoms.arrays["positions"], values)
@@ -311,7 +283,7 @@ class Constraints(FixConstraint):
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None, "_last": None, "_watch": Watch()}
+        return {**self.__dict__, "_binding": None, "_last": None, "_on_surface": False, "_watch": Watch()}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
@@ -359,7 +331,6 @@ class Constraints(FixConstraint):
         atoms.set_positions(x, apply_constraint=False)
         if momenta is not None:
             atoms.set_momenta(momenta, apply_constraint=False)
-        self._watch.know(x, atoms.cell.array)
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
@@ -476,7 +447,8 @@ def constrain(
         if project:
             held.restore(atoms)
         bound = held._bound(atoms)
-        held._watch.look(bound.motion.constraint_set, atoms.arrays["positions"], atoms.cell.array)
+        require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
+        held._on_surface = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
     except BaseException:

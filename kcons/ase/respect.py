@@ -1,4 +1,4 @@
-"""Detection of what does not respect the constraints of its atoms: edits, dynamics classes, finite differences."""
+"""Detection of what does not respect the constraints of its atoms: dynamics classes, finite differences."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from weakref import WeakSet
 
 import numpy as np
 from ase import Atoms
-from ase.cell import Cell
 
 from kcons.constraints.arguments import finite_array
 from kcons.constraints.constraint import IntArray
@@ -17,12 +16,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 
-#: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
-#: most files leave. Farther off they are refused.
+#: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta.
 START_TOLERANCE = 1e-6
-#: Digits after the point that coordinates in Angstrom may have in a file, where they are looked for: GROMACS and PDB
-#: files have 2 and 3; what more than 6 leave is within START_TOLERANCE.
-DIGITS = (2, 3, 4, 5, 6)
 #: Residual of asked positions, relative to the scale of the row, that no usable time step produces ...
 ABSURD = 0.3
 #: ... and how many steps in a row it takes to say so.
@@ -35,101 +30,29 @@ DISPLACING = ("ase.vibrations.vibrations", "ase.phonons")
 _warned: WeakSet[object] = WeakSet()
 
 ADVICE = (
-    "use kcons.ase.ConstrainedDynamics for constant energy, ConstrainedLangevin, ConstrainedNoseHoover or "
-    "IsokineticDynamics of kcons.ase for constant temperature, and these with barostat= for constant pressure; of "
-    "ASE's own classes VelocityVerlet, Langevin(fixcm=False) and Bussi are right"
+    "use kcons.ase.ConstrainedDynamics for constant energy, and ase.md.langevin.Langevin(fixcm=False) or "
+    "ase.md.bussi.Bussi for constant temperature; if the atoms were edited without constraints, call "
+    "Constraints.restore(atoms)"
 )
 
 
 class Watch:
-    """The positions that the constraints last accepted: what differs from them was moved past the constraints.
+    """The positions that an MD engine last asked for and got, which show whether it respects the constraints.
 
-    Also what an MD engine last asked for, which shows whether it respects the constraints: only dynamics set momenta,
-    and an MD engine that goes on from its own copy of the positions asks for uncorrected ones again.
-
-    Attributes
-    ----------
-    between_steps : bool
-        Whether forces were asked for last: all dynamics and optimizers of ASE end their steps so. Who moves atoms then
-        is a person, and otherwise most often the dynamics class.
+    Only dynamics set momenta. Positions must be on the constraints then; if they are not, the MD engine has
+    continued from its own copy of the positions instead of the corrected ones.
     """
 
     def __init__(self) -> None:
-        self.between_steps = True
         self._accepted: FloatArray | None = None
-        self._cell = b""
         self._before: FloatArray | None = None  # what was accepted before these positions were asked for first
+        self._cell = b""
         self._asked: FloatArray | None = None
         self._momenta_since = False
         self._counted = False
         self._repeats = 0
         self._absurd = 0
         self._looked = True
-
-    # -- the positions that atoms have ----------------------------------------------------------
-
-    def knows(self, x: FloatArray, cell: FloatArray) -> bool:
-        """Whether these are the positions that were accepted last, in the same cell."""
-        known = self._accepted
-        return known is not None and _same(known, x) and cell.tobytes() == self._cell
-
-    def know(self, x: FloatArray, cell: FloatArray) -> None:
-        """Accept positions that are on the constraints."""
-        self._accepted, self._cell = x.copy(), cell.tobytes()
-
-    def look(self, held: ConstraintSet, x: FloatArray, cell: FloatArray) -> bool:
-        """Whether positions before a step, or where momenta are set, are on the constraints to rounding.
-
-        False where they are to be put right before velocities are made of their change: off by less than
-        START_TOLERANCE, or scaled together with the cell, as barostats do.
-
-        Raises
-        ------
-        InputError
-            They are farther off.
-        UnsupportedError
-            They are, and were moved within a step.
-        """
-        right = self.knows(x, cell)
-        if not right:
-            worst = worst_row(held, x)
-            if worst is not None and not self._scaled(x, cell):
-                self._refuse(held, x, *worst)
-            right = worst is None and bool(np.all(np.abs(held.value(x)) <= 4 * held.tolerance(x)))
-            if right:
-                self.know(x, cell)
-        self.between_steps = False
-        return right
-
-    def _scaled(self, x: FloatArray, cell: FloatArray) -> bool:
-        """Whether positions are those accepted last but for a change of the cell that took them along."""
-        known = self._accepted
-        if known is None or known.shape != x.shape or cell.tobytes() == self._cell:
-            return False
-        before = Cell(np.frombuffer(self._cell).reshape(3, 3)).complete()
-        moved = known @ np.linalg.solve(before, Cell(cell).complete())
-        return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
-
-    def _refuse(self, held: ConstraintSet, x: FloatArray, row: int, miss: float) -> None:
-        if self._accepted is None:
-            require_on_surface(held, x)
-        finite_array(x, held.n_atoms, "position")
-        off = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target()[row]:.6g})"
-        if self.between_steps:
-            raise InputError(
-                f"{off}: they were moved past the constraints since the last step, as atoms.positions[...] = ..., "
-                "set_distance, rotate_dihedral and set_positions(..., apply_constraint=False) do; going on from there "
-                "would turn the correction into velocity. Call Constraints.restore(atoms) first",
-                item="positions",
-                atoms=held.row_atoms(row),
-            )
-        raise UnsupportedError(
-            f"{off}: they were moved past the constraints since momenta were last set. If you moved them, call "
-            "Constraints.restore(atoms). If not, this dynamics class does so (LangevinBAOAB does); instead, "
-            f"{ADVICE}"
-        )
-
-    # -- what a dynamics class asks for ---------------------------------------------------------
 
     def ask(self, new: FloatArray) -> FloatArray:
         """Remember positions before they are corrected."""
@@ -147,27 +70,37 @@ class Watch:
         self._momenta_since = False
         return asked
 
-    def accept(self, asked: FloatArray, new: FloatArray, cell: FloatArray, atoms: Atoms) -> None:
+    def accept(self, asked: FloatArray, new: FloatArray, cell: bytes, atoms: Atoms) -> None:
         """Remember the corrected positions."""
         if not self._counted:
             self._before = self._accepted
         own = new.base is None and new is not atoms.arrays["positions"] and new.dtype == np.float64
         self._accepted = new if own else np.array(new, dtype=np.float64)
-        self._cell = cell.tobytes()
+        self._cell = cell
         self._asked = asked
         if self._counted and (_near(asked, new) or _near(self._before, new)):
             # Positions that need no correction may be set as often as one likes; atoms at rest ask for the same.
             self._repeats = 0
 
-    def check_momenta(self, held: ConstraintSet, x: FloatArray) -> None:
-        """Momenta are about to be set at `x`, which was looked at.
+    def check_momenta(self, held: ConstraintSet, cell: bytes, x: FloatArray) -> None:
+        """Momenta are about to be set at `x`.
 
         Raises
         ------
         UnsupportedError
-            The MD engine keeps asking for its own uncorrected positions.
+            The positions are off the constraints, or the MD engine keeps asking for its own uncorrected ones.
         """
         self._momenta_since = True
+        accepted = self._accepted
+        if accepted is None or self._cell != cell or not _same(accepted, x):
+            worst = worst_row(held, x)
+            if worst is not None and np.isfinite(worst[1]):  # the engine names positions that are not finite
+                row, miss = worst
+                raise UnsupportedError(
+                    f"momenta are set while the atoms are off row {held.row_name(row)} by {miss:.6g}: this dynamics "
+                    f"class moves atoms past their constraints (LangevinBAOAB does). Instead, {ADVICE}"
+                )
+            self._accepted, self._cell = x.copy(), cell
         if self._repeats >= 2:
             self._repeats = 0
             raise UnsupportedError(
@@ -224,19 +157,6 @@ def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) ->
             item="positions",
             atoms=held.row_atoms(row),
         )
-
-
-def fulfilled(held: ConstraintSet, x: FloatArray, touched: IntArray) -> bool:
-    """Whether positions fulfil the rows, those of the atoms `touched`: to rounding, or to the digits they come with."""
-    miss, scale = np.abs(held.value(x)), held.scale
-    if np.all(miss <= np.maximum(START_TOLERANCE * scale, 4 * held.tolerance(x))):
-        return True
-    for digits in DIGITS:
-        written = x[touched] * 10.0**digits
-        if np.abs(written - np.round(written)).max(initial=0.0) <= 1e-3:  # also those that were float32 in between
-            reach = np.asarray(abs(held.jacobian(x)).sum(axis=1)).ravel()
-            return bool(np.all(miss <= 0.5 * 10.0**-digits * reach + START_TOLERANCE * scale))
-    return False
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:
