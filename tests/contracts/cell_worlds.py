@@ -278,6 +278,8 @@ def _finished(b: Builder) -> World:
     s = _singular_values(rows, x)
     if np.any((s > DEPENDENT) & (s < s.max(initial=0.0) / WORST_CONDITION)):
         raise Unsuitable
+    if np.sum(s >= DEPENDENT) == 3 * (n - len(pinned)):
+        raise Unsuitable  # nothing can move, and a speed of 0 is no measure of what rounds
     if np.any(s < DEPENDENT) and (np.any(rows.waving[0]) or np.any(waves)):
         raise Unsuitable  # rows that depend on each other contradict each other once one of them moves
     if not b.impossible and np.any(np.abs(rows.value(x, 0.0)) > 1e-12):
