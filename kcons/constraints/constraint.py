@@ -22,7 +22,16 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import LENGTH, MD_UNITS, Kind, kept, numbers, plain_target, taking_quantities
+from kcons.constraints.arguments import (
+    LENGTH,
+    MD_UNITS,
+    Kind,
+    kept,
+    numbers,
+    out_of_range,
+    plain_target,
+    taking_quantities,
+)
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError
@@ -114,9 +123,10 @@ class Constraint(ABC):
                     f"for all rows or {shape}",
                     item=name,
                 ) from None
-            if not np.all(np.isfinite(array)):
-                row = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise InputError(f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row])
+            wrong = out_of_range(array)
+            if wrong is not None:
+                row, said = wrong
+                raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
             setattr(self, name, kept(np.array(array, order="C")))
 
     def __setstate__(self, own: dict[str, Any]) -> None:
