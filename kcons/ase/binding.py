@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from math import isfinite
 from operator import is_
-from typing import Any, Literal
+from threading import local
+from typing import Any, Literal, TypeAlias
 from weakref import ref
 
 import ase.constraints
@@ -30,8 +33,18 @@ _SHORT = 4096
 #: Arrays of atoms that calculators read.
 _READ = ("numbers", "initial_charges", "initial_magmoms")
 
+#: Engines of the last objects that are kept for other objects with the same rows, as frames of a file have.
+RECENT = 2
+
+#: What objects of ASE hold, by the names of their attributes.
+_HELD = "index", "mask", "dir", "pairs", "bondlengths", "triples", "bonds", "angles", "dihedrals", "bondcombos"
+
 #: ASE objects that only add forces, so that they get along with any constraint.
 FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
+
+
+#: Constraints on atoms, each with what it holds.
+Company: TypeAlias = tuple[tuple[Any, Any], ...]
 
 
 @dataclass
@@ -53,7 +66,8 @@ class Binding:
     cell: bytes
     #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
     weights: tuple[FloatArray, FloatArray, FloatArray] | None
-    others: tuple[Any, ...] = ()
+    #: Other constraints on the atoms, and what these held when they were looked at.
+    others: Company = ()
     #: The object whose cells the engine follows, if it is still there.
     owner: Callable[[], object] = lambda: None
 
@@ -152,9 +166,86 @@ def bind(
     )
 
 
+class _Recent(local):
+    """Engines that were built last in this thread, each with the rows as they were given and what `degenerate` was."""
+
+    def __init__(self) -> None:
+        self.known: deque[tuple[tuple[Constraint, ...], str, Binding]] = deque(maxlen=RECENT)
+
+
+_recent = _Recent()
+
+
+def shared(given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["convert", "raise"]) -> Binding:
+    """An engine as `bind` gives it, or one that was built before for the same rows, masses and cell.
+
+    Frames of a file need one engine together. Only rows whose engine depends on no positions have it in common: targets
+    are given, nothing was converted to linear rows, and minimum images say all.
+    """
+    given = tuple(given)
+    for rows, how, bound in _recent.known:
+        same_cell = not bound.periodic or atoms.cell.array.tobytes() == bound.cell
+        if how == degenerate and same_cell and bound.fits(atoms) and alike(rows, given):
+            return bound
+    bound = bind(given, atoms, degenerate)
+    motion = bound.motion
+    plain = motion.constraint_set.images is None and all(item.windings is None for item in bound.given)
+    if plain and not motion.conversions and all(item.target is not None for item in given):
+        _recent.known.append((given, degenerate, bound))
+    return bound
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Whether two values say the same: the same object, or numbers, words, arrays, rows and collections of such."""
+    if one is other:
+        return True
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other)
+    if isinstance(one, Constraint):
+        return alike(vars(one), vars(other))
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(alike(value, other[name]) for name, value in one.items())
+    if isinstance(one, list):
+        with suppress(ValueError):  # of arrays in it
+            return bool(one == other)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    return isinstance(one, int | float | str | np.generic) and bool(one == other)
+
+
+def holding(item: Any) -> Any:
+    """What a constraint of ASE or kcons holds; nothing for those that only add forces."""
+    if hasattr(item, "engine"):  # of kcons, whose rows are never changed
+        return item.constraints
+    if isinstance(item, FORCES_ONLY):
+        return None
+    own = vars(item)
+    return [own.get(name) for name in _HELD]
+
+
+def company(present: Sequence[Any]) -> Company:
+    """Constraints, each with what it holds now."""
+    return tuple((item, holding(item) if hasattr(item, "engine") else deepcopy(holding(item))) for item in present)
+
+
+def same_company(present: Sequence[Any], known: Company) -> bool:
+    """Whether these are the same constraints, and hold what they held."""
+    if len(present) != len(known):
+        return False
+    for item, (one, held) in zip(present, known, strict=True):
+        if item is not one:
+            return False
+        now = holding(item)
+        if now is not held and not alike(now, held):
+            return False
+    return True
+
+
 def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
     """Refuse ASE constraints that share atoms with `own`: ASE would apply them one after the other."""
-    if len(present) == len(bound.others) and all(a is b for a, b in zip(present, bound.others, strict=True)):
+    if same_company(present, bound.others):
         return
     for other in present:
         if other is own or isinstance(other, FORCES_ONLY):
@@ -168,7 +259,7 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
                 f"one after the other, and neither would hold. Put all of it into one Constraints object"
                 f"{_REPLACEMENTS.get(type(other).__name__, '')}"
             )
-    bound.others = tuple(present)
+    bound.others = company(present)
 
 
 def _acted_on(other: Any, n_atoms: int) -> IntArray:

@@ -14,10 +14,10 @@ from ase import Atoms
 from ase.constraints import FixAtoms, FixConstraint
 
 import kcons.constraints as families
-from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
+from kcons.ase.binding import Binding, applied_forces, bind, check_company, shared, touched_atoms
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import Watch, require_on_surface, warn_of_displacements
+from kcons.ase.respect import Watch, fulfilled, moves_far, warn_of_displacements
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_form, ase_forms
 from kcons.constraints import Constraint
@@ -128,11 +128,13 @@ class Constraints(FixConstraint):
             check_company(atoms.constraints, self, bound)
         return bound
 
-    def _bind(self, atoms: Atoms) -> Binding:
+    def _bind(self, atoms: Atoms, *, alone: bool = False) -> Binding:
+        """An engine for these atoms; `alone` one that no other object has."""
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
-        bound = bind(given, atoms, self.degenerate)
-        bound.owner = ref(self)
+        bound = (bind if alone else shared)(given, atoms, self.degenerate)
+        if bound.owner() is None:
+            bound.owner = ref(self)
         self.constraints = bound.given
         self._repeated, self._binding = None, bound
         self._forget()
@@ -140,7 +142,6 @@ class Constraints(FixConstraint):
 
     def _forget(self) -> None:
         """What is known of the positions is void."""
-        self._on_surface = False
         self._watch = Watch()
         #: Calls of each hook until its result is certified.
         self._positions_due = self._momenta_due = 0
@@ -148,44 +149,77 @@ class Constraints(FixConstraint):
     # -- ASE's hooks ----------------------------------------------------------------------------
 
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
-        """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails."""
+        """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
+
+        A frame that fulfils the constraints already, and to which these gradients need not lead, is taken as it is, but
+        for what the digits of its file leave.
+
+        Raises
+        ------
+        InputError
+            The atoms were moved past the constraints before; see `restore`.
+        """
         bound = self._bound(atoms)
         bound.check(new, "position")
-        old = atoms.arrays["positions"]
-        if not self._on_surface:
-            require_on_surface(bound.motion.constraint_set, old)
-            self._on_surface = True
+        old, cell, held = atoms.arrays["positions"], atoms.cell.array, bound.motion.constraint_set
         asked = self._watch.ask(new)
-        try:
-            _in_place(bound.motion.project_positions, new, new, old)
-            if self._positions_due <= 0:
-                _certify_positions(bound.motion, new, asked)
-                self._positions_due = CHECK_EVERY
-            self._positions_due -= 1
-        except ConvergenceError as error:
-            error.add_note(
-                "In ASE: a smaller timestep, maxstep, or dr of BasinHopping; or, if the atoms were placed anew, "
-                "atoms.positions[:] = ... followed by Constraints.restore(atoms)"
-            )
-            raise
-        self._watch.accept(asked, new, bound.cell, atoms)
+        frame = moves_far(old, new) and fulfilled(held, new, bound.touched)
+        if not frame:
+            try:
+                self._watch.look(held, old, cell)
+                _in_place(bound.motion.project_positions, new, new, old)
+            except (ConvergenceError, InputError, UnsupportedError) as error:
+                frame = fulfilled(held, new, bound.touched)
+                if not frame:
+                    if isinstance(error, ConvergenceError):
+                        error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
+                    raise
+        if frame:
+            _in_place(bound.motion.project_positions, new, new, asked)
+        if self._positions_due <= 0:
+            _certify_positions(bound.motion, new, asked)
+            self._positions_due = CHECK_EVERY
+        self._positions_due -= 1
+        self._watch.accept(asked, new, cell, atoms)
+
+    def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
+        """Leave forces of dynamics, and noise, as they are; put atoms right that were scaled together with the cell.
+
+        ASE asks for these forces before it makes a step from the positions: later on, velocities would be made of what
+        is put right.
+
+        Raises
+        ------
+        InputError
+            The atoms were moved past the constraints in another way; see `restore`.
+        """
+        x, cell = atoms.arrays["positions"], atoms.cell.array
+        if rand or not self._watch.in_another(cell):
+            return  # other edits are seen where positions are set
+        bound = self._bound(atoms)
+        if not self._watch.look(bound.motion.constraint_set, x, cell):
+            try:
+                self._move(atoms, bound.motion, bound.motion.project_positions(x, x))
+            except ConvergenceError as error:
+                error.add_note("The atoms were scaled together with the cell: call Constraints.restore(atoms)")
+                raise
 
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
 
         Raises
         ------
+        InputError
+            The atoms are off the constraints, or were moved past them since the last step; see `restore`.
         UnsupportedError
-            The atoms are off the constraints, or were moved past them: only dynamics set momenta, and such
-            dynamics do not respect constraints.
+            They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
         """
         bound = self._bound(atoms)
         bound.check(momenta, "momentum")
         if momenta.shape == (bound.n_atoms, 3):  # otherwise the engine complains
-            if not self._on_surface:
-                require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
-                self._on_surface = True
-            self._watch.check_momenta(bound.motion.constraint_set, bound.cell, atoms.arrays["positions"])
+            held, x = bound.motion.constraint_set, atoms.arrays["positions"]
+            self._watch.look(held, x, atoms.cell.array)
+            self._watch.check_momenta(held, x)
         try:
             if bound.weights is None or momenta.shape != bound.weights[0].shape:
                 # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
@@ -224,13 +258,14 @@ class Constraints(FixConstraint):
         bound = self._binding
         if bound is not None and bound.fits(atoms):
             new = numbers(cell, "cell")
-            mine = bound if bound.serves(self, atoms.cell.array, new) else self._bind(atoms)
+            mine = bound if bound.serves(self, atoms.cell.array, new) else self._bind(atoms, alone=True)
             mine.follow_cell(atoms, new)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
         self._bound(atoms).check(forces, "force")
         self._project_covector(atoms, forces)
+        self._watch.between_steps = True
 
     def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:
         _in_place(self._bound(atoms).motion.project_forces, values, atoms.arrays["positions"], values)
@@ -299,7 +334,7 @@ class Constraints(FixConstraint):
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None, "_last": None, "_on_surface": False, "_watch": Watch()}
+        return {**self.__dict__, "_binding": None, "_last": None, "_watch": Watch()}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
@@ -339,14 +374,18 @@ class Constraints(FixConstraint):
             If there is no way to fulfil the constraints from here with other bonds and angles as they are; nothing is
             changed.
         """
-        bound = self._bound(atoms)
-        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
-        momenta = None
-        if "momenta" in atoms.arrays:
-            momenta = bound.motion.project_forces(x, atoms.arrays["momenta"])
+        motion = self._bound(atoms).motion
+        x = motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
+        self._move(atoms, motion, x)
+        self._watch.between_steps = True
+
+    def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
+        """Put atoms where they are on the constraints, and project momenta that they have."""
+        momenta = motion.project_forces(x, atoms.arrays["momenta"]) if "momenta" in atoms.arrays else None
         atoms.set_positions(x, apply_constraint=False)
         if momenta is not None:
             atoms.set_momenta(momenta, apply_constraint=False)
+        self._watch.know(x, atoms.cell.array)
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
@@ -487,8 +526,8 @@ def constrain(
         if project:
             held.restore(atoms)
         bound = held._bound(atoms)
-        require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
-        held._on_surface = True
+        held._watch.look(bound.motion.constraint_set, atoms.arrays["positions"], atoms.cell.array)
+        held._watch.between_steps = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
     except BaseException:

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from operator import is_
 from typing import Any, Literal
 
 import numba
@@ -20,12 +19,15 @@ from kcons.ase.binding import (
     FORCES_ONLY,
     Answers,
     Binding,
+    Company,
     applied_energy,
     applied_forces,
     bind,
+    company,
     in_step,
     name_step,
     refuse_fewer,
+    same_company,
     surroundings,
 )
 from kcons.ase.constraints_object import Constraints, listed
@@ -75,8 +77,8 @@ class ConstrainedDynamics(MolecularDynamics):
     forces : array_like, shape (n_atoms, 3), optional
         Applied forces at the start, if known (from a trajectory); saves one evaluation.
     state : State, optional
-        Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time, forces and
-        the number of steps are taken from it, `time` and `forces` are not looked at.
+        Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time and the number
+        of steps are taken from it, `time` and `forces` are not looked at. Forces are asked of the calculator.
     degenerate : {'convert', 'raise'}
         See `Constraints`.
     check_every : int, optional
@@ -132,7 +134,7 @@ class ConstrainedDynamics(MolecularDynamics):
         require_stepper(self.stepper)
         self._degenerate, self._friction = degenerate, friction
         self._more = listed(constraints)
-        self._present: tuple[Any, ...] | None = None
+        self._present: Company | None = None
         self._bound: Binding | None = None
         self._system: System | None = None
         self._state: State | None = None
@@ -333,7 +335,9 @@ class ConstrainedDynamics(MolecularDynamics):
                 raise InputError(message, item="state")
             self.time, self.nsteps = float(state.time), int(state.step)
             self._momenta, _ = put(self.atoms, self._weights, x, v)
-            self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
+            # Forces are asked for anew: nobody knows which calculator those of a file are of.
+            kept = replace(state.copied(), forces=None, origin=None)
+            self._state = replace(kept, positions=x, velocities=v, time=self.time, step=self.nsteps)
             self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
@@ -345,9 +349,9 @@ class ConstrainedDynamics(MolecularDynamics):
     def _systems(self) -> System:
         """The system for the atoms as they are; built anew if masses, constraints or periodicity changed."""
         atoms = self.atoms
-        present = tuple(atoms.constraints)
+        present = atoms.constraints
         known, bound = self._present, self._bound
-        if known is None or len(present) != len(known) or not all(map(is_, present, known)):
+        if known is None or not same_company(present, known):
             bound = None
         if bound is None or not bound.fits(atoms):
             self._size = refuse_fewer(self._size, len(atoms), self._more, self._friction, self.stepper)
@@ -355,7 +359,7 @@ class ConstrainedDynamics(MolecularDynamics):
             bound = bind(rows, atoms, self._degenerate, self.time, all_masses=True)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
-            self._bound, self._present, self._state = bound, present, None
+            self._bound, self._present, self._state = bound, company(present), None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
             self._system = self._made(bound.motion)
             self._system.time_unit = ("fs", units.fs)

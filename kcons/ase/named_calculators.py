@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from hashlib import sha256
 from importlib import import_module
 from importlib.util import find_spec
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms
+from ase.calculators.names import names as ase_names
 
 from kcons.ase.binding import FORCES_ONLY
 from kcons.errors import InputError, KconsError, UnsupportedError, did_you_mean
@@ -22,6 +23,29 @@ WEIGHTS = (".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz
 
 #: Calculators of ASE that take any setting, and know those alone that they list.
 _FULLY_LISTED = ("emt", "lj", "morse")
+#: Calculators that compute in this process, whatever their settings: others start programs that settings name.
+LISTED = ("gfn2", "gfn1", *_FULLY_LISTED, "eam", "tip3p", "tip4p")
+
+
+def refuse_unlisted(name: str, modules: Collection[str]) -> None:
+    """Refuse a calculator that a file names, unless it is listed or of one of these modules; nothing is imported.
+
+    Raises
+    ------
+    InputError
+    """
+    if name in LISTED:
+        return
+    module, _, attribute = name.partition(":") if ":" in name else (f"ase.calculators.{name}", "", name)
+    if not (attribute and module) or (":" not in name and name not in ase_names):
+        raise _no_calculator(name)
+    if module not in modules:
+        raise InputError(
+            f"the calculator {name!r} runs code of the module {module}, or a program that its settings name. If you "
+            f"trust where they come from, allow it: --allow-module {module} on the command line, "
+            f"allow_modules=[{module!r}] in Python. Without that there are {', '.join(LISTED)}",
+            item="calculator",
+        )
 
 
 def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> Any:
@@ -37,7 +61,7 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
     Raises
     ------
     InputError
-        There is none of that name, or it does not take these settings.
+        There is none of that name, it does not take these settings, or what it makes is no calculator.
     UnsupportedError
         tblite is not installed.
     """
@@ -51,27 +75,49 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
             _refuse_unknown(name, TBLite, given)
             return TBLite(**{"method": f"GFN{name[-1]}-xTB", "verbosity": 0, **given})
         if ":" in name:
-            module, _, attribute = name.partition(":")
-            return getattr(import_module(module), attribute)(**given)
-        from ase.calculators.calculator import get_calculator_class
+            kind = _made_by(name)
+        else:
+            from ase.calculators.calculator import get_calculator_class
 
-        kind = get_calculator_class(name)
+            kind = get_calculator_class(name)
         if name in _FULLY_LISTED:
             _refuse_unknown(name, kind, given)
-        return kind(**given)
+        made = kind(**given)
     except KconsError:
         raise
     except Exception as error:
-        from ase.calculators.names import names
+        raise _no_calculator(name, error) from error
+    if not _calculates(made):
+        raise InputError(f"{name} makes no calculator of ASE: {made!r:.60}; name what does", item="calculator")
+    return made
 
-        known = ["gfn2", "gfn1", *names]
-        hint = "" if name in known else did_you_mean(name, known)
-        why = "" if ":" not in name and name not in known else f" with these settings ({type(error).__name__}: {error})"
+
+def _made_by(name: str) -> Any:
+    """A class or function of a module, or of the package it belongs to; not what the module took from elsewhere."""
+    module, _, attribute = name.partition(":")
+    kind = getattr(import_module(module), attribute)
+    home = str(getattr(kind, "__module__", "")).partition(".")[0]
+    if not callable(kind) or home != module.partition(".")[0] or (isinstance(kind, type) and not _calculates(kind)):
         raise InputError(
-            f"there is no calculator {name!r}{why}{hint}; there are gfn2, gfn1, those of ASE by "
-            "name (emt, lj, ...), and MODULE:NAME for what makes any other",
+            f"{name} is no calculator of ASE, nor a function of that module that makes one; name what is",
             item="calculator",
-        ) from error
+        )
+    return kind
+
+
+def _calculates(found: Any) -> bool:
+    return hasattr(found, "get_potential_energy") and hasattr(found, "get_forces")
+
+
+def _no_calculator(name: str, error: Exception | None = None) -> InputError:
+    known = ["gfn2", "gfn1", *ase_names]
+    hint = "" if name in known else did_you_mean(name, known)
+    why = f" with these settings ({type(error).__name__}: {error})" if ":" in name or name in known else ""
+    return InputError(
+        f"there is no calculator {name!r}{why if error else ''}{hint}; there are gfn2, gfn1, those of ASE by "
+        "name (emt, lj, ...), and MODULE:NAME for what makes any other",
+        item="calculator",
+    )
 
 
 def _refuse_unknown(name: str, kind: Any, given: Mapping[str, Any]) -> None:

@@ -73,7 +73,7 @@ def _check(chosen: argparse.Namespace) -> int:
     from kcons.mdanalysis.check import report
 
     if chosen.out is not None:
-        report.refuse_others(chosen.out, chosen.trajectory)  # complain before any work
+        report.results(chosen.out, chosen.trajectory).refuse_others()  # complain before any work
     for name in ("rigid_bodies", "no_rigid_water", "format", "topology_format"):
         if chosen.forces is not None and getattr(chosen, name):
             option = name.replace("_", "-")

@@ -11,7 +11,7 @@ from typing import Any
 
 from kcons.cli import listing, long_steps
 from kcons.cli.parser import Parser
-from kcons.cli.systems import check_name, molecules, test_system
+from kcons.cli.systems import check_name, molecules, owner, test_system
 from kcons.cli.terminal import console, names, numbers, rendered, say_written, show
 from kcons.errors import InputError
 
@@ -19,6 +19,8 @@ from kcons.errors import InputError
 OF_FLUIDS = frozenset({"size", "seed", "dt", "methods", "out", "quick", "budget", "criterion"})
 OF_STEPS_OF_FLUIDS = OF_FLUIDS - {"criterion"} | {"slow", "fast"}
 OF_STEPS_OF_FILES = OF_STEPS_OF_FLUIDS - {"size"} | {"coordinates", "constrain", "select", "rigid_residues", "platform"}
+#: Options that results depend on, beside the system, the budget and what is said about molecules.
+SETTINGS = ("size", "seed", "quick", "dt")
 #: Steps of a production run that are looked at, in fs.
 PRODUCTION_STEPS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
@@ -104,16 +106,20 @@ def _trajectories(chosen: argparse.Namespace, budget: float, folder: Path) -> in
         raise InputError("--target-error is an error of trajectories; leave --criterion drift out", item="criterion")
     from kcons.cli.progress import Bars
     from kcons.comparison import measure, methods, ranking, report
+    from kcons.steppers.files import ResultFolder, in_one_piece
 
     methods.choose(chosen.methods)  # complain before any work
     check_name(chosen)
-    path = folder / "compare.csv"
     asked = _asked(chosen, budget)
+    names = [f"compare.{kind}" for kind in ("csv", "png", "txt")]
+    results = ResultFolder(folder, names[0], {"asked": {"system": asked["system"]}}, names, "a comparison")
+    results.refuse_others()
+    path = folder / names[0]
     done = _earlier(path, asked) if chosen.resume else None
-    folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
-    if done is None:
-        path.unlink(missing_ok=True)  # that of an earlier run is not what --resume is to go on from
-    with Bars() as watcher:
+    with results.taken(), Bars() as watcher:
+        if done is None:  # what an earlier run left is not what --resume is to go on from
+            for name in names:
+                (folder / name).unlink(missing_ok=True)
         with watcher.piece("building the test system", 1):
             system = test_system(chosen, quick=chosen.quick)
         if chosen.dt is not None:
@@ -132,32 +138,33 @@ def _trajectories(chosen: argparse.Namespace, budget: float, folder: Path) -> in
         try:
             table = measure.compare(system, chosen.methods, **options, done=done, keep=keep, watcher=watcher)
         except KeyboardInterrupt:
-            if not path.is_file():
-                raise
-            print(f"kcons: interrupted; --resume goes on from what is in {path}", file=sys.stderr)
-            return 130
+            if path.is_file():
+                print(f"kcons: --resume goes on from what is in {path}", file=sys.stderr)
+            raise
         if target is not None:
             rows = ranking.find_steps(system, table, target, reference, budget=budget, watcher=watcher)
             table = measure.table_of([*table.to_dict("records"), *rows], table.attrs)
         production = _production(chosen, system, budget, watcher)
-    keep(table)
-    found = ranking.rank(table, chosen.criterion or "error", target)
-    code = ""
-    if found is not None and len(found.table):
-        best = found.table.iloc[0]
-        code = methods.code(system, best.method, best.setting, _expression(chosen))
-    words = report.text(table, found, code, production)
+        keep(table)
+        found = ranking.rank(table, chosen.criterion or "error", target)
+        code = ""
+        if found is not None and len(found.table):
+            best = found.table.iloc[0]
+            code = methods.code(system, best.method, best.setting, _expression(chosen))
+        words = report.text(table, found, code, production)
+        with in_one_piece(folder / "compare.txt") as file:
+            file.write(f"{words}\n".encode())
+        with in_one_piece(folder / "compare.png") as file:
+            report.figure(table).savefig(file, dpi=150, format="png")
     console().print(words + "\n", highlight=False, markup=False, soft_wrap=True)
-    (folder / "compare.txt").write_text(words + "\n", encoding="utf-8")
-    report.figure(table).savefig(folder / "compare.png", dpi=150)
     print(f"wrote compare.csv, .png and .txt into {folder}; the whole table is in {path}")
     return 0
 
 
 def _asked(chosen: argparse.Namespace, budget: float) -> dict[str, Any]:
     """What the rows of a table depend on."""
-    asked = {"system": chosen.scene, "size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt}
-    return {**asked, "budget": budget, **molecules(chosen)}
+    settings = {name: getattr(chosen, name) for name in SETTINGS}
+    return {"system": owner(chosen.scene), **settings, "budget": budget, **molecules(chosen)}
 
 
 def _earlier(path: Path, asked: dict[str, Any]) -> Any:
@@ -230,10 +237,14 @@ def _thermostats(chosen: argparse.Namespace, budget: float, folder: Path) -> int
     from kcons.comparison import test_systems
     from kcons.comparison.averages import ranking, sampling
     from kcons.comparison.averages import report as sampling_report
+    from kcons.comparison.study import report_files
 
     sampling.chosen(chosen.methods)  # complain before any work
     check_name(chosen)
     chosen.of.take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
+    system = owner(chosen.scene)
+    results = report_files.results(folder, "compare", system)
+    results.refuse_others()
     fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
     if chosen.dt is not None:
         fluid = fluid.with_time_steps(chosen.dt)
@@ -245,7 +256,13 @@ def _thermostats(chosen: argparse.Namespace, budget: float, folder: Path) -> int
             budget=budget,
             seed=chosen.seed,
             watcher=watcher,
-            settings={"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt},
+            settings={
+                "system": system,
+                "size": chosen.size,
+                "seed": chosen.seed,
+                "quick": chosen.quick,
+                "dt": chosen.dt,
+            },
             partial=True,
         )
     table, explained = sampling_report.table(result), sampling_report.explanation(result)
@@ -254,5 +271,6 @@ def _thermostats(chosen: argparse.Namespace, budget: float, folder: Path) -> int
     for words in first:
         terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(table, explained, terminal)
-    say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
+    with results.taken():
+        say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
     return 130 if "interrupted" in result.settings else 0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kcons.cli.systems import test_system
+from kcons.cli.systems import owner, test_system
 from kcons.cli.terminal import console, rendered, say_written, show
 from kcons.errors import InputError
 
@@ -29,19 +29,23 @@ def run(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison.averages import long_steps
     from kcons.comparison.averages import long_steps_report as report
+    from kcons.comparison.study import report_files
 
     long_steps.chosen(chosen.methods)  # complain before any work
     if chosen.fast is None:
         raise InputError("--slow needs --fast: give the cheap forces, too", item="fast")
     if chosen.slow == chosen.fast:
         raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
+    system = owner(chosen.scene)
+    results = report_files.results(folder, "compare", system)
+    results.refuse_others()
     with Bars() as watcher:
         with watcher.piece("building the system", 1):
             layers = _layers(chosen)
         unit = layers.units.time_unit
         steps = None if chosen.dt is None else [dt * unit for dt in chosen.dt]
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
-        asked = {"slow": chosen.slow, "fast": chosen.fast, "size": chosen.size, "quick": chosen.quick}
+        asked = {"system": system, "slow": chosen.slow, "fast": chosen.fast, "size": chosen.size, "quick": chosen.quick}
         result = long_steps.compare(
             layers,
             methods=chosen.methods,
@@ -57,7 +61,8 @@ def run(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
     if stopped:
         explained = f"{stopped}\n{explained}"
     show(table, explained, console())
-    say_written(report.write(result, folder, tables=[rendered(table), explained]))
+    with results.taken():
+        say_written(report.write(result, folder, tables=[rendered(table), explained]))
     return 130 if stopped else 0
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from kcons import __version__
 from kcons.cli import check, compare, doctor, freeenergy, plan, scan, warmup
 from kcons.cli.parser import Parser
-from kcons.cli.terminal import patient_streams
+from kcons.cli.terminal import Terminated, ended_in_order, patient_streams, warnings_in_a_line
 from kcons.errors import KconsError, with_extra
 
 
@@ -17,7 +17,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     The exit status: 0; of `check`, 1 for a violation and 3 where not all could be told; of `scan` and
-    `freeenergy`, 3 where some points or windows failed; 2 for an error that the user can mend; 130 when interrupted.
+    `freeenergy`, 3 where some points or windows failed; 2 for an error that the user can mend; 130 when interrupted,
+    143 when terminated.
     """
     try:
         with patient_streams():
@@ -37,7 +38,8 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser.print_help()
         return 0
     try:
-        return int(chosen.run(chosen))
+        with ended_in_order(), warnings_in_a_line():
+            return int(chosen.run(chosen))
     except ModuleNotFoundError as error:
         explained = with_extra(error, f"kcons {chosen.command}")
         if not isinstance(explained, KconsError):
@@ -56,9 +58,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     except MemoryError as error:
         print(f"kcons: there is not enough memory: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("kcons: interrupted", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        ended, status = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
+        kept = getattr(chosen, "kept", None)
+        more = f"; finished {kept} are kept: run again to resume" if kept else ""
+        print(f"kcons: {ended}{more}", file=sys.stderr)
+        return status
 
 
 def commands() -> dict[str, Parser]:

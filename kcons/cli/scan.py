@@ -90,7 +90,7 @@ def add(commands: Any) -> None:
     scan.add_argument("--fmax", type=float, default=0.01, help="largest force left, eV/angstrom (default 0.01)")
     scan.add_argument("--one-way", action="store_true", help="relax each point from the first neighbour only")
     scan.add_argument("--out", type=Path, help="folder for all results (default ./scan-STRUCTURE)")
-    scan.set_defaults(run=_scan)
+    scan.set_defaults(run=_scan, kept="relaxations")
 
 
 def _scan(chosen: argparse.Namespace) -> int:
@@ -207,20 +207,13 @@ def _calculator(name: str, settings: dict[str, Any]) -> Any:
 
 
 def _of_system(path: Path, settings: dict[str, Any]) -> Any:
-    if not path.is_file():
-        raise InputError(f"there is no file {path}", item="calculator")
     if find_spec("openmm") is None:
         raise UnsupportedError("a System needs OpenMM: python -m pip install openmm")
     import openmm
 
-    from kcons.free_energy import SystemCalculator
+    from kcons.free_energy.scans.system_calculator import SystemCalculator, read_system
 
-    try:
-        system = openmm.XmlSerializer.deserialize(path.read_text())
-    except Exception as error:
-        raise InputError(f"{path} is no System of OpenMM: {error}", item="calculator") from error
-    if not isinstance(system, openmm.System):
-        raise InputError(f"{path} has a {type(system).__name__} in it, no System", item="calculator")
+    system = read_system(path, "calculator")
     try:
         return SystemCalculator(system, **settings)
     except (TypeError, openmm.OpenMMException) as error:

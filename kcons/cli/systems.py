@@ -36,6 +36,11 @@ def check_name(chosen: argparse.Namespace) -> None:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
+def owner(scene: str) -> str:
+    """What results belong to: a test system by name, or a file by its path."""
+    return str(Path(scene).resolve()) if Path(scene).is_file() else scene
+
+
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
     """What was said about molecules in OpenMM."""
     said = {

@@ -6,8 +6,11 @@ import argparse
 import codecs
 import io
 import os
+import signal
 import sys
+import threading
 import unicodedata
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,6 +49,43 @@ def show(table: RenderableType, explained: str, console: Console) -> None:
 def say_written(paths: list[Path]) -> None:
     for path in paths:
         print(f"wrote {path}")
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM has come."""
+
+
+@contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does, so that it finishes its files and ends its workers."""
+    if threading.current_thread() is not threading.main_thread():  # no other one can set what a signal does
+        yield
+        return
+
+    def end(*_: object) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+@contextmanager
+def warnings_in_a_line() -> Iterator[None]:
+    """Say warnings for users as errors are said, without the line of code that they come from."""
+    with warnings.catch_warnings():
+        shown = warnings.showwarning
+
+        def show_one(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if category is UserWarning:
+                print(f"kcons: {' '.join(str(message).split())}", file=sys.stderr)
+            else:
+                shown(message, category, *where, **more)
+
+        warnings.showwarning = show_one
+        yield
 
 
 # -- streams ----------------------------------------------------------------------------------------

@@ -29,6 +29,8 @@ IntArray: TypeAlias = NDArray[np.int64]
 _FLOAT = np.dtype(np.float64)
 #: Kinds of dtype whose values are real numbers: boolean, integers, floating point.
 _REAL = "biuf"
+#: Larger numbers have squares, or sums of squares, that overflow.
+LARGEST = 1e150
 
 
 def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
@@ -83,11 +85,28 @@ def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArra
     return array
 
 
+def out_of_range(values: FloatArray) -> tuple[int, str] | None:
+    """The first row with a value that is not finite or larger than `LARGEST`, and what to say of it; None without."""
+    good = np.abs(values) <= LARGEST
+    if good.all():
+        return None
+    first = np.argwhere(~good)[0]
+    value = float(values[tuple(first)])
+    said = f"{value:g}, of which the square overflows; choose other units" if math.isfinite(value) else "not finite"
+    return int(first[0]) if len(first) else 0, said
+
+
 def lent(array: FloatArray) -> FloatArray:
     """The same numbers, for a function of the user: it can read them and not change them."""
     view = array.view()
     view.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
     return view
+
+
+def kept(array: NDArray[Any]) -> NDArray[Any]:
+    """The array itself, which nobody can change from now on."""
+    array.setflags(write=False)
+    return array
 
 
 def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:

@@ -22,7 +22,16 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import LENGTH, MD_UNITS, Kind, numbers, plain_target, taking_quantities
+from kcons.constraints.arguments import (
+    LENGTH,
+    MD_UNITS,
+    Kind,
+    kept,
+    numbers,
+    out_of_range,
+    plain_target,
+    taking_quantities,
+)
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError
@@ -53,7 +62,8 @@ class Constraint(ABC):
 
     Notes
     -----
-    Quantities of OpenMM are taken wherever numbers are, see `kcons.constraints.arguments`.
+    Quantities of OpenMM are taken wherever numbers are, see `kcons.constraints.arguments`. Arrays of constraints cannot
+    be changed: engines have copies of what stands in them. Make another constraint instead.
     """
 
     family: ClassVar[str]
@@ -96,7 +106,7 @@ class Constraint(ABC):
             cls.__init__ = taking_quantities(cls.__init__)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
-        self.atoms: IntArray = _atom_table(atoms, type(self).__name__, self.row_width)
+        self.atoms: IntArray = kept(_atom_table(atoms, type(self).__name__, self.row_width))
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
 
     def _keep(self, **data: ArrayLike) -> None:
@@ -113,10 +123,17 @@ class Constraint(ABC):
                     f"for all rows or {shape}",
                     item=name,
                 ) from None
-            if not np.all(np.isfinite(array)):
-                row = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise InputError(f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row])
-            setattr(self, name, np.array(array, order="C"))
+            wrong = out_of_range(array)
+            if wrong is not None:
+                row, said = wrong
+                raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
+            setattr(self, name, kept(np.array(array, order="C")))
+
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        for value in own.values():
+            if isinstance(value, np.ndarray):
+                kept(value)
+        self.__dict__.update(own)
 
     def _settle(self) -> None:
         """Derive and check what follows from the per-row data; called once, when these were set."""
@@ -253,7 +270,7 @@ class Constraint(ABC):
         if not self.uses_masses:
             return self
         copy = self.with_target(self.target)
-        copy.masses = np.ascontiguousarray(masses, dtype=np.float64)
+        copy.masses = kept(np.array(masses, dtype=np.float64, order="C"))
         return copy
 
     def with_target(self, target: Target) -> Self:
@@ -270,15 +287,15 @@ class Constraint(ABC):
         """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
         copy = self.with_target(None)
-        copy.atoms = self.atoms[rows]
+        copy.atoms = kept(self.atoms[rows])
         for name in self.per_row:
-            setattr(copy, name, getattr(self, name)[rows])
+            setattr(copy, name, kept(getattr(self, name)[rows]))
         if self.masses is not None:
-            copy.masses = self.masses[rows]
+            copy.masses = kept(self.masses[rows])
         copy.whole = None if self.whole is None else self.whole[rows]
         copy.windings = None if self.windings is None else self.windings[rows]
         if isinstance(self.target, np.ndarray):
-            copy.target = self.target[rows]
+            copy.target = kept(self.target[rows])
         elif self.target is not None:
             copy.target = _selected(self.target, rows, self.n_rows, self.period)
         return copy
@@ -286,7 +303,7 @@ class Constraint(ABC):
     def renumbered(self, new_index: IntArray) -> Self:
         """Copy with atom a replaced by new_index[a]."""
         copy = self.with_target(self.target)
-        copy.atoms = np.asarray(new_index, dtype=np.int64)[self.atoms]
+        copy.atoms = kept(np.asarray(new_index, dtype=np.int64)[self.atoms])
         return copy
 
     def row_name(self, row: int) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import numbers, refuse_other
+from kcons.constraints.arguments import kept, numbers, refuse_other
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import find_images
@@ -398,7 +398,7 @@ def _rate_at(c: Constraint, time: float) -> FloatArray:
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:
     copy = item.with_target(item.target)
-    copy.atoms = np.searchsorted(atoms, item.atoms)
+    copy.atoms = kept(np.searchsorted(atoms, item.atoms))
     return copy
 
 

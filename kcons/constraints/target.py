@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import check_call, has_units, numbers, positive
+from kcons.constraints.arguments import check_call, has_units, kept, numbers, out_of_range, positive
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -115,8 +115,9 @@ def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:
         raise InputError(
             f"the target at t = {time:g} has shape {array.shape}; give one number or {rows}", item="target"
         ) from None
-    if not np.all(np.isfinite(array)):
-        raise InputError(f"the target at t = {time:g} is not finite", item="target")
+    wrong = out_of_range(array)
+    if wrong is not None:
+        raise InputError(f"the target at t = {time:g} is {wrong[1]}", item="target")
     return array
 
 
@@ -126,7 +127,8 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
     Raises
     ------
     InputError
-        If an explicit target is no number, not finite, or has the wrong number of entries.
+        If an explicit target is no number, not finite, so large that its square overflows, or has the wrong number of
+        entries.
     """
     if target is None or isinstance(target, MovingTarget):
         return target
@@ -137,10 +139,10 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
         array = array.ravel()
     if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, rows)):
         raise InputError(f"target has shape {array.shape}; give one number or {rows}", item="target")
-    if not np.all(np.isfinite(array)):
-        row = int(np.flatnonzero(~np.isfinite(array.ravel()))[0])
-        raise InputError(f"the target of row {row} is not finite: {array.ravel()[row]}", item="target")
-    return np.array(np.broadcast_to(array, (rows,)), order="C")
+    wrong = out_of_range(array)
+    if wrong is not None:
+        raise InputError(f"the target of row {wrong[0]} is {wrong[1]}", item="target")
+    return kept(np.array(np.broadcast_to(array, (rows,)), order="C"))
 
 
 # -- derivatives that a user gave, and central differences for those that were not given --------------

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numba as nb
@@ -55,6 +58,27 @@ class RigidTurn(NamedTuple):
     def _direction(self, x: FloatArray) -> FloatArray:
         e: FloatArray = x[self.axis[1]] - x[self.axis[0]]
         return e / np.linalg.norm(e)
+
+
+def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None:
+    """Warn of torsions over atoms that are not bonded: most often the atoms are in another order than the chain.
+
+    Not of improper torsions, where one atom is bonded to the three others, nor of atoms without any bond.
+    """
+    joined, bonded = {frozenset(pair) for pair in bonds.tolist()}, set(bonds.ravel().tolist())
+    for name, item in coordinates.items():
+        for four in item.atoms.tolist() if item.family == "Dihedral" else ():
+            if any(all({hub, other} in joined for other in four if other != hub) for hub in four):
+                continue
+            gaps = [pair for pair in pairwise(four) if {*pair} not in joined and bonded.issuperset(pair)]
+            if gaps:
+                said = ", ".join(f"{a}-{b}" for a, b in gaps) + (" are no bonds" if len(gaps) > 1 else " is no bond")
+                warnings.warn(
+                    f"{name} is a torsion over the atoms {', '.join(map(str, four))}, counted from 0, and {said}; give "
+                    "the atoms in the order in which they are bonded, unless this is what you mean",
+                    UserWarning,
+                    stacklevel=5,
+                )
 
 
 def rigid_turn(

@@ -140,7 +140,7 @@ def _becomes_straight(
         time = start + part / PARTS * (request.time - start)
         wanted = None if request.wanted is None else constraint_set.target(time)
         ahead = here + step
-        small = Request(ahead, here, wanted, request.lattice, time, start)
+        small = Request(ahead, here, wanted, request.lattice, time, start, moved=request.moved)
         if not solver.positions(small).converged:
             return _straightened(constraint_set, numbers, here, ahead, rows)
         here, step = ahead, ahead - here

@@ -40,6 +40,7 @@ class LocalProjections:
         # Plain attributes: a step of one bond takes microseconds, and looking these up would show.
         self._moving = rows.moving
         self._velocity_rows: IntArray = np.flatnonzero(~rows.holonomic)
+        self._placed = rows.placed
         self._several = len(plan.solvers) > 1 or len(plan.pinned) > 0
         self.iterations = [0] * len(plan.solvers)
         self._rescuers = Rescuers(rows, plan, numbers)
@@ -72,6 +73,7 @@ class LocalProjections:
         several = self._several or images is not None
         saved = (x.copy(), None if velocities is None else velocities.copy()) if several else None
         found: list[FloatArray | None] = []
+        moved: FloatArray | None = None
         try:
             if len(plan.pinned):
                 x[plan.pinned] = plan.pinned_targets(targets)
@@ -83,8 +85,10 @@ class LocalProjections:
                     self.unchecked = None
                 stored, ref = ref, images.make_whole(ref, lattice)
                 shifts = images.follow(x, stored, ref, lattice)
+                places = None if self._placed is None else x[self._placed]
                 x[images.atoms] += shifts
-            given = (x, ref, targets, lattice, time, reference_time, velocities, inv_dt, flight != 0)
+                moved = None if places is None else rows.moved_places(places, x)
+            given = (x, ref, targets, lattice, time, reference_time, velocities, inv_dt, flight != 0, moved)
             request = tuple.__new__(Request, given)  # as `Request(*given)`, in a third of its time
             for k, solver in enumerate(plan.solvers):
                 lam = None if multipliers is None else np.empty(len(solver.rows))
@@ -100,6 +104,8 @@ class LocalProjections:
             if images is not None:
                 rows.refuse_loose_links(x, self.numbers)
                 x[images.atoms] -= shifts
+                if len(plan.pinned):
+                    x[plan.pinned] = plan.pinned_targets(targets)  # without the rounding of there and back
         except KconsError as error:
             tried = x.copy() if images is not None else x
             if saved is not None:
@@ -126,8 +132,6 @@ class LocalProjections:
         plan = self.plan
         lattice = self.rows.lattice
         saved = y.copy() if self._several else None
-        if lattice is not None:
-            x = self.rows.whole(x)
         if len(plan.pinned):
             y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
             if plan.loose is not None:
@@ -138,7 +142,12 @@ class LocalProjections:
                         np.copyto(y, saved)
                     raise
         found: list[FloatArray | None] = []
-        request = tuple.__new__(Request, (y, x, rates, lattice, time, time, None, 0.0, False))
+        moved: FloatArray | None = None
+        if lattice is not None:
+            places = None if self._placed is None else x[self._placed]
+            x = self.rows.whole(x)
+            moved = None if places is None else self.rows.moved_places(places, x)
+        request = tuple.__new__(Request, (y, x, rates, lattice, time, time, None, 0.0, False, moved))
         for k, solver in enumerate(plan.solvers):
             lam = None if multipliers is None else np.empty(len(solver.rows))
             outcome = solver.tangents(request if lattice is None else plan.asked_of(k, request), lam)
@@ -161,8 +170,11 @@ class LocalProjections:
         """c of A v = c at local positions; None if it is 0."""
         return self.rows.velocity_target(x, time) if self.plan.driven else None
 
-    def nearest(self, x: FloatArray, time: float, work: Work) -> None:
-        """Bring `x` to the nearest point on the constraints in the mass metric, in place, for no more than `work`."""
+    def nearest(self, x: FloatArray, time: float, work: Work) -> float:
+        """Bring `x` to the nearest point on the constraints in the mass metric, in place, for no more than `work`.
+
+        What it returns is said at `FarStart.restore`.
+        """
         if len(self.plan.pinned):
             x[self.plan.pinned] = self.plan.pinned_targets(self.rows.target(time) if self._moving else None)
         start = FarStart(
@@ -176,6 +188,6 @@ class LocalProjections:
         )
         self._rescuers.work = work
         try:
-            start.restore(x, time)
+            return start.restore(x, time)
         finally:
             self._rescuers.work = None

@@ -7,6 +7,7 @@ that names the row, with nothing changed, where there is no solution.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -21,7 +22,7 @@ from kcons.motion.projector import Projector
 from kcons.motion.report import Report, make_report
 from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
-from kcons.motion.restoring.nearest_point import Work
+from kcons.motion.restoring.nearest_point import LEFT_OVER, Work
 from kcons.plan.second_order.flat_bodies import MISFIT
 
 
@@ -96,31 +97,47 @@ class Motion(Projector):
             other angles by more than 2 degrees; nothing was changed.
         InputError
             Bonds of unknown atoms.
+
+        Warns
+        -----
+        UserWarning
+            ``bonds=[]``, and the search has ended on the rows before it came to the nearest point.
         """
         if out is not None:
             check_out(out, self._shape)
         self.cell()
         start = as_array(x, self._shape, "positions")
         pairs: Bonds | None = None
+        nearest_only = False
         if callable(bonds):
             pairs = bonds
         elif bonds is not None:
             table = check_pairs(bonds, self.n_atoms)
+            nearest_only = not len(table)
 
             def pairs() -> IntArray:
                 return table
 
         work = Work(self.plan)
+        left = 0.0
 
         def nearest(y: FloatArray) -> FloatArray:
+            nonlocal left
             result = y.copy()
             local = result if self._atoms is None else result[self._atoms]
-            self._solve.nearest(local, time, work)
+            left = self._solve.nearest(local, time, work)
             if self._atoms is not None:
                 result[self._atoms] = local
             return result
 
         result = restored(self.constraint_set, self.plan, start, time, pairs, nearest)
+        if left > LEFT_OVER and nearest_only:
+            warnings.warn(
+                f"these positions fulfil all rows, but are not the nearest that do: {left:.1g} of the way from the "
+                "start leads along the rows, and the search has done what it may. Start nearer to the rows, or bring "
+                "targets there in several parts",
+                stacklevel=2,
+            )
         if out is None:
             return result
         np.copyto(out, result)

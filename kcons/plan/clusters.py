@@ -163,6 +163,8 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
     single = np.zeros(n_clusters, dtype=bool)
     single[labels[inside & (kinds == RowKind.FUNCTION)]] = True
     single &= n_rows == 1
+    if constraint_set.images is not None:
+        single &= ~anchored  # fixed atoms may be moved to another image, of which single rows know nothing
     others: tuple[tuple[ShapeKind, NDArray[np.bool_]], ...] = (
         ("single", single),
         ("mixed", compiled & ~distances_only & ~single),

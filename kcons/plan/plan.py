@@ -246,14 +246,15 @@ def make_plan(
         if not constraint_set.moving:
             plan.resting = (plan.loose, in_place)
             plan.loose = None
-    whole_positions = constraint_set.whole(positions)
+    whole_positions, placed = constraint_set.whole(positions), constraint_set.placed
+    moved = None if placed is None else constraint_set.moved_places(positions[placed], whole_positions)
     for shape, whole in _shapes(constraint_set, labels, inverse_masses):
         solver = solver_of(shape, constraint_set, inverse_masses, labels, time)
         if shape.independent:
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time)
+            rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time, moved)
         if shape.kind == "single" and rank < shape.rows.size:
             shape = replace(shape, kind="mixed")
         alone = shape.independent or shape.kind == "single"

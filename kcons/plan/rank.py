@@ -80,13 +80,16 @@ def rank_of_shape(
     lattice: FloatArray | None,
     solver: ClusterSolver,
     time: float,
+    moved: FloatArray | None,
 ) -> int:
-    """Independent rows of a shape whose graph does not tell."""
-    if isinstance(solver, (SparseRows, SingleRows)):
+    """Independent rows of a shape whose graph does not tell; `moved` as in `Request`."""
+    if isinstance(solver, SparseRows):
+        return solver.rank(positions, lattice, time, moved)
+    if isinstance(solver, SingleRows):
         return solver.rank(positions, lattice, time)
     if isinstance(solver, SparseDistances):
         return solver.rank(positions, lattice)
     if isinstance(solver, DistanceClusters):
         return rank_of_small(shape, inverse_masses, positions, lattice)
     assert isinstance(solver, GeneralClusters)
-    return solver.rank(positions, time)
+    return solver.rank(positions, time, moved)

@@ -61,6 +61,8 @@ class CalledSolver(ABC):
     ways: tuple[bool, ...] = (False,)
     _given: GivenRows
     _solution: FloatArray
+    #: Whether rows take whole cells off positions.
+    _moved = False
 
     @property
     @abstractmethod
@@ -75,9 +77,14 @@ class CalledSolver(ABC):
         """Raise what a Python function among the rows has raised while a kernel ran."""
         self._given.refuse()
 
+    def _take_off(self, moved: FloatArray | None) -> None:
+        """Let rows with a place in space take these whole cells off the positions of their atoms."""
+
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt, flight = request
+        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt, flight, moved = request
+        if moved is not None or self._moved:
+            self._take_off(moved)
         numbers = self._given.numbers
         numbers[:3] = time, reference_time, flight
         for careful in self.ways:
@@ -95,7 +102,9 @@ class CalledSolver(ABC):
 
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, wanted, lattice, time, *_ = request
+        y, x, wanted, lattice, time, _, _, _, _, moved = request
+        if moved is not None or self._moved:
+            self._take_off(moved)
         self._given.numbers[:3] = time, time, 1.0
         found = self.kernels[1](
             True, x, y, NO_NUMBERS if wanted is None else wanted[self.rows],

@@ -33,6 +33,8 @@ class Request(NamedTuple):
         Whether `reference` is where a flight began that ends in `changed`: rows of velocities then hold at its middle,
         at the middle of the times, and `wanted` has what they are held at times the length of the flight. Otherwise
         rows of velocities do not count in positions.
+    moved : ndarray, shape (n_atoms, 3), optional
+        Whole cells by which positions were moved from where they are stored. Rows with a place in space take them off.
     """
 
     changed: FloatArray
@@ -44,6 +46,7 @@ class Request(NamedTuple):
     velocities: FloatArray | None = None
     inv_dt: float = 0.0
     flight: bool = False
+    moved: FloatArray | None = None
 
 
 class Outcome(NamedTuple):

@@ -81,7 +81,7 @@ class EightAtATime(DistanceClusters):
     def _project(
         self, request: Request, given: FloatArray, tangent: Literal[True] | None, multipliers: FloatArray | None
     ) -> Outcome:
-        points, references, _, lattice, _, _, velocities, inv_dt, _ = request
+        points, references, _, lattice, _, _, velocities, inv_dt, _, _ = request
         cell, kind = lattice_kind(lattice)
         ok, residual, iterations, row = self._kernel(
             points,

@@ -153,11 +153,15 @@ class GeneralClusters:
         data = self.subset.jacobian(state, time).data
         return data if flight is None else np.where(flight.entries, flight.jacobian(state).data, data)
 
+    def _place(self, request: Request) -> None:
+        self.subset.lattice = request.lattice
+        self.subset.moved = None if request.moved is None else request.moved[self.atoms]
+
     # -- positions ------------------------------------------------------------------------------
 
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
-        self.subset.lattice = request.lattice
+        self._place(request)
         state = request.changed[self.atoms]
         flight = None if self._held.all() else _Flight.of(request, self.subset, self.atoms, self.rows)
         with np.errstate(all="ignore"):
@@ -324,7 +328,7 @@ class GeneralClusters:
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """y <- y - M^-1 A^T mu with A y = rates, in place; see `Motion.project_velocities`."""
         rates, y = request.wanted, request.changed
-        self.subset.lattice = request.lattice
+        self._place(request)
         with np.errstate(all="ignore"):
             data = self._data(request.reference[self.atoms], request.time)
             local = y[self.atoms]
@@ -372,8 +376,9 @@ class GeneralClusters:
             multipliers[:] = mu
         return worst
 
-    def rank(self, x: FloatArray, time: float) -> int:
-        """Independent rows at `x`, by singular values."""
+    def rank(self, x: FloatArray, time: float, moved: FloatArray | None = None) -> int:
+        """Independent rows at `x`, by singular values; `moved` as in `Request`."""
+        self.subset.moved = None if moved is None else moved[self.atoms]
         data = self._data(x[self.atoms], time)
         return sum(rank(self._weighted(batch, data)) for batch in self._batches)
 

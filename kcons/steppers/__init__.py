@@ -2,7 +2,8 @@
 
 A stepper never changes its input. Where it raises, nothing has happened.
 
-- `state`, `files`: where a system is, and what acts on it
+- `state`: where a system is, and what acts on it
+- `files`: its files, and folders of results that belong to one run
 - `operations`: a time step as data
 - `stepper`: what a stepper is
 - `stages`: what steps are made of

@@ -10,6 +10,7 @@ import numpy as np
 from kcons.constraints.arguments import check_call, finite_number, refuse_other, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.motion.certificate import checked_every
+from kcons.steppers.files import refuse_clock
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper, require_stepper
@@ -145,7 +146,7 @@ def run(
     ------
     InputError
         Negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units, or that is no finite number;
-        what is no system, state, stepper or observer.
+        what is no system, state, stepper or observer; a state whose time is no finite number, or whose step no count.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
@@ -159,6 +160,7 @@ def run(
     dt = finite_number(dt, "dt")
     refuse_other(system, System, "system", "a kcons.System")
     refuse_other(state, State, "state", "a kcons.State, such as system.initial_state(positions, velocities)")
+    refuse_clock(state.time, state.step, state.time_remainder)
     if stepper is None:
         stepper = Rattle()
     require_stepper(stepper)

@@ -22,7 +22,7 @@ from kcons.constraints.vectors import extent
 from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
-from kcons.steppers.files import checked_state, in_one_piece, stored_arrays
+from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
 from kcons.steppers.stages.compensated_steps import beyond, check_finite
 from kcons.steppers.stages.drifts import Drift, FreeFlight, GreatCircles
 from kcons.steppers.stages.friction import Friction
@@ -427,11 +427,13 @@ class System:
         Raises
         ------
         InputError
-            Wrong shapes, complex numbers, masked arrays: a state may have been made by hand.
+            Wrong shapes, complex numbers, masked arrays, a time that is no finite number, a step that is no count: a
+            state may have been made by hand.
         """
         x, v, f = state.positions, state.velocities, state.forces
         if state is self.last:
             return x, v, f
+        refuse_clock(state.time, state.step, state.time_remainder)
         x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
         return x, v, None if f is None or not state.has_forces_of(self) else as_array(f, self._shape, "forces")
 

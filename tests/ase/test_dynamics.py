@@ -11,7 +11,7 @@ from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
-from ase.constraints import FixAtoms, FixBondLengths, Hookean
+from ase.constraints import FixAtoms, FixBondLengths, FixCartesian, Hookean
 from ase.io import read
 from ase.io.trajectory import Trajectory
 from ase.md.velocitydistribution import thermalize_momenta
@@ -407,6 +407,61 @@ def test_constraints_changed_between_steps_are_taken():
     dyn.run(5)
     assert np.array_equal(atoms.positions[0], fixed)
     assert dyn.degrees_of_freedom == 6
+
+
+def _index(items):
+    items["atoms"].index = np.array([7])
+
+
+def _index_in_place(items):
+    items["atoms"].index[0] = 7
+
+
+def _mask(items):
+    items["components"].mask[:] = True, True, True
+
+
+def _lengths(items):
+    items["lengths"].pairs = np.array([[1, 2], [3, 5]])
+    items["lengths"].bondlengths = None
+
+
+def _rows(items):
+    items["kcons"].constraints = (*items["kcons"].constraints, Distance([1, 2]))
+
+
+@pytest.mark.parametrize(
+    ("change", "rest"),
+    [(_index, [7]), (_index_in_place, [7]), (_mask, [8]), (_lengths, []), (_rows, [])],
+    ids=lambda v: getattr(v, "__name__", ""),
+)
+def test_what_constraints_hold_changed_between_steps_is_taken(change, rest):
+    """The objects on the atoms are the same: dynamics go on as new ones would, which see them so from the start."""
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    items = {
+        "atoms": FixAtoms([6]),
+        "components": FixCartesian([8], (True, False, False)),
+        "lengths": FixBondLengths([[1, 2]]),
+    }
+    atoms.set_constraint(list(items.values()))
+    if change is _rows:
+        atoms.set_constraint(list(items.values())[:2])
+    items["kcons"] = constrain(atoms, Distance([0, 4]))
+    draw_velocities(atoms, 300, rng=1)
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(2)
+    engine = dyn.motion
+    dyn.run(1)
+    assert dyn.motion is engine
+    change(items)
+    again, before = atoms.copy(), atoms.get_positions()
+    again.calc = EMT()
+    dyn.run(2)
+    ConstrainedDynamics(again, FS).run(2)
+    np.testing.assert_allclose(atoms.positions, again.positions, rtol=0, atol=1e-13)
+    assert np.array_equal(atoms.positions[rest], before[rest])
+    assert dyn.motion is not engine
 
 
 def test_masses_changed_between_steps_are_taken():

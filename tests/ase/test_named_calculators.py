@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from ase.calculators.lj import LennardJones
 from ase.calculators.mixing import SumCalculator
 from ase.constraints import ExternalForce, FixAtoms, Hookean
 
-from kcons.ase.named_calculators import described, named_calculator
+from kcons.ase.named_calculators import LISTED, described, named_calculator, refuse_unlisted
 from kcons.errors import InputError
 
 
@@ -92,3 +93,69 @@ def test_constraints_that_add_forces_belong_to_it():
         atoms.set_constraint([FixAtoms([0]), item])
         found.append(json.dumps(described(EMT(), atoms)))
     assert len(set(found)) == 4
+
+
+# -- what names a calculator may be somebody else ---------------------------------------------------
+
+MODULE = """
+from os import system
+from ase.calculators.emt import EMT
+import pathlib
+pathlib.Path(__file__).with_suffix(".ran").touch()
+number = 3
+
+class Mine(EMT):
+    pass
+
+class Other:
+    def __init__(self, command):
+        system(command)
+
+def made(asap_cutoff=False):
+    return Mine(asap_cutoff=asap_cutoff)
+
+def nothing(**settings):
+    return None
+"""
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """The name of a module, and a file that is there once it was imported."""
+    (tmp_path / "calculators_of_mine.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "calculators_of_mine", tmp_path / "calculators_of_mine.ran"
+    sys.modules.pop("calculators_of_mine", None)
+
+
+def test_a_class_or_a_function_makes_a_calculator(module):
+    name, _ = module
+    assert isinstance(named_calculator(f"{name}:Mine"), EMT)
+    assert named_calculator(f"{name}:made", {"asap_cutoff": True}).parameters["asap_cutoff"] is True
+
+
+@pytest.mark.parametrize("what", ["system", "Other", "nothing", "number", "pathlib", "EMT"])
+def test_what_makes_no_calculator_is_refused(module, tmp_path, what):
+    """Nor is what a module has from elsewhere called, nor a class that is none."""
+    name, _ = module
+    with pytest.raises(InputError, match=f"{name}:{what} (is no calculator of ASE, nor|makes no calculator of ASE)"):
+        named_calculator(f"{name}:{what}", {"command": f"touch {tmp_path / 'shell'}"})
+    assert not (tmp_path / "shell").exists()
+
+
+def test_files_name_calculators_of_a_list_or_of_modules_that_their_reader_names(module):
+    name, ran = module
+    for listed in LISTED:
+        refuse_unlisted(listed, ())
+    with pytest.raises(InputError, match=f"the calculator '{name}:Mine' runs code of .*--allow-module {name} "):
+        refuse_unlisted(f"{name}:Mine", ["another", f"{name}:Mine", f"{name}.more"])
+    refuse_unlisted(f"{name}:Mine", [name])
+    assert not ran.exists()  # nothing is imported
+    # These start programs that their settings name.
+    for program in ("cp2k", "aims", "lammpsrun"):
+        with pytest.raises(InputError, match=f"--allow-module ase.calculators.{program} "):
+            refuse_unlisted(program, ())
+        refuse_unlisted(program, [f"ase.calculators.{program}"])
+    for wrong in ("", ":", "os:", ":system", "gfn3", "os.path", "../os"):
+        with pytest.raises(InputError, match=f"there is no calculator '{wrong}'"):
+            refuse_unlisted(wrong, ["os", "os.path", "ase.calculators.gfn3"])

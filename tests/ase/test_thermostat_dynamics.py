@@ -25,6 +25,7 @@ from kcons.ase import (
 )
 from kcons.constraints import Distance, FixedAtoms, Plane
 from kcons.errors import InputError, KconsError, NonFiniteError, OverdeterminedError, UnsupportedError
+from kcons.steppers import State
 
 FS = units.fs
 
@@ -225,6 +226,23 @@ def test_a_saved_run_goes_on_to_the_last_bit(kind, at, tmp_path):
     assert np.array_equal(moving._state.thermostat, resumed._state.thermostat)
     assert resumed.nsteps == 30
     assert not list(tmp_path.glob("*.unfinished"))
+
+
+@KINDS
+def test_a_restart_asks_the_calculator_for_forces(kind, tmp_path):
+    """Those of a file may be of another calculator: the run goes on as one from positions and velocities alone."""
+    moving = made(kind, waters())
+    moving.run(3)
+    moving.save(tmp_path / "restart.npz")
+    saved = moving.state
+    assert saved.forces is not None
+    bare = State(saved.positions, saved.velocities, saved.time, step=saved.step, thermostat=saved.thermostat)
+    ends = []
+    for given in ({"restart": tmp_path / "restart.npz"}, {"state": saved}, {"state": bare}):
+        atoms = waters(calc=Pairs(), momenta=False)
+        made(kind, atoms, **given, **({} if kind == "langevin" else {"momentum": "free"})).run(2)
+        ends.append(state(atoms))
+    assert equal(ends[0], ends[2]) and equal(ends[1], ends[2])
 
 
 def test_a_run_goes_on_from_a_state_of_another_dynamics():

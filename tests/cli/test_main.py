@@ -168,3 +168,33 @@ def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, 
 def test_criteria_that_do_not_fit(words, said, capsys):
     assert run("compare", *words) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["compare", "chain", "--methods", "rattle"], ["compare.csv", "compare.png", "compare.txt"]),
+        (["compare", "thermostat", "--methods", "langevin"], ["compare.json", "compare.png", "compare.txt"]),
+        (["compare", "thermostat-water", "--fast", "3.8", "--methods", "spheres"], ["compare.json", "compare.txt"]),
+    ],
+    ids=lambda given: "-".join(given[:2]),
+)
+def test_results_of_others_are_not_overwritten(words, names, tmp_path, capsys):
+    """Before anything is measured."""
+    for name in names:
+        other = tmp_path / name / name
+        other.parent.mkdir()
+        other.write_text("precious")
+        assert run(*words, "--out", other.parent) == 2
+        assert f"other files called {name}; give another folder (--out)" in capsys.readouterr().err
+        assert [path.name for path in other.parent.iterdir()] == [name] and other.read_text() == "precious"
+
+
+def test_a_comparison_replaces_that_of_the_same_system_alone(tmp_path, capsys):
+    words = ("--methods", "rattle", "--dt", 10, "--out", tmp_path)
+    assert run("compare", "chain", "--size", 3, *words) == 0
+    assert run("compare", "chain", "--size", 4, *words) == 0
+    before = (tmp_path / "compare.csv").read_bytes()
+    assert run("compare", "sphere", *words) == 2
+    assert "has a comparison of other system (chain); give another folder (--out)" in capsys.readouterr().err
+    assert (tmp_path / "compare.csv").read_bytes() == before

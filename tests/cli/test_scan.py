@@ -157,3 +157,13 @@ def test_a_file_that_ase_cannot_read(run, tmp_path, capsys):
     (tmp_path / "bad.xyz").write_text("three\n")
     assert run("bad.xyz", *TURN) == 2
     assert "ASE cannot read bad.xyz" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["scan.json", "scan.csv", "scan.png", "scan.extxyz", "plan.json"])
+def test_results_of_others_are_not_overwritten(run, tmp_path, capsys, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("precious")
+    assert run("peroxide.xyz", *TURN, "--steps", 2, "--out", "out", *EMT) == 2
+    assert f"out has other files called {name}; give another folder (--out)" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [name]
+    assert (tmp_path / "out" / name).read_text() == "precious"

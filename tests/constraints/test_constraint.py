@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -199,3 +201,20 @@ def test_what_are_no_constraints(given):
         constraints_in(given, "held")
     row = Distance([[0, 1]])
     assert constraints_in(row, "held") == [row] == constraints_in(iter([row]), "held")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_arrays_cannot_be_changed(name):
+    """Engines have copies of what stands in them, and would not notice."""
+    item = made(name)
+    others = [item, item.select([0]), item.renumbered(np.arange(N_ATOMS)), item.with_target(None), copy.deepcopy(item)]
+    try:
+        others += [from_dict(item.todict()), pickle.loads(pickle.dumps(item))]
+    except (InputError, AttributeError, TypeError, pickle.PicklingError):
+        assert item.functions or item.moving  # they hold functions of Python
+    for each in others:
+        arrays = {name: value for name, value in vars(each).items() if isinstance(value, np.ndarray)}
+        assert {"atoms", *item.per_row} <= set(arrays)
+        assert not [name for name, value in arrays.items() if value.flags.writeable]
+    with pytest.raises(ValueError, match="read-only"):
+        item.atoms[0, 0] = 1

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons import ConstraintSet
+from kcons import ConstraintSet, Motion
+from kcons import constraints as held
 from kcons.constraints import Dihedral, Distance
 from kcons.constraints.target import MovingTarget, as_target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
@@ -64,6 +65,49 @@ def test_an_acceleration_without_its_rate_is_refused():
 def test_bad_targets_are_named(target, message):
     with pytest.raises(InputError, match=message):
         as_target(target, 3)
+
+
+HUGE = {
+    "Distance": lambda t: Distance([0, 1], t),
+    "CenterDistance": lambda t: held.CenterDistance([0], [1, 2], t),
+    "RadiusOfGyration": lambda t: held.RadiusOfGyration([[0, 1, 2]], target=t),
+    "Dihedral": lambda t: Dihedral([0, 1, 2, 3], t),
+    "Sphere": lambda t: held.Sphere(0, [1.0, 1.0, 1.0], t),
+    "center": lambda t: held.Sphere(0, [t, 1.0, 1.0], None),
+    "Cylinder": lambda t: held.Cylinder(0, [1.0, 1.0, 1.0], [0, 0, 1.0], t),
+    "Torus": lambda t: held.Torus(0, [1.0, 1.0, 1.0], [0, 0, 1.0], 2.0, t),
+    "major radius": lambda t: held.Torus(0, [1.0, 1.0, 1.0], [0, 0, 1.0], t, 1.0),
+    "Ellipsoid": lambda t: held.Ellipsoid(0, [1.0, 1.0, 1.0], [2.0, 1.0, 1.0], target=t),
+    "Plane": lambda t: held.Plane(0, [0, 0, 1.0], t),
+    "point": lambda t: held.Line(0, [t, 0, 0], [0, 0, 1.0]),
+    "CenterOfMass": lambda t: held.CenterOfMass([[0, 1]], target=[[t, 0, 0]]),
+    "LinearCombination": lambda t: held.LinearCombination([0, 1], [[1.0, 0, 0], [-1.0, 0, 0]], t),
+    "coefficients": lambda t: held.LinearCombination([0, 1], [[t, 0, 0], [-t, 0, 0]]),
+    "LinearRelation": lambda t: held.LinearRelation(0, [1, 2], [0.5, 0.5], [[t, 0, 0]]),
+    "FixedAtoms": lambda t: held.FixedAtoms([0], [[t, 0, 0]]),
+    "Custom": lambda t: held.Custom([0], lambda r: float(r[0, 0]), target=t),
+    "Formula": lambda t: held.Formula("x1", 0, target=t),
+    "parameter": lambda t: held.Formula("x1 - a", 0, {"a": t}),
+    "LinearVelocity": lambda t: held.LinearVelocity([[0]], [[1.0, 0, 0]], t),
+}
+
+
+@pytest.mark.parametrize("large", [1.1e150, 1e155, -1e200, 1e308])
+@pytest.mark.parametrize("make", HUGE.values(), ids=HUGE)
+def test_numbers_whose_squares_overflow_are_refused(make, large):
+    with pytest.raises(InputError, match="of which the square overflows; choose other units"):
+        make(large)
+    make(0.9e150)
+
+
+def test_a_moving_target_is_refused_when_it_becomes_too_large():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    target = MovingTarget(lambda t: 1.0 if t < 0.5 else 1e160, lambda t: 0.0, lambda t: 0.0)
+    motion = Motion(ConstraintSet(Distance([0, 1], target), x, np.ones(2)), x)
+    new, kept = x.copy(), x.copy()
+    with pytest.raises(InputError, match=r"target at t = 1 is 1e\+160, of which the square overflows"):
+        motion.project_positions(new, x, time=1.0, out=new)
+    np.testing.assert_array_equal(new, kept)
 
 
 def test_bad_values_of_a_function_are_named():

@@ -235,7 +235,7 @@ class Judge:
             self.values()
             self.restore()
         self.steps()
-        if self.periodic and not self._far() and rng.random() < 0.3:
+        if self.periodic and not self._far() and not w.elsewhere and rng.random() < 0.3:
             self.new_cell()
         still = all(i.how != "moving" for i in w.items)
         if still and rng.random() < 0.2:
@@ -483,7 +483,7 @@ class Judge:
         """Wrap the atoms, or change the cell, as MD engines and barostats do."""
         w, rng = self.w, self.rng
         whole = state.positions - images @ cell
-        if rng.random() < 0.5 or winds or self._far():
+        if rng.random() < 0.5 or winds or w.elsewhere or self._far():
             images = np.where(w.placed[:, None], images, wrapping(whole, cell, w.pbc))
         else:
             changed = w.cell @ (np.eye(3) + 0.02 * rng.uniform(-1, 1, (3, 3)))

@@ -291,10 +291,45 @@ def fixed_pair(b: Builder) -> list[int]:
 
 def surface(b: Builder) -> list[int]:
     """A chain of which one atom, or the centre of mass, keeps to a place."""
-    rng = b.rng
-    a = b.atoms(zigzag(rng, int(rng.integers(1, 5))))
+    a = b.atoms(zigzag(b.rng, int(b.rng.integers(1, 5))))
     if len(a) > 1:
         b.distances(list(itertools.pairwise(a)))
+    _place(b, a)
+    return a
+
+
+def places(b: Builder) -> list[int]:
+    """Atoms that each keep to a place of their own, tied together by what depends on their images."""
+    rng = b.rng
+    n = int(rng.integers(2, 6))
+    a = b.atoms(zigzag(rng, n))
+    tie = rng.integers(4)
+    if tie == 0 and n > 2:
+        (b.angles if n == 3 else b.dihedrals)([a[:4]])
+    elif tie == 1 and n > 2:
+        b.add("RadiusOfGyration", [Row("gyration", [{i: 1.0 for i in a}])], [a], atoms=a, mass_weighted=False)
+    elif tie == 2:
+        c = np.outer([1.0, -1.0], _unit(rng))
+        b.combination([a[0], a[-1]], c)
+    else:
+        row = Row("norm", [{i: 1.0 if i == a[0] else -1.0 for i in a}], [(0, 0, 0)])
+        b.add("CenterDistance", [row], [a], group_a=a[:1], group_b=a[1:])
+    if rng.random() < 0.4:
+        b.distances([p for p in itertools.pairwise(a) if rng.random() < 0.5] or [(a[0], a[1])])
+    order = [a[int(k)] for k in rng.permutation(n)]
+    if rng.random() < 0.3:
+        b.fixed.append(order[-1])
+        b.placed.add(order[-1])
+        b.add("FixedAtoms", [], [order[-1:]], atoms=order[-1:])
+    for k in range(int(rng.integers(2, n + 1))):
+        if order[k] not in b.fixed:
+            _place(b, order[k:])
+    return a
+
+
+def _place(b: Builder, a: list[int]) -> None:
+    """The first atom on a surface, or the centre of all or a combination of them at a place."""
+    rng = b.rng
     what = rng.integers(4)
     if what == 0:
         center = b.x[a[0]] + _unit(rng) * rng.uniform(1, 2)
@@ -311,7 +346,6 @@ def surface(b: Builder) -> list[int]:
     else:
         b.combination(a, rng.normal(size=(len(a), 3)), place=True)
         b.placed.update(a)
-    return a
 
 
 def winding(b: Builder) -> list[int]:
@@ -353,6 +387,7 @@ KINDS: dict[str, tuple[float, Callable[[Builder], list[int]]]] = {
     "fixed": (1.0, fixed),
     "fixed pair": (0.2, fixed_pair),
     "surface": (1.0, surface),
+    "places": (1.0, places),
     "winding": (0.7, winding),
 }
 

@@ -45,7 +45,7 @@ class World:
     items : list of Item
     rows : Dense
     placed : array of bool
-        Atoms that a row holds at a place in space: these must not change their image.
+        Atoms that a row holds at a place in space, in the image in which they are given: these must not change it.
     impossible : bool
         A row between fixed atoms that moves by itself: must be refused.
     drifting : bool
@@ -80,6 +80,11 @@ class World:
         return (self.x if x is None else x) + (self.images if images is None else images) @ (
             self.cell if cell is None else cell
         )
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether atoms that keep to a place do so in another image than that of the whole molecule."""
+        return bool(np.any(self.images[self.placed]))
 
     def constraints(self) -> list[families.Constraint]:
         """The rows in the package's words; new objects at each call."""
@@ -139,6 +144,7 @@ class World:
             "fixed atoms": len(self.rows.pinned) > 0,
             "far images": bool(np.abs(self.images).max() > 5),
             "wrapped or elsewhere": bool(np.any(self.images)),
+            "places in other images": self.elsewhere,
             "free links": self.links(self.x)[0] > 0,
         }
         return [name for name, present in found.items() if present]
@@ -173,15 +179,20 @@ def _constraint(item: Item, world: World) -> families.Constraint:
     """The package's object of an item."""
     arguments = {k: v for k, v in item.arguments.items() if k not in ("listed", "pairs_as_rows", "place")}
     make = getattr(families, item.family)
+    moved = world.images @ world.cell
     if item.family == "FixedAtoms":
         atoms = np.asarray(arguments["atoms"])
         slots = np.searchsorted(world.rows.pinned, atoms)
-        places, waves = world.rows.places[slots], world.rows.waves[:, slots]
+        places, waves = world.rows.places[slots] + moved[atoms], world.rows.waves[:, slots]
         if item.how == "moving":
             return make(atoms, _moving(places, waves))
         return make(atoms, None if item.how == "open" else places)
     rows = item.arguments.get("pairs_as_rows") or item.rows
     values = np.array([r.target for r in rows])
+    if item.family == "Sphere":
+        arguments["center"] = arguments["center"] + moved[arguments["atoms"][0]]
+    elif item.family in ("Plane", "CenterOfMass") or "place" in item.arguments:
+        values = values + [sum(c @ moved[a] for a, c in r.coefficients.items()) for r in rows]
     target = None
     if item.how == "given":
         target = values
@@ -267,6 +278,8 @@ def _finished(b: Builder) -> World:
     s = _singular_values(rows, x)
     if np.any((s > DEPENDENT) & (s < s.max(initial=0.0) / WORST_CONDITION)):
         raise Unsuitable
+    if np.sum(s >= DEPENDENT) == 3 * (n - len(pinned)):
+        raise Unsuitable  # nothing can move, and a speed of 0 is no measure of what rounds
     if np.any(s < DEPENDENT) and (np.any(rows.waving[0]) or np.any(waves)):
         raise Unsuitable  # rows that depend on each other contradict each other once one of them moves
     if not b.impossible and np.any(np.abs(rows.value(x, 0.0)) > 1e-12):
@@ -418,7 +431,8 @@ def _store(w: World, rng: np.random.Generator) -> None:
         w.images = rng.integers(-2, 3, (n, 3))
     elif how < 0.95:
         w.images = rng.integers(-40, 41, (n, 3))
-    w.images = np.where(w.placed[:, None] | ~w.pbc, 0, w.images)
+    kept = w.placed & (rng.random() < 0.3)
+    w.images = np.where(kept[:, None] | ~w.pbc, 0, w.images)
 
 
 def wrapping(x: Array, cell: Array, pbc: Array) -> Array:

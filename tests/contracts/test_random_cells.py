@@ -17,8 +17,8 @@ from cell_worlds import world
 from kcons import Motion
 from kcons.errors import ConvergenceError
 
-#: Some of those of the long run; in the last an atom of a pair is fixed, which is rare.
-FAST = (*range(60), 144)
+#: Some of those of the long run; in the last ones atoms that keep to places are given in other images.
+FAST = (*range(60), 67, 84, 106, 108, 147, 154)
 
 
 def test_a_share_of_the_cases():
@@ -28,6 +28,7 @@ def test_a_share_of_the_cases():
     assert set(found["kinds"]) == set(KINDS)
     assert found["features"]["longer than the cell"]["right"] > 3
     assert found["features"]["drifting"]["refused"] > 0
+    assert found["features"]["places in other images"]["right"] > 8
     assert found["allowed"]["largest"] < 1e-7
 
 

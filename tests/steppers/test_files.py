@@ -5,13 +5,22 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from kcons.errors import InputError
-from kcons.steppers.files import as_path, in_one_piece, plain, stored_arrays, text
+from kcons import State
+from kcons.errors import InputError, OccupiedError
+from kcons.steppers.files import ResultFolder, as_path, in_one_piece, plain, stored_arrays, text
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_what_names_a_path(tmp_path: Path) -> None:
@@ -52,6 +61,137 @@ def test_what_was_left_unfinished_is_written_anew_and_links_are_not_followed(tmp
     assert path.read_bytes() == b"mine" and not path.is_symlink()
 
 
+def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    with in_one_piece(path) as one:
+        one.write(b"the first half")
+        with in_one_piece(path) as other:
+            other.write(b"all of the other")
+        assert path.read_bytes() == b"all of the other"
+        with pytest.raises(OSError, match="full"), in_one_piece(path) as third:
+            third.write(b"never more")
+            raise OSError("the disk is full")
+        one.write(b", and the second")
+    assert path.read_bytes() == b"the first half, and the second"
+    assert [found.name for found in tmp_path.iterdir()] == ["a"]
+
+
+def test_states_saved_by_several_at_once_are_whole(tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    states = [State(np.full((20_000, 3), float(k)), np.full((20_000, 3), float(k))) for k in range(3)]
+    states[0].save(path)
+
+    def save(state: State) -> None:
+        for _ in range(15):
+            state.save(path)
+
+    with ThreadPoolExecutor(3) as pool:
+        writing = [pool.submit(save, state) for state in states]
+        loaded = 0
+        while not all(job.done() for job in writing):
+            found = State.load(path)
+            assert np.ptp(found.positions) == np.ptp(found.velocities) == 0
+            loaded += 1
+        for job in writing:
+            job.result()
+    assert loaded > 1 and [found.name for found in tmp_path.iterdir()] == ["state.npz"]
+
+
+# -- folders of results -----------------------------------------------------------------------------
+
+
+def of(folder: Path, **owner: object) -> ResultFolder:
+    return ResultFolder(folder, "of.json", owner or {"system": "water"}, ["part-*.npz", "found.csv"], "a study")
+
+
+def test_a_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
+    mine, other = of(tmp_path / "out"), of(tmp_path / "out")
+    with mine.taken(), mine.taken():
+        with pytest.raises(OccupiedError, match=rf"another run writes into .*out \(process {os.getpid()} on .*--out"):
+            other.taken().__enter__()
+        (tmp_path / "out" / "found.csv").write_text("mine")
+    with other.taken():
+        assert (tmp_path / "out" / "found.csv").read_text() == "mine"
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["found.csv", "of.json"]
+
+
+def test_a_run_that_is_killed_leaves_a_folder_to_the_next(tmp_path: Path) -> None:
+    """No lock outlives its process, and what it had begun to write is cleared."""
+    script = """
+import sys, time
+from kcons.steppers.files import ResultFolder, in_one_piece
+folder = ResultFolder(sys.argv[1], "of.json", {"system": "water"}, ["part-*.npz", "found.csv"], "a study")
+with folder.taken(), in_one_piece(folder.path / "part-1.npz") as file:
+    file.write(b"half")
+    file.flush()
+    print("begun", flush=True)
+    time.sleep(100)
+"""
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=tmp_path.parent
+    )
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    with pytest.raises(OccupiedError, match=f"process {process.pid}"):
+        of(tmp_path).taken().__enter__()
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.stdout.close()
+    assert list(tmp_path.glob("*.unfinished"))
+    (tmp_path / "kept.csv.0123.unfinished").write_text("of somebody else")
+    with of(tmp_path).taken():
+        assert sorted(path.name for path in tmp_path.glob("*.*")) == [
+            ".kcons.lock",
+            "kept.csv.0123.unfinished",
+            "of.json",
+        ]
+
+
+@pytest.mark.parametrize("name", ["part-3.npz", "found.csv", "of.json"])
+@pytest.mark.parametrize("content", ["precious", '{"precious": 1}', "[" * 100_000, None])
+def test_files_of_others_are_not_replaced(name: str, content: str | None, tmp_path: Path) -> None:
+    path = tmp_path / name
+    if content is None:
+        path.symlink_to(tmp_path / "nowhere")
+    else:
+        path.write_text(content)
+    for begin in (of(tmp_path).refuse_others, of(tmp_path).taken().__enter__):
+        with pytest.raises(OccupiedError, match=r"(other files called|is a link.*;) .*give another folder \(--out\)"):
+            begin()
+    assert [found.name for found in tmp_path.iterdir()] == [name]
+    assert content is None or path.read_text() == content
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    with of(tmp_path, system="water", size=3).taken():
+        pass
+    of(tmp_path, system="water", size=3).refuse_others()
+    for owner, said in (({"system": "chain", "size": 3}, "system"), ({"system": "water"}, "size")):
+        with pytest.raises(OccupiedError, match=f"has a study of other {said}; give another folder") as caught:
+            of(tmp_path, **owner).refuse_others()
+        assert caught.value.item == said
+    (tmp_path / "file").touch()
+    with pytest.raises(OccupiedError, match="there is a file where a folder has to be"):
+        of(tmp_path / "file").refuse_others()
+
+
+def test_a_result_may_be_the_record(tmp_path: Path) -> None:
+    """It says more than whose it is."""
+    (tmp_path / "r.json").write_text('{"settings": {"system": "water", "size": 3}, "numbers": [1]}')
+    for system in ("water", "chain"):
+        folder = ResultFolder(tmp_path, "r.json", {"settings": {"system": system}}, ["r.json"], "a study")
+        if system == "water":
+            with folder.taken():
+                pass
+        else:
+            with pytest.raises(OccupiedError, match=r"a study of other system \(water\); give"):
+                folder.refuse_others()
+    assert "numbers" in (tmp_path / "r.json").read_text()
+
+
+# -- data -------------------------------------------------------------------------------------------
+
+
 def test_data_as_json() -> None:
     data = {1: (1.5, math.nan), "b": [-math.inf, {"c": None, "d": True}], "σ": np.float64(0.25)}
     wanted = {"1": [1.5, None], "b": [None, {"c": None, "d": True}], "σ": 0.25}
@@ -85,3 +225,26 @@ def test_a_damaged_number_is_noticed() -> None:
     whole[300] ^= 1
     with pytest.raises(Exception, match="CRC"):
         stored_arrays(io.BytesIO(bytes(whole)))
+
+
+def test_an_archive_that_would_unpack_to_more_is_refused() -> None:
+    """Before any of it is read: a small file may unpack to all the memory there is."""
+    file = io.BytesIO()
+    np.savez_compressed(file, positions=np.zeros((100_000, 3)))
+    with pytest.raises(ValueError, match="would unpack to 2,400,128"):
+        stored_arrays(file)
+    file.seek(0)
+    with pytest.raises(InputError, match=r"holds no state .* would unpack to 2,400,128"):
+        State.load(file)
+
+
+@pytest.mark.parametrize("shape", [(10**12, 3), (1, 3)])
+def test_a_header_that_says_more_or_less_than_there_is(shape: tuple[int, int]) -> None:
+    """Room is made for what a header says: it is looked at before."""
+    content, file = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    content.write(bytes(48))
+    with zipfile.ZipFile(file, "w") as packed:
+        packed.writestr("positions.npy", content.getvalue())
+    with pytest.raises(ValueError, match=f"positions.npy has 48 bytes for {8 * shape[0] * 3:,}"):
+        stored_arrays(file)

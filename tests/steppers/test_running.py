@@ -21,6 +21,7 @@ from kcons.steppers import (
     Trajectory,
     run,
 )
+from kcons.thermostats import Langevin
 
 
 def molecule(force=None) -> tuple[System, State]:
@@ -70,6 +71,24 @@ def test_what_is_no_system_state_time_or_stepper(item, value) -> None:
     with pytest.raises(InputError, match=f"{item} is .*give") as caught:
         run(**given)
     assert caught.value.item == item
+
+
+IMPOSSIBLE = [{"time": np.nan}, {"time": -np.inf}, {"time": 1j}, {"time": "a"}, {"time_remainder": np.nan}]
+IMPOSSIBLE += [{"step": step} for step in (-3, 2.5, True, None)]
+
+
+@pytest.mark.parametrize("impossible", IMPOSSIBLE, ids=str)
+@pytest.mark.parametrize("stepper", [None, BlanesMoan4(), Langevin(1.0, 1.0, seed=1)], ids=str)
+def test_states_made_by_hand_with_impossible_numbers(stepper, impossible) -> None:
+    """In a run, which shows them to nobody, and in a step by itself."""
+    system, state = rotor()
+    wrong, seen = State(state.positions, state.velocities, **impossible), []
+    (item,) = impossible
+    with pytest.raises(InputError, match=f"^{item} is .*; give a") as caught:
+        run(system, wrong, 0.1, 2, stepper=stepper, observers=[seen.append])
+    assert caught.value.item == item and not seen
+    with pytest.raises(InputError, match=f"^{item} is"):
+        (stepper or Rattle()).step(system, wrong, 0.1)
 
 
 def test_run_uses_rattle_unless_told() -> None:

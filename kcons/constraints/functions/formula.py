@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, MD_UNITS, numbers, positive, without_units
+from kcons.constraints.arguments import ANY, MD_UNITS, numbers, out_of_range, positive, without_units
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part, width_of
 from kcons.constraints.target import FloatArray, Target
@@ -93,12 +93,15 @@ class Formula(Constraint):
             plain, matters = without_units(value, f"Formula: {name}", ANY)
             self.units = MD_UNITS if matters else self.units
             column = numbers(plain, f"Formula: {name}")
-            if column.shape not in ((), (1,), (self.n_rows,)) or not np.all(np.isfinite(column)):
+            if column.shape not in ((), (1,), (self.n_rows,)):
                 raise InputError(
                     f"Formula: parameter {name!r} has shape {column.shape}; give one finite number, or one for each of "
                     f"the {self.n_rows} rows",
                     item=name,
                 )
+            wrong = out_of_range(column)
+            if wrong is not None:
+                raise InputError(f"Formula: parameter {name!r} is {wrong[1]}", item=name)
             columns.append(np.broadcast_to(column, (self.n_rows,)))
         self._keep_values(np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
         self.translation_invariant = self.code().invariant

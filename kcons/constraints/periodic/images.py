@@ -11,6 +11,9 @@ set-up:
   spanning tree of the shortest links that the set has, held distances first, and the row takes positions in
   the images found there.
 
+Rows with a place in space are neither: they take all of their atoms as they are stored. What solvers get is made
+whole, so that these rows take off by how much (`InCell.moved`).
+
 A link of the tree that no constant distance holds is *loose*: its image is unambiguous only as long as it is
 shorter than half the cell. `Images.make_whole` reports how near the worst one is, and `Images.refuse_loose_links`
 raises before it flips.
@@ -415,7 +418,7 @@ def _tree(
     component = connected_components(forest, directed=False)[1].astype(np.int64)
     longest = np.zeros(int(component.max(initial=-1)) + 1)
     np.maximum.at(longest, component[pair[link, 0]], length[link])
-    # Atoms that are fixed, or held in space by a row of their own, keep the image they are stored in.
+    # Atoms that are fixed, or have a row of their own with a place in space, are not moved where that can be had.
     firm = np.zeros(n_atoms, bool)
     for item in given:
         if item.width == 1:

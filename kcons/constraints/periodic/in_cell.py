@@ -28,6 +28,9 @@ class InCell:
         Cell vectors as rows, and the inverse with zeros for directions without periodicity.
     images : Images or None
         The tree along which atoms of whole rows are made whole; see `kcons.constraints.periodic.images`.
+    moved : ndarray, shape (n_atoms, 3), or None
+        Whole cells by which the positions that the set is given were moved from where they are stored, in solvers:
+        rows with a place in space take them off.
     """
 
     constraints: tuple[Constraint, ...]
@@ -35,6 +38,7 @@ class InCell:
     lattice: FloatArray | None
     images: Images | None
     scale: FloatArray
+    moved: FloatArray | None = None
 
     def locate(self, row: int) -> tuple[Constraint, int]:
         """The constraint object that holds `row`, and the row's number within it."""
@@ -197,7 +201,7 @@ class InCell:
 
         here = self._rows(lambda c: miss(c, y)) / self.scale
         there = self._rows(lambda c: miss(c, as_before)) / self.scale
-        other = np.concatenate([changed[c.atoms].any(axis=1) for c in self.constraints if c.n_rows])
+        other = np.concatenate([changed[c.atoms].any(axis=1) & c.relative for c in self.constraints if c.n_rows])
         bad = other & (here > np.maximum(1e-9, 0.5 * there))
         if bad.any():
             row = int(np.argmax(np.where(bad, here, -1.0)))
@@ -234,14 +238,34 @@ class InCell:
             return x
         return self.images.make_whole(x, self.lattice)
 
+    @cached_property
+    def placed(self) -> IntArray | None:
+        """Atoms of `images` at which rows with a place in space look, but for `FixedAtoms`; None if there are none."""
+        rows = [c.atoms.ravel() for c in self.constraints if not c.relative and c.family != "FixedAtoms"]
+        if self.images is None or not rows:
+            return None
+        found = np.intersect1d(self.images.atoms, np.concatenate(rows))
+        return found if len(found) else None
+
+    def moved_places(self, stored: FloatArray, x: FloatArray) -> FloatArray | None:
+        """`moved` for positions `x`, where those of the atoms `placed` were `stored`; None if these did not move."""
+        cells = x[self.placed] - stored
+        if not cells.any():
+            return None
+        moved = np.zeros(x.shape)
+        moved[self.placed] = cells
+        return moved
+
     def gather(self, item: Constraint, x: FloatArray) -> FloatArray:
         """Positions of a constraint's atoms, shape (n_rows, width, 3), in the images that its rows mean."""
         return self._gather(item, x, self.whole(x))
 
     def _gather(self, item: Constraint, x: FloatArray, whole: FloatArray) -> FloatArray:
-        # Fixed atoms stand where they are told to, in no other image.
-        r = (x if item.family == "FixedAtoms" else whole)[item.atoms]
-        if self.lattice is None or not item.relative:
+        if not item.relative:
+            # A place in space is that of the positions as they are stored.
+            return x[item.atoms] if self.moved is None else x[item.atoms] - self.moved[item.atoms]
+        r = whole[item.atoms]
+        if self.lattice is None:
             return r
         if item.whole is None:
             return lined_up(r, self.lattice)

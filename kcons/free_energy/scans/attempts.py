@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -15,12 +17,13 @@ from ase import Atoms
 from kcons.ase.named_calculators import described
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, OccupiedError, UnreadableError
+from kcons.errors import UnreadableError
 from kcons.free_energy.scans.grid import Grid, Point
-from kcons.steppers.files import in_one_piece, stored_arrays, text
+from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays
 
-#: What is in a folder: the plan of the scan, and its relaxations.
+#: What is in a folder: the plan of the scan, its relaxations, and what `scan_report` makes of them.
 PLAN, PLACE = "plan.json", "relaxations"
+FILES = (f"{PLACE}/*.npz", "scan.json", "scan.csv", "scan.png", "scan.extxyz")
 #: Atoms of a term of the model, filled up with this.
 _NONE = -9
 
@@ -65,7 +68,7 @@ class Attempts:
 
     Parameters
     ----------
-    folder : Path or None
+    folder : path, or None
     atoms : ase.Atoms
     grid : Grid
     held : sequence of Constraint
@@ -74,15 +77,21 @@ class Attempts:
     Raises
     ------
     OccupiedError
-        The folder has another scan in it.
+        The folder has another scan in it, or other files of these names.
     InputError
         Coordinates that cannot be written to a file.
     """
 
     def __init__(
-        self, folder: Path | None, atoms: Atoms, grid: Grid, held: Sequence[Constraint], settings: Mapping[str, Any]
+        self,
+        folder: str | PathLike[str] | None,
+        atoms: Atoms,
+        grid: Grid,
+        held: Sequence[Constraint],
+        settings: Mapping[str, Any],
     ) -> None:
-        self.folder = folder
+        self._results: ResultFolder | None = None
+        self.folder: Path | None = None
         if folder is None:
             return
         plan = {
@@ -96,12 +105,25 @@ class Attempts:
             "held": [item.todict() for item in held],
             "settings": dict(settings),
         }
-        place = folder / PLAN
-        if place.exists():
-            _refuse_another(place, plan)
-        (folder / PLACE).mkdir(parents=True, exist_ok=True)
-        with in_one_piece(place) as file:
-            file.write(text(plan).encode())
+        self._results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
+        self._results.refuse_others()
+        self.folder = self._results.path
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Make the folder, and keep others out of it.
+
+        Raises
+        ------
+        OccupiedError
+            Another scan writes there.
+        """
+        if self._results is None:
+            yield
+            return
+        with self._results.taken():
+            (self._results.path / PLACE).mkdir(exist_ok=True)
+            yield
 
     def _file(self, number: int) -> Path:
         assert self.folder is not None
@@ -164,24 +186,3 @@ class Attempts:
                 memory=attempt.memory,
                 terms=terms,
             )
-
-
-def _refuse_another(place: Path, plan: Mapping[str, Any]) -> None:
-    try:
-        before = json.loads(place.read_text())
-    except ValueError as error:
-        raise UnreadableError(f"{place} cannot be read ({error}); take another folder", item="folder") from error
-    if not isinstance(before, dict):
-        raise UnreadableError(f"{place} is no plan of a scan; take another folder", item="folder")
-    unknown = sorted(set(before) ^ set(plan))
-    if unknown:
-        raise InputError(
-            f"{place} has unknown or missing entries: {', '.join(unknown)}; take another folder", item=unknown[0]
-        )
-    wrong = [name for name in plan if before[name] != json.loads(json.dumps(plan[name]))]
-    if wrong:
-        raise OccupiedError(
-            f"{place.parent} has another scan in it (of other {', '.join(wrong)}); take another folder "
-            "(--out on the command line)",
-            item="folder",
-        )

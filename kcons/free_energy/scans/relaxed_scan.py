@@ -36,13 +36,13 @@ from kcons.errors import (
     KconsError,
     NonFiniteError,
 )
+from kcons.free_energy.rigid_turns import warn_of_gaps
 from kcons.free_energy.scans.attempts import Attempt, Attempts
 from kcons.free_energy.scans.grid import Grid, Point
 from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import FIRST, relax
 from kcons.motion.minimisation import minimise
 from kcons.motion.motion import Motion
-from kcons.steppers.files import as_path
 
 #: Energy by which a structure has to be lower to be handed on to the neighbours, in eV (10^-5 hartree).
 LOWER = 2.7e-4
@@ -174,7 +174,7 @@ def scan(
         What else is held, at its targets or as it is in `atoms`.
     folder : path, optional
         Keeps every relaxation as soon as it is done. With the same arguments again, a scan goes on there, and tries
-        points once more that failed.
+        points once more that failed. One at a time.
     fmax : float
         The largest force along the constraints that may be left on an atom, in eV/angstrom.
     both_ways : bool
@@ -196,7 +196,7 @@ def scan(
     ConstraintError
         A coordinate that is undefined at the start, or depends on what else is held.
     OccupiedError
-        The folder has another scan in it.
+        The folder has another scan in it, or other files of the names of its results; or another one writes there.
     KconsError
         The first failure, where no point at all could be relaxed.
     """
@@ -206,8 +206,9 @@ def scan(
     fmax, evaluations = positive(fmax, "fmax"), whole_number(evaluations, "evaluations")
     surface = _Surface(atoms, grid, constraints_in(held, "held"))
     settings = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
-    attempts = Attempts(None if folder is None else as_path(folder, "folder"), atoms, grid, surface.held, settings)
-    return _Wavefront(surface, grid, attempts, settings, progress).run()
+    attempts = Attempts(folder, atoms, grid, surface.held, settings)
+    with attempts.taken():
+        return _Wavefront(surface, grid, attempts, settings, progress).run()
 
 
 class _Surface:
@@ -242,6 +243,7 @@ class _Surface:
         measured = self._engine(Constraints([c.with_target(None) for c in grid.coordinates])).constraint_set
         self.place = [float(v) for v in measured.measure(self.start)]
         self._bonds = bonds_of(self.atoms)
+        warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds)
 
     def _engine(self, constraints: Constraints) -> Motion:
         bare = self.atoms.copy()

@@ -1,9 +1,10 @@
-"""An OpenMM System as an ASE calculator."""
+"""An OpenMM System, from a file that runs no code, and as an ASE calculator."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,34 @@ from kcons.errors import InputError, UnsupportedError
 
 #: kJ/mol in eV.
 _KJ = units.kJ / units.mol
+
+
+def read_system(path: Path, item: str) -> openmm.System:
+    """The System of an XML file.
+
+    Raises
+    ------
+    InputError
+        No System; or one with a `PythonForce`, whose Python code would run while it is read.
+    """
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", item=item)
+    try:
+        text = path.read_text(encoding="utf-8")
+        if "PythonForce" in text:
+            raise InputError(
+                f"{path} has a PythonForce in it, whose code would run while the file is read; make the System in "
+                "Python where you trust it (OpenMMWindows, SystemCalculator)",
+                item=item,
+            )
+        system = openmm.XmlSerializer.deserialize(text)
+    except (OSError, ValueError, openmm.OpenMMException) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is no System of OpenMM: {error}", item=item) from error
+    if not isinstance(system, openmm.System):
+        raise InputError(f"{path} has a {type(system).__name__} in it, no System", item=item)
+    return system
 
 
 class SystemCalculator(Calculator):

@@ -106,8 +106,7 @@ class AseWindows:
         )
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
-        held = self._rows()
-        return held.found, held.periods
+        return self._rows().begin()
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         began = time.process_time()

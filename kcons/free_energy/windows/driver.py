@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED as FIRST
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
 from itertools import chain
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from os import PathLike
 from pathlib import Path
+from signal import SIG_IGN, SIGINT, signal
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -22,18 +25,29 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray, nearest_image
-from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
+from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
 from kcons.free_energy.windows.window_results import FreeEnergy, together
-from kcons.steppers.files import as_path, in_one_piece, text
+from kcons.steppers.files import ResultFolder
 
 #: Boltzmann's constant in kJ/mol/K.
 BOLTZMANN = 0.00831446261815324
 #: How often a window is begun again whose process was killed.
 RETRIES = 3
+#: Files of a folder of windows, those of `windows_report` and of the command line included.
+FILES = (
+    "window-*.npz",
+    "window-*.txt",
+    "pull-*.npz",
+    "pull-*.txt",
+    "free_energy.json",
+    "profile.csv",
+    "profile.png",
+    "pulls.json",
+)
 
 
 class Windows:
@@ -44,7 +58,8 @@ class Windows:
     sampler : Sampler
         `AseWindows` or `OpenMMWindows`.
     folder : path
-        Where finished windows are kept, one file each. A second run with the same sampler and settings goes on there.
+        Where finished windows are kept, one file each. A later run with the same sampler and settings goes on there;
+        one at a time.
     settings : Settings, optional
     both_sides : bool
         Sample each window twice, pulled there from below and from above: what the two differ by is hysteresis.
@@ -57,7 +72,8 @@ class Windows:
     KconsError
         A coordinate that is undefined at the structure or depends on other constraints.
     OccupiedError
-        The folder has windows of other settings; in `run`, of other values.
+        The folder has windows of other settings, or other files of their names; in `run`, `improve` and `pull`, of
+        other values, or another run writes there.
     """
 
     def __init__(
@@ -70,7 +86,6 @@ class Windows:
         approach: ArrayLike = 0.1,
         seed: int = 1,
     ) -> None:
-        self.folder = as_path(folder, "folder")
         self.sampler = sampler
         self.settings = settings or Settings()
         self.both_sides, self.seed = both_sides, seed_number(seed)
@@ -80,7 +95,10 @@ class Windows:
         self.approach = approach_of(approach, sampler.names)
         mine: dict[str, Any] = {"coordinates": list(sampler.names), "system": sampler.digest}
         mine |= {"settings": asdict(self.settings), "seed": self.seed, "both sides": both_sides}
-        _keep(self.folder, mine | {"approach": self.approach.tolist(), "start": self.start.tolist()})
+        mine |= {"approach": self.approach.tolist(), "start": self.start.tolist()}
+        self._results = ResultFolder(folder, "settings.json", mine, FILES, "windows")
+        self._results.refuse_others()
+        self.folder = self._results.path
 
     @property
     def angles(self) -> list[bool | None]:
@@ -88,6 +106,10 @@ class Windows:
         return list(self.sampler.angles)
 
     # -- running --------------------------------------------------------------------------------
+
+    def taken(self) -> AbstractContextManager[None]:
+        """Keep other runs out of the folder, over several calls. Each of `run`, `improve` and `pull` does so itself."""
+        return self._results.taken()
 
     def run(
         self,
@@ -117,10 +139,12 @@ class Windows:
             One failed window does not stop the others; `failed` says why.
         """
         numbers: list[int] = []
-        for place in map(tuple, places_of(targets, self.sampler.names).tolist()):
-            asked = [n for n, target in enumerate(self._targets) if target == place and n not in numbers]
-            numbers += asked[:1] or self._added([place])
-        return self._run(numbers, executor, workers, progress)
+        places = places_of(targets, self.sampler.names)
+        with self.taken():
+            for place in map(tuple, places.tolist()):
+                asked = [n for n, target in enumerate(self._targets) if target == place and n not in numbers]
+                numbers += asked[:1] or self._added([place])
+            return self._run(numbers, executor, workers, progress)
 
     def _added(self, places: Iterable[Sequence[float]]) -> list[int]:
         """Numbers of new windows."""
@@ -169,16 +193,17 @@ class Windows:
         """
         positive(error, "error")
         whole_number(most, "most")
-        result = self.result()
-        while len(self._targets) < most:
-            profile = result.profile
-            if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
-                break
-            places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
-            known = len(self._failed)
-            result = self._run(self._added([place] for place in places), executor, workers, progress)
-            if len(self._failed) > known:
-                break
+        with self.taken():
+            result = self.result()
+            while len(self._targets) < most:
+                profile = result.profile
+                if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
+                    break
+                places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
+                known = len(self._failed)
+                result = self._run(self._added([place] for place in places), executor, workers, progress)
+                if len(self._failed) > known:
+                    break
         return result
 
     def _jobs(self, number: int) -> list[Window]:
@@ -235,8 +260,9 @@ class Windows:
             seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
             jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
         every = list(chain(*jobs))
-        missing = [job for job in every if not self.file(job).exists()]
-        failed = self._sample(missing, executor, workers, progress, len(every))
+        with self.taken():
+            missing = [job for job in every if not self.file(job).exists()]
+            failed = self._sample(missing, executor, workers, progress, len(every))
         if failed:
             said = f"{len(failed)} of {len(every)} pulls failed; {': '.join(next(iter(failed.items())))}"
             if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs):
@@ -277,36 +303,33 @@ class Windows:
         left, began, done = list(jobs), time.monotonic(), 0
         cores = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         while left:
-            pool = executor or _processes(cores, len(left))
             again: list[Window] = []
             try:
-                running: dict[Future[None], Window] = {}
-                for job in left:
-                    running[pool.submit(_sampled, self.sampler, job, self.settings, self.file(job))] = job
-                while running:
-                    for future in wait(running, return_when=FIRST).done:
-                        job = running.pop(future)
-                        problem = _problem(future)
-                        tries[job.name] += 1
-                        if problem == _KILLED and tries[job.name] <= RETRIES:
-                            again.append(job)
-                            continue
-                        done += 1
-                        note = self.folder / f"{job.name}.failed.txt"
-                        note.unlink(missing_ok=True)
-                        if problem is not None:
-                            failed[job.name] = problem
-                            note.write_text(problem, encoding="utf-8")
-                        if progress is not None:
-                            spent = time.monotonic() - began
-                            progress(total - len(jobs) + done, total, spent / done * (len(jobs) - done))
+                with nullcontext(executor) if executor else _processes(cores, len(left)) as pool:
+                    running: dict[Future[None], Window] = {}
+                    for job in left:
+                        running[pool.submit(_sampled, self.sampler, job, self.settings, self.file(job))] = job
+                    while running:
+                        for future in wait(running, return_when=FIRST).done:
+                            job = running.pop(future)
+                            problem = _problem(future)
+                            tries[job.name] += 1
+                            if problem == _KILLED and tries[job.name] <= RETRIES:
+                                again.append(job)
+                                continue
+                            done += 1
+                            note = self.folder / f"{job.name}.failed.txt"
+                            note.unlink(missing_ok=True)
+                            if problem is not None:
+                                failed[job.name] = problem
+                                note.write_text(problem, encoding="utf-8")
+                            if progress is not None:
+                                spent = time.monotonic() - began
+                                progress(total - len(jobs) + done, total, spent / done * (len(jobs) - done))
             except BrokenExecutor:
                 if executor is not None:
                     raise  # nothing can be sent to it any more
                 again = [job for job in left if not self.file(job).exists() and job.name not in failed]
-            finally:
-                if executor is None:
-                    pool.shutdown(wait=True, cancel_futures=True)
             left = again
         return failed
 
@@ -334,25 +357,6 @@ class Windows:
                 found.append(together(number, np.array(target), sides, self.sampler, seconds))
         found.sort(key=lambda w: w.value.tolist())
         return FreeEnergy(self.sampler.names, self.periods, found, problems)
-
-
-def _keep(folder: Path, mine: Mapping[str, Any]) -> None:
-    """Make a folder of windows with these settings, or refuse one of others."""
-    folder.mkdir(parents=True, exist_ok=True)
-    known = folder / "settings.json"
-    if known.exists():
-        try:
-            theirs = dict(json.loads(known.read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
-            raise UnreadableError(f"{known} cannot be read ({error}); choose another folder", item="folder") from error
-        differ = [key for key in mine if theirs.get(key) != json.loads(text(mine))[key]]
-        if differ:
-            raise OccupiedError(
-                f"{folder} has windows of other {', '.join(differ)}; choose another folder", item=differ[0]
-            )
-        return
-    with in_one_piece(known) as opened:
-        opened.write(text(mine).encode())
 
 
 #: What is said of a window whose process was killed, or whose worker was lost.
@@ -396,11 +400,33 @@ def _log_mean(logarithms: FloatArray) -> float:
     return float(np.logaddexp.reduce(logarithms) - np.log(len(logarithms))) if len(logarithms) else 0.0
 
 
-def _processes(workers: int, jobs: int) -> ProcessPoolExecutor:
-    """Processes of this machine, one thread each: they start anew, since OpenMM and OpenMP do not survive a fork."""
-    return ProcessPoolExecutor(min(workers, jobs), mp_context=get_context("spawn"), initializer=_one_thread)
+@contextmanager
+def _processes(workers: int, jobs: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes of this machine, one thread each: they start anew, since OpenMM and OpenMP do not survive a fork.
+
+    They end with what waits for them: at once where an error or a signal ends the block, or this process is killed.
+    """
+    context = get_context("spawn")
+    theirs, mine = context.Pipe(duplex=False)
+    with theirs, mine, ProcessPoolExecutor(min(workers, jobs), context, _begin_worker, (theirs,)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            mine.close()
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
-def _one_thread() -> None:
+def _begin_worker(run: Connection) -> None:
     for name in ("OMP_NUM_THREADS", "OPENMM_CPU_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    signal(SIGINT, SIG_IGN)  # Ctrl-C comes to all processes of a terminal; the run ends its workers itself
+    Thread(target=_end_with, args=(run,), daemon=True).start()
+
+
+def _end_with(run: Connection) -> None:
+    """End this process as soon as nobody holds the other end of a pipe."""
+    try:
+        run.poll(None)  # nothing is ever sent
+    finally:
+        os._exit(1)

@@ -110,8 +110,7 @@ class OpenMMWindows:
         )
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
-        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
-        return held.found, held.periods
+        return self._rows(openmm.XmlSerializer.deserialize(self._system)).begin()
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         began = time.process_time()

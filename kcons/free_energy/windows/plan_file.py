@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
@@ -123,14 +123,22 @@ class _Cluster(AbstractContextManager["Executor | None"]):
         self._client.close()
 
 
-def read_plan(file: str | PathLike[str]) -> PlanFile:
+def read_plan(file: str | PathLike[str], allow_modules: Collection[str] = ()) -> PlanFile:
     """Read a plan; its paths count from where it lies.
+
+    Nothing of what a plan names is imported or called, but for the calculators of `LISTED`, to look at their settings.
+
+    Parameters
+    ----------
+    file : path
+    allow_modules : collection of str
+        Python modules of which the plan may take a calculator, and run their code.
 
     Raises
     ------
     InputError
         No TOML, unknown or missing keys, files that are not there, coordinates without values, more than 100,000
-        windows.
+        windows; a calculator that is neither in `kcons.ase.named_calculators.LISTED` nor of one of these modules.
     """
     path = as_path(file, "plan")
     try:
@@ -170,7 +178,7 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
         )
     pulls = _pulls(data["pulls"], coordinates, targets) if "pulls" in data else None
     return PlanFile(
-        _sampler(data, path.parent, coordinates),
+        _sampler(data, path.parent, coordinates, allow_modules),
         Settings(**settings),
         targets,
         options,
@@ -297,7 +305,9 @@ def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]
     return np.where([isinstance(item, Distance) for item in coordinates.values()], values, np.radians(values))
 
 
-def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Constraint]) -> Sampler:
+def _sampler(
+    data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Constraint], allow_modules: Collection[str]
+) -> Sampler:
     structure, forces, held = data.get("structure", {}), data.get("forces", {}), data.get("held", {})
     if "file" not in structure:
         raise InputError("the plan has no structure; write [structure] with file = ...", item="structure")
@@ -319,7 +329,7 @@ def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Co
     import ase.io
 
     from kcons.ase import constraints_of
-    from kcons.ase.named_calculators import named_calculator
+    from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
     try:
@@ -334,26 +344,28 @@ def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Co
         rows.append(Distance([counted(pair, first) for pair in held["distances"]]))
     if "constrain" in held:
         rows += constraints_of(atoms, held["constrain"], guess_bonds=True)
+    refuse_unlisted(forces["calculator"], allow_modules)
     make = partial(named_calculator, forces["calculator"], forces.get("settings", {}))
-    make()  # complain before windows are begun
+    if forces["calculator"] in LISTED:
+        make()  # complain of settings
     return AseWindows(atoms, make, coordinates, rows)
 
 
 def _of_openmm(
     structure: Path, system: Path, forces: Mapping[str, Any], coordinates: Mapping[str, Constraint]
 ) -> Sampler:
-    import openmm
     from openmm import app
 
+    from kcons.free_energy.scans.system_calculator import read_system
     from kcons.free_energy.windows.openmm_windows import OpenMMWindows
 
-    if not system.is_file():
-        raise InputError(f"there is no file {system}", item="system")
+    made = read_system(system, "system")
     try:
         pdb = app.PDBxFile(str(structure)) if structure.suffix == ".cif" else app.PDBFile(str(structure))
-        made = openmm.XmlSerializer.deserialize(system.read_text(encoding="utf-8"))
     except Exception as error:
-        raise InputError(f"OpenMM cannot read {structure} or {system}: {error}", item="system") from error
+        raise InputError(
+            f"OpenMM cannot read {structure}: {type(error).__name__}: {error}", item="structure"
+        ) from error
     return OpenMMWindows(
         pdb.topology,
         made,

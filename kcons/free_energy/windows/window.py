@@ -18,6 +18,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
+from kcons.free_energy.rigid_turns import warn_of_gaps
 from kcons.motion.motion import Motion
 
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
@@ -216,6 +217,11 @@ class Held:
         held = HeldCoordinates(everything, self.coordinates, self.positions)
         self.found = everything.measure(self.positions)[held.rows]
         self.periods = held.periods
+
+    def begin(self) -> tuple[FloatArray, FloatArray]:
+        """The coordinates where windows start from, and their periods; warns of torsions over what is not bonded."""
+        warn_of_gaps(self.coordinates, np.asarray(self.bonds(), dtype=np.int64).reshape(-1, 2))
+        return self.found, self.periods
 
     def _set(self, rows: list[Constraint]) -> ConstraintSet:
         return ConstraintSet(rows, self.positions, self.masses, cell=self.cell, pbc=self.pbc)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.free_energy.profiles.profile import Profile
 from kcons.free_energy.profiles.pulls import Pulled
 from kcons.free_energy.windows.window_results import UNLIKELY, FreeEnergy, WindowResult
 from kcons.steppers.files import in_one_piece, text
@@ -18,8 +20,6 @@ from kcons.thermostats.correlated_series import FEW_INDEPENDENT
 if TYPE_CHECKING:
     from rich.table import Table
 
-#: Least windows that a profile is drawn through.
-FEWEST = 4
 #: Of angles, of lengths, and of formulas and functions: as places are shown, and what mean forces are by.
 _SHOWN = {True: "degrees", False: "angstrom", None: "own unit"}
 _PER = {**_SHOWN, True: "radian"}
@@ -75,8 +75,10 @@ def summary(found: FreeEnergy) -> str:
             f"fewer than {FEW_INDEPENDENT} independent samples in window {', '.join(map(str, poor))}: errors there are "
             "not to be relied on; sample longer"
         )
-    if len(found.names) == 1 and len(found.windows) >= FEWEST:
-        profile = found.profile
+    profile, why = _profile(found)
+    if why:
+        lines.append(why)
+    if profile is not None:
         low, high = int(np.argmin(profile.F)), int(np.argmax(profile.F))
         gap = profile.difference(float(profile.x[low]), float(profile.x[high]))
         lines.append(f"from the lowest to the highest point {gap.value:.2f} ± {gap.error:.2f} kJ/mol")
@@ -89,15 +91,26 @@ def write(found: FreeEnergy, folder: Path, degrees: Sequence[bool | None]) -> li
     written = [folder / "free_energy.json"]
     with in_one_piece(written[0]) as opened:
         opened.write(text(found.numbers()).encode())
-    if len(found.names) == 1 and len(found.windows) >= FEWEST:
-        profile = found.profile
+    profile, _ = _profile(found)
+    if profile is not None:
         written.append(folder / "profile.csv")
         with in_one_piece(written[-1]) as opened:
             opened.write(f"{found.names[0]} ({_PER[degrees[0]]}),F (kJ/mol),error (kJ/mol)\n".encode())
             np.savetxt(opened, np.column_stack([profile.x, profile.F, profile.error]), fmt="%.8g", delimiter=",")
         written.append(folder / "profile.png")
-        _draw(found, written[-1], degrees[0])
+        with in_one_piece(written[-1]) as opened:
+            _draw(profile, found.names[0], opened, degrees[0])
     return written
+
+
+def _profile(found: FreeEnergy) -> tuple[Profile | None, str]:
+    """The profile of windows along one coordinate; otherwise None, and where there could be one, why there is none."""
+    if len(found.names) != 1:
+        return None, ""
+    try:
+        return found.profile, ""
+    except InputError as error:
+        return None, f"no profile: {error}"
 
 
 def of_pulls(found: FreeEnergy, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
@@ -110,7 +123,7 @@ def of_pulls(found: FreeEnergy, pulled: Pulled, start: FloatArray, end: FloatArr
             numbers[key] = [each.value, each.error]
     numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
     said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol are lost)"
-    if len(found.names) == 1 and len(found.windows) >= FEWEST:
+    if _profile(found)[0] is not None:
         windows = found.between(float(start[0]), float(end[0]))
         if windows is None:
             return numbers, f"{said}; the windows do not reach both ends"
@@ -120,14 +133,14 @@ def of_pulls(found: FreeEnergy, pulled: Pulled, start: FloatArray, end: FloatArr
     return numbers, said
 
 
-def _draw(found: FreeEnergy, file: Path, degrees: bool | None) -> None:
+def _draw(profile: Profile, name: str, file: BinaryIO, degrees: bool | None) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     above, below = figure.subplots(2, 1, sharex=True)
-    profile, turn = found.profile, 180 / np.pi if degrees else 1.0
+    turn = 180 / np.pi if degrees else 1.0
     above.plot(turn * profile.x, profile.F, color="tab:blue")
     above.fill_between(
         turn * profile.x, profile.F - 2 * profile.error, profile.F + 2 * profile.error, color="tab:blue", alpha=0.25
@@ -137,5 +150,5 @@ def _draw(found: FreeEnergy, file: Path, degrees: bool | None) -> None:
     below.errorbar(*windows, fmt="o", ms=4, capsize=2)
     below.axhline(0, color="0.6", lw=0.8)
     below.set_ylabel(f"dF/dq (kJ/mol by {_PER[degrees]})")
-    below.set_xlabel(f"{found.names[0]} ({_SHOWN[degrees]})")
-    figure.savefig(file, dpi=150)
+    below.set_xlabel(f"{name} ({_SHOWN[degrees]})")
+    figure.savefig(file, dpi=150, format="png")

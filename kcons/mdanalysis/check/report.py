@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,8 +12,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from kcons.errors import OccupiedError
-from kcons.steppers.files import in_one_piece
+from kcons.steppers.files import ResultFolder, in_one_piece
 from kcons.steppers.files import text as as_json
 
 if TYPE_CHECKING:
@@ -171,66 +169,27 @@ def write_failure(trajectory: str | Path, reason: str, folder: Path) -> list[Pat
     return _put(folder, trajectory, {"trajectory": str(trajectory), "status": "incomplete", "verdict": reason})
 
 
-def refuse_others(folder: Path, trajectory: str | Path) -> None:
-    """Refuse a folder that holds anything but a check of this trajectory under the names that `write` uses.
-
-    Raises
-    ------
-    OccupiedError
-    """
-    remedy = "give another folder (--out)"
-    if folder.exists() and not folder.is_dir():
-        raise OccupiedError(f"{folder} is no folder; {remedy}", item="out")
-    paths = [folder / name for name in FILES]
-    for path in paths:
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise OccupiedError(f"{path} is a link, or no file; {remedy}", item="out")
-    if not any(path.exists() for path in paths):
-        return
-    try:
-        data = json.loads(paths[0].read_text(encoding="utf-8"))
-        owner = Path(data.get("file") or data["trajectory"]).resolve()
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        raise OccupiedError(f"{folder} has other files called {', '.join(FILES)}; {remedy}", item="out") from None
-    if owner != Path(trajectory).resolve():
-        raise OccupiedError(f"{folder} holds the check of {owner}; {remedy}", item="out")
+def results(folder: Path, trajectory: str | Path) -> ResultFolder:
+    """The folder of the check of a trajectory."""
+    return ResultFolder(folder, FILES[0], {"file": str(Path(trajectory).resolve())}, FILES, "a check")
 
 
 def _put(
     folder: Path, trajectory: str | Path, data: dict[str, Any], picture: bytes = b"", text: str = ""
 ) -> list[Path]:
     """Write what there is, and take away what an earlier check of the same trajectory left."""
-    refuse_others(folder, trajectory)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / name for name in FILES]
-    whole = as_json({"file": str(Path(trajectory).resolve()), **data})
+    place = results(folder, trajectory)
+    whole = as_json({**place.owner, **data})
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
     page = f"{text}\n".encode(errors="replace") if text else b""
     contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, page]
-    if not paths[0].exists():
-        _claim(paths[0], contents[0])
     written = []
-    for path, content in zip(paths, contents, strict=True):
-        if not content:
-            path.unlink(missing_ok=True)
-            continue
-        with in_one_piece(path) as file:
-            file.write(content)
-        written.append(path)
+    with place.taken():
+        for path, content in zip([folder / name for name in FILES], contents, strict=True):
+            if not content:
+                path.unlink(missing_ok=True)
+                continue
+            with in_one_piece(path) as file:
+                file.write(content)
+            written.append(path)
     return written
-
-
-def _claim(path: Path, content: bytes) -> None:
-    """Write a file that must not be there yet, by which a folder belongs to a check; nothing is left of a failure."""
-    try:
-        file = path.open("xb")
-    except FileExistsError:
-        raise OccupiedError(
-            f"another check writes into {path.parent}; give another folder (--out)", item="out"
-        ) from None
-    try:
-        with file:
-            file.write(content)
-    except BaseException:
-        path.unlink()
-        raise

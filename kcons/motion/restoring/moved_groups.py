@@ -157,7 +157,10 @@ def eased(geometry: Geometry) -> FloatArray | None:
             if not (np.isfinite(off).all() and np.isfinite(table.data).all()):
                 return None
             normal = sp.csc_array(table.T @ table + least * sp.eye_array(len(columns)))
-            step = -_solve(normal, table.T @ off)
+            try:
+                step = -_solve(normal, table.T @ off)
+            except RuntimeError:  # exactly singular: sizes that differ by more than double precision
+                return None
             longest = float(np.abs(step).max())
             x.reshape(-1)[columns] += step * min(1.0, reach / longest) if longest > 0 else 0.0
             if not longest > 1e-9 * reach:

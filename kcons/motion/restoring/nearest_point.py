@@ -30,6 +30,10 @@ NEAREST_ROUNDS = 200
 MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
 #: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
 _STILL, _ROUNDING = 1e-12, 16 * float(np.finfo(float).eps)
+#: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
+SLOW, MIXED = 3, 5
+#: Part of the way to the nearest point that may be left along the constraints without a word.
+LEFT_OVER = 1e-6
 #: Rounds towards the constraints that must gain a tenth, or damping does better.
 STALLED = 10
 #: Halvings of one step of it.
@@ -174,17 +178,30 @@ class FarStart:
         self._solve(x, reference, time, time, None, 0.0, None)
         self._work.iterations += FAILED - self._iterations()
 
-    def restore(self, x: FloatArray, time: float) -> None:
-        """Bring `x` onto the constraints in place, or raise `InfeasibleError`."""
+    def restore(self, x: FloatArray, time: float) -> float:
+        """Bring `x` onto the constraints in place, or raise `InfeasibleError`.
+
+        Returns
+        -------
+        float
+            The part of the way that leads along the constraints: 0 where the search has found the nearest point.
+        """
         start = x.copy()
         here = x.copy()
         try:
             self._positions(here, start, time)
         except ConvergenceError:
             self._reach(here, time)
-        if not self._settle(start, here, time):
-            self._descend(start, here, time)
+        found = self._settle(start, here, time) or self._descend(start, here, time)
+        found = found or self._settle(start, here, time, slow=SLOW)
         np.copyto(x, here)
+        if found:
+            return 0.0
+        along = start - x
+        along[self._atom_labels() < 0] = 0.0
+        size = float(np.max(np.abs(along), initial=0.0))
+        self._tangents(x, along, None, time, None, "position")
+        return float(np.max(np.abs(along), initial=0.0)) / size if size > 0.0 else 0.0
 
     def _reach(self, x: FloatArray, time: float) -> None:
         """Some point on the constraints, for starts too far off for one projection, in place."""
@@ -200,41 +217,50 @@ class FarStart:
             if not outcome.converged:
                 raise failures.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
 
-    def _settle(self, start: FloatArray, x: FloatArray, time: float) -> bool:
+    def _settle(self, start: FloatArray, x: FloatArray, time: float, slow: int = 0) -> bool:
         """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
 
         Its fixed point is the foot of the mass-weighted perpendicular from the start. False where the iteration
-        does not settle, and `x` as it was, or as near as the work came that was left.
+        does not settle, and `x` as it was, or as near as the work came that was left. `slow` rounds count as slow.
         """
-        here, last = x, np.inf
+        here = reached = x
+        mixed: _Mixed | None = None
+        last = np.inf
         still = max(_STILL * extent(start), _ROUNDING * float(np.abs(start).max(initial=0.0)))
         first = np.inf
         for _ in range(NEAREST_ROUNDS):
             if self._work.iterations <= 0:
-                if last < first:  # on its way to the foot, and nearer than where it began
-                    np.copyto(x, here)
-                return False
+                break
             ahead = start.copy()
             try:
                 self._positions(ahead, here, time)
             except ConvergenceError:
                 return False
             move = float(np.max(np.abs(ahead - here), initial=0.0))
-            here = ahead
             if move == 0.0 or (move > 0.5 * last and move < still):
-                break
+                np.copyto(x, ahead)
+                return True
             if move > 2 * last:
                 return False
             if last == np.inf:
                 first = move
-            last = move
-        np.copyto(x, here)
-        return True
+            slow += move > 0.5 * last
+            if slow >= SLOW:
+                mixed = mixed or _Mixed(self._atom_labels())
+                # Gradients are taken there, which need not be on the constraints.
+                here = mixed.after(here, ahead)
+            else:
+                here = ahead
+            reached, last = ahead, move
+        if last < first:  # on its way to the foot, and nearer than where it began
+            np.copyto(x, reached)
+        return False
 
-    def _descend(self, start: FloatArray, x: FloatArray, time: float) -> None:
+    def _descend(self, start: FloatArray, x: FloatArray, time: float) -> bool:
         """Walk along the constraints towards the start in place, as long as every cluster comes nearer to it.
 
-        Steps are the tangential part of start - x; its end is the foot of a perpendicular from the start.
+        Steps are the tangential part of start - x; its end is the foot of a perpendicular from the start. Whether it
+        was reached.
         """
         plan = self._plan
         atom_label = self._atom_labels()
@@ -256,15 +282,15 @@ class FarStart:
             slope = float(np.max(np.abs(step), initial=0.0))
             near = slope < 1e-6 * size  # where rounding hides which of two points is nearer
             if slope <= 1e-13 * size:
-                return
+                return True
             if near and slope > 0.9 * last:  # swings about the foot
                 factor *= 0.5
                 if factor.max() < 0.05:
-                    return
+                    return False
             last = slope
             for _ in range(MAX_HALVINGS):
                 if self._work.iterations <= 0:
-                    return
+                    return False
                 ahead = x + np.where(inside, factor[atom_label], 0.0)[:, None] * step
                 try:
                     self._positions(ahead, x, time)
@@ -277,11 +303,12 @@ class FarStart:
                     break
                 factor[worse] *= 0.5
             else:
-                return
+                return False
             np.copyto(x, ahead)
             away = now
             if not near:
                 factor = np.minimum(1.0, 1.5 * factor)
+        return False
 
     def _atom_labels(self) -> IntArray:
         """Cluster of each local atom, -1 for atoms that belong to none."""
@@ -333,3 +360,45 @@ class FarStart:
                 np.copyto(x, trial)
                 sigma, error = trial_sigma, trial_error
         return False
+
+
+class _Mixed:
+    """Anderson's mixing of the last rounds of a fixed-point iteration, cluster by cluster.
+
+    The next point is that combination of the last ones whose changes cancel best. D. G. Anderson, J. ACM 12, 547
+    (1965).
+
+    Parameters
+    ----------
+    label : ndarray of int, shape (n_atoms,)
+        Cluster of each atom, -1 for atoms that belong to none.
+    """
+
+    def __init__(self, label: IntArray) -> None:
+        self._inside = np.flatnonzero(label >= 0)
+        self._label = label[self._inside]
+        self._points: list[FloatArray] = []
+        self._changes: list[FloatArray] = []
+
+    def after(self, here: FloatArray, ahead: FloatArray) -> FloatArray:
+        """Where to go on after `here` led to `ahead`."""
+        inside = self._inside
+        self._points = [*self._points[-MIXED:], ahead[inside]]
+        self._changes = [*self._changes[-MIXED:], (ahead - here)[inside]]
+        change, changes = self._changes[-1], np.diff(self._changes, axis=0)
+        if not len(changes):
+            return ahead
+        products = np.array([[self._sums(a, b) for b in changes] for a in changes])
+        with np.errstate(divide="ignore"):
+            size = 1.0 / np.sqrt(np.einsum("aac->ac", products))
+        size[~np.isfinite(size)] = 0.0
+        inverse = np.linalg.pinv(np.einsum("ac,abc,bc->cab", size, products, size), rcond=1e-12, hermitian=True)
+        right = size * np.array([self._sums(a, change) for a in changes])
+        weights = size * np.einsum("cab,bc->ac", inverse, right)
+        found = ahead.copy()
+        found[inside] -= np.einsum("an,ani->ni", weights[:, self._label], np.diff(self._points, axis=0))
+        return found
+
+    def _sums(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Products of two sets of vectors by cluster."""
+        return np.bincount(self._label, weights=np.einsum("ni,ni->n", a, b)).astype(np.float64)

@@ -107,7 +107,7 @@ class SparseDistances(DistanceClusters):
     def _project(
         self, request: Request, given: FloatArray, tangent: Literal[True] | None, multipliers: FloatArray | None
     ) -> Outcome:
-        x, reference, _, lattice, _, _, velocities, inv_dt, _ = request
+        x, reference, _, lattice, _, _, velocities, inv_dt, _, _ = request
         cell, periodic = NO_LATTICE if lattice is None else lattice, lattice is not None
         rooms = (
             self._state, self._entries, self._pivots, self._starts, self._places, self._moves, self._solution,

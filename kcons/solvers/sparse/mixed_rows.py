@@ -55,7 +55,7 @@ SPEED_TOLERANCE = 1e-15
 CLOSER = 16.0
 _EPS = float(np.finfo(float).eps)
 #: Of the pieces of `SparseRows.tables`, those that are named.
-_PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS = 16, 20, 21, 26
+_PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS, _MOVED = 16, 20, 21, 26, 27
 #: Signatures of what `_positions` and `_tangents` call by address, so that it is compiled once and not into both.
 _RANGE = types.int64, types.int64
 _FACTOR = types.none(*_RANGE, *(5 * (INDICES,)), *(5 * (NUMBERS,)))
@@ -124,9 +124,13 @@ class SparseRows(CalledSolver):
                 *(room(n), room(n), room(n), room(numbers), room(numbers), room(n)),
                 *(room(numbers), room(n), room(numbers), room(numbers)),
                 _addresses(self._given.kinds),
+                room(4 * int(slots[-1])),  # by slot, as quads: what `_take_off` says
             )
         )
         self._pivots, self._solution = part_of(self.tables, _PIVOTS), part_of(self.tables, _SOLUTION)
+        placed = [np.full(c.n_rows, not c.relative) for c in constraint_set.constraints] or [np.zeros(0, np.bool_)]
+        self._placed = np.flatnonzero(np.repeat(np.concatenate(placed)[self.rows], widths))
+        self._placed_atoms = flat[self._placed]
 
     def __reduce__(self) -> tuple[type[SparseRows], tuple[object, ...]]:
         return SparseRows, self._made_of  # addresses are of no use elsewhere
@@ -135,9 +139,16 @@ class SparseRows(CalledSolver):
     def kernels(self) -> tuple[Any, Any, Any]:
         return _positions, _tangents, _apply
 
-    def rank(self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0) -> int:
-        """Independent rows at `x`: those whose pivot does not vanish."""
-        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice, time=time))
+    def _take_off(self, moved: FloatArray | None) -> None:
+        cells = part_of(self.tables, _MOVED).reshape(-1, 4)
+        cells[self._placed, :3] = 0.0 if moved is None else moved[self._placed_atoms]
+        self._moved = moved is not None
+
+    def rank(
+        self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0, moved: FloatArray | None = None
+    ) -> int:
+        """Independent rows at `x`: those whose pivot does not vanish; `moved` as in `Request`."""
+        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice, time=time, moved=moved))
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))
@@ -259,7 +270,7 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _begin(  # type: ignore[no-untyped-def]
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
-    scale, lines, values, inverse_rounding, base, moves, origin, solution, functions,
+    scale, lines, values, inverse_rounding, base, moves, origin, moved, solution, functions,
 ):  # fmt: skip
     """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
     zero = quad(0.0, 0.0, 0.0, 0.0)
@@ -267,8 +278,8 @@ def _begin(  # type: ignore[no-untyped-def]
         store_quad(origin, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
         store_quad(moves, 4 * a, zero)
     call_evaluate(functions[0], (
-        functions[1], first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, lattice, periodic,
-        values, lines, REFERENCE,
+        functions[1], first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, moved, lattice,
+        periodic, values, lines, REFERENCE,
     ))  # fmt: skip
     for a in range(first_atom, last_atom):
         point = load_point(x_new, 3 * entry(atoms, a))
@@ -340,13 +351,14 @@ def _positions(  # type: ignore[no-untyped-def]
     values, inverse_rounding, base = at_piece(t, h, 17), at_piece(t, h, 18), at_piece(t, h, 19)
     moves, solution, kept_moves = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION), at_piece(t, h, 22)
     kept_solution, origin, functions = at_piece(t, h, 23), at_piece(t, h, 25), at_piece(h, h, _FUNCTIONS)
+    moved = at_piece(t, h, _MOVED)
     goals, parameters = at_first(wanted) if wanted.size else at_piece(t, h, 12), at_first(numbers)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         _begin(
             first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
-            parameters, links, scale, lines, values, inverse_rounding, base, moves, origin, solution, functions,
+            parameters, links, scale, lines, values, inverse_rounding, base, moves, origin, moved, solution, functions,
         )  # fmt: skip
         matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
         error = np.inf
@@ -357,8 +369,8 @@ def _positions(  # type: ignore[no-untyped-def]
         while True:
             previous = error
             call_evaluate(functions[0], (
-                functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic,
-                values, lines, NOW,
+                functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, origin, moved,
+                lattice, periodic, values, lines, NOW,
             ))  # fmt: skip
             error, total, excess, bad = _measure(
                 first, last, kinds, parameters, links, goals, scale, inverse_rounding, values, state
@@ -425,7 +437,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type:
     triple, sides, masses, lines = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 13)
     state, entries, pivots, values = at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS), at_piece(t, h, 17)
     base, moves, solution = at_piece(t, h, 19), at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
-    speeds, functions = at_piece(t, h, 24), at_piece(h, h, _FUNCTIONS)
+    speeds, functions, moved = at_piece(t, h, 24), at_piece(h, h, _FUNCTIONS), at_piece(t, h, _MOVED)
     driven, goals, parameters = wanted.size > 0, at_first(wanted), at_first(numbers)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
@@ -436,8 +448,8 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type:
             store_quad(speeds, 4 * a, load_point(y, g))
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
         call_evaluate(functions[0], (
-            functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, base, lattice, periodic,
-            values, lines, REFERENCE,
+            functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, base, moved, lattice,
+            periodic, values, lines, REFERENCE,
         ))  # fmt: skip
         largest, total = 0.0, 0.0
         for k in range(first, last):

@@ -42,8 +42,8 @@ LINEAR = int(RowKind.LINEAR)
 _PLACE, _CELL = types.int64, (types.float64[:, :, ::1], types.boolean)
 # `evaluate` is called by address: it is compiled once, and not into each of its callers. So are functions: where there
 # are none, nothing is compiled for them.
-_EVALUATE = types.none(*(3 * (_PLACE,)), *(3 * (INDICES,)), *(4 * (NUMBERS,)), *_CELL, NUMBERS, NUMBERS, _PLACE)
-_FUNCTION = types.float64(*(3 * (_PLACE,)), INDICES, NUMBERS, _PLACE, *(3 * (NUMBERS,)), *_CELL, NUMBERS, _PLACE)
+_EVALUATE = types.none(*(3 * (_PLACE,)), *(3 * (INDICES,)), *(5 * (NUMBERS,)), *_CELL, NUMBERS, NUMBERS, _PLACE)
+_FUNCTION = types.float64(*(3 * (_PLACE,)), INDICES, NUMBERS, _PLACE, *(4 * (NUMBERS,)), *_CELL, NUMBERS, _PLACE)
 call_evaluate, _call_function = caller_of(_EVALUATE), caller_of(_FUNCTION)
 
 #: Which of the two gradients in a slot's line: as numbers of NumPy, for which `evaluate` is compiled once.
@@ -119,7 +119,7 @@ def angle(u, w):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _function(  # type: ignore[no-untyped-def]
-    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, lattice, periodic, lines, which
+    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, moved, lattice, periodic, lines, which
 ):
     """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots.
 
@@ -148,7 +148,7 @@ def _function(  # type: ignore[no-untyped-def]
                 put(parameters, at + size + 1, lane(way, 1))
                 put(parameters, at + size + 2, lane(way, 2))
             if kind in (FUNCTION, VELOCITY):
-                r = here + change
+                r = (here - load_quad(moved, 4 * p)) + change
                 x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
             elif p > slot:
                 dx, dy, dz = near(here - before, change - change_before, cell, inverse, periodic)
@@ -172,13 +172,13 @@ def _function(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
-    function, first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values, lines,
-    which,
+    function, first, last, kinds, links, slot_atoms, parameters, base, moves, origin, moved, lattice, periodic, values,
+    lines, which,
 ):  # fmt: skip
     """Values and gradients of rows first to last; those of velocities for the way from `origin`.
 
     `function` is from `addresses_for`. ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its
-    first parameter.
+    first parameter. `moved` has, as quads by slot, what rows with a place in space take off positions.
     """
     cell, inverse = cell_of(lattice)
     for k in range(first, last):
@@ -209,14 +209,14 @@ def evaluate(  # type: ignore[no-untyped-def]
                     number(parameters, offset), number(parameters, offset + 1), number(parameters, offset + 2), 0.0
                 )
                 _put(lines, 8 * p + which, lane(c, 0), lane(c, 1), lane(c, 2))
-                whole += dot(c, load_quad(base, i))
+                whole += dot(c, load_quad(base, i) - load_quad(moved, 4 * p))
                 change += dot(c, load_quad(moves, i))
                 offset += 3
             value = whole + change
         else:
             value = _call_function(function, (
-                kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, lattice,
-                periodic, lines, which,
+                kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, moved,
+                lattice, periodic, lines, which,
             ))  # fmt: skip
         put(values, k, value)
 

@@ -95,7 +95,7 @@ def test_files_keep_formulas():
         (lambda: Formula("x1 - y1", [[0, 1]]), "atoms", "names 1 atoms a row, and atoms has 2"),
         (lambda: Formula("a*x1", [0, 1], 2.0), "parameters", "parameters is 2.0; give numbers by name"),
         (lambda: Formula("a*x1", [0, 1], {"a": [1.0, 2.0, 3.0]}), "a", r"'a' has shape \(3,\).* 2 rows"),
-        (lambda: Formula("a*x1", [0, 1], {"a": np.nan}), "a", "one finite number"),
+        (lambda: Formula("a*x1", [0, 1], {"a": np.nan}), "a", "parameter .a. is not finite"),
         (lambda: Formula("x1", 0, {"x7": 1.0}), "x7", "cannot be the name"),
         (lambda: Formula("x1", 0, {"sin": 1.0}), "sin", "cannot be the name"),
         (lambda: Formula("x1", 0, {"lambda": 1.0}), "lambda", "cannot be the name"),

@@ -21,6 +21,54 @@ MUTANTS = [
     ),
     # -- ASE: what changes between steps --
     (
+        "ase/binding.py",
+        "if now is not held and not alike(now, held):",
+        "if False:",
+        "tests/ase/test_dynamics.py::test_what_constraints_hold_changed_between_steps_is_taken",
+    ),
+    (
+        "ase/binding.py",
+        "if how == degenerate and same_cell and bound.fits(atoms) and alike(rows, given):",
+        "if how == degenerate and bound.fits(atoms) and alike(rows, given):",
+        "tests/ase/test_binding.py::test_frames_that_differ_have_engines_of_their_own",
+    ),
+    (
+        "ase/dynamics.py",
+        "replace(state.copied(), forces=None, origin=None)",
+        "state.copied()",
+        "tests/ase/test_thermostat_dynamics.py::test_a_restart_asks_the_calculator_for_forces",
+    ),
+    (
+        "constraints/arguments.py",
+        "array.setflags(write=False)",
+        "pass",
+        "tests/constraints/test_constraint.py::test_arrays_cannot_be_changed",
+    ),
+    (
+        "ase/respect.py",
+        "elif not self._scaled(x, cell):",
+        "elif False:",
+        "tests/ase/test_edits.py::test_an_edit_between_runs_is_refused",
+    ),
+    (
+        "ase/respect.py",
+        "return known is not None and _same(known, x) and cell.tobytes() == self._cell",
+        "return known is not None",
+        "tests/ase/test_edits.py::test_an_edit_between_runs_is_refused",
+    ),
+    (
+        "ase/constraints_object.py",
+        "        self._watch.between_steps = True\n\n    def _project_covector",
+        "\n    def _project_covector",
+        "tests/ase/test_edits.py::test_an_edit_is_named_before_a_class",
+    ),
+    (
+        "ase/constraints_object.py",
+        "frame = moves_far(old, new) and fulfilled(held, new, bound.touched)",
+        "frame = False",
+        "tests/ase/test_edits.py::test_frames_on_the_constraints_are_taken",
+    ),
+    (
         "ase/dynamics.py",
         "self.time, all_masses=True)",
         "self.time)",

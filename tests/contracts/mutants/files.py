@@ -148,6 +148,30 @@ MUTANTS = [
         "tests/motion/test_failures.py::test_a_dihedral_that_is_passed_in_small_parts_is_not_named",
     ),
     (
+        "constraints/periodic/in_cell.py",
+        "return x[item.atoms] if self.moved is None",
+        "return whole[item.atoms] if self.moved is None",
+        "tests/constraints/periodic/test_places.py::test_a_place_of_several_atoms_does_not_hang_on_what_ties_them",
+    ),
+    (
+        "plan/clusters.py",
+        "single &= ~anchored",
+        "single &= anchored >= 0",
+        "tests/constraints/periodic/test_places.py::test_a_molecule_is_the_same_in_the_cell_as_in_open_space",
+    ),
+    (
+        "motion/local_projections.py",
+        "                moved = None if places is None else rows.moved_places(places, x)",
+        "                moved = None",
+        "tests/constraints/periodic/test_places.py::test_a_molecule_is_the_same_in_the_cell_as_in_open_space",
+    ),
+    (
+        "constraints/arguments.py",
+        "good = np.abs(values) <= LARGEST",
+        "good = np.isfinite(values)",
+        "tests/constraints/test_target.py::test_numbers_whose_squares_overflow_are_refused",
+    ),
+    (
         "constraints/periodic/images.py",
         "| (not self._in_line)",
         "",

@@ -40,6 +40,24 @@ MUTANTS = [
         "tests/free_energy/windows/test_driver.py::test_windows_that_failed_before_others_are_added_are_still_told_of",
     ),
     (
+        "free_energy/windows/driver.py",
+        "    finally:\n        os._exit(1)",
+        "    finally:\n        pass",
+        "tests/free_energy/windows/test_driver.py::test_workers_end_with_what_waits_for_them",
+    ),
+    (
+        "ase/named_calculators.py",
+        "if module not in modules:",
+        "if False:",
+        "tests/ase/test_named_calculators.py::test_files_name_calculators_of_a_list_or_of_modules_that_their_reader_names",
+    ),
+    (
+        "free_energy/rigid_turns.py",
+        "{*pair} not in joined and bonded.issuperset(pair)",
+        "{*pair} not in joined",
+        "tests/free_energy/windows/test_ase_windows.py::test_torsions_over_atoms_that_form_no_bonds",
+    ),
+    (
         "constraints/target.py",
         "    return difference - period * np.round(difference / whole)",
         "    return difference",

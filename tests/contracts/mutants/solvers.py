@@ -136,6 +136,18 @@ MUTANTS = [
     ),
     (
         "solvers/sparse/row_values.py",
+        "r = (here - load_quad(moved, 4 * p)) + change",
+        "r = here + change",
+        "tests/solvers/sparse/test_row_values.py::test_rows_with_a_place_take_off_what_positions_were_moved_by",
+    ),
+    (
+        "motion/restoring/nearest_point.py",
+        "here = mixed.after(here, ahead)",
+        "here = ahead",
+        "tests/motion/restoring/test_nearest_point.py::test_the_nearest_point_is_found_where_the_surface_is_much_bent",
+    ),
+    (
+        "solvers/sparse/row_values.py",
         "difference -= period * np.rint(difference / period)",
         "difference -= 0.5 * period * np.rint(2 * difference / period)",
         "tests/solvers/sparse/test_row_values.py::test_rows_with_a_period_miss_by_the_shorter_way",

@@ -153,6 +153,36 @@ MUTANTS = [
         "tests/steppers/test_state.py::test_a_full_disk_leaves_nothing_behind",
     ),
     (
+        "steppers/files.py",
+        '{target.name}.{token_hex(8)}{UNFINISHED}"',
+        '{target.name}{UNFINISHED}"',
+        "tests/steppers/test_files.py::test_writers_of_one_path_do_not_meet",
+    ),
+    (
+        "steppers/files.py",
+        "fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)",
+        "pass",
+        "tests/steppers/test_files.py::test_a_folder_is_of_one_run_at_a_time",
+    ),
+    (
+        "steppers/files.py",
+        "        if wrong:\n            said",
+        "        if False:\n            said",
+        "tests/steppers/test_files.py::test_a_folder_of_something_else_is_refused",
+    ),
+    (
+        "steppers/files.py",
+        "if unpacked > length:",
+        "if False:",
+        "tests/steppers/test_files.py::test_an_archive_that_would_unpack_to_more_is_refused",
+    ),
+    (
+        "steppers/running.py",
+        "    refuse_clock(state.time, state.step, state.time_remainder)\n    if stepper",
+        "    if stepper",
+        "tests/steppers/test_running.py::test_states_made_by_hand_with_impossible_numbers",
+    ),
+    (
         "steppers/state.py",
         "return self.is_of(system) and (",
         "return (",

@@ -17,7 +17,14 @@ from kcons.free_energy.scans.grid import Grid
 
 def made(folder, settings=None):
     atoms = chain(4, threefold)
-    return Attempts(folder, atoms, Grid([Dihedral([[0, 1, 2, 3]])], [[0.1, 0.2]]), [], settings or {"fmax": 0.01})
+    return begun(folder, atoms, Grid([Dihedral([[0, 1, 2, 3]])], [[0.1, 0.2]]), [], settings or {"fmax": 0.01})
+
+
+def begun(*arguments):
+    """Attempts whose folder is there."""
+    attempts = Attempts(*arguments)
+    with attempts.taken():
+        return attempts
 
 
 def test_an_attempt_comes_back(tmp_path):
@@ -52,15 +59,15 @@ def test_an_attempt_of_another_scan_is_refused(tmp_path):
 
 def test_the_plan_has_to_be_the_same(tmp_path):
     made(tmp_path)
-    with pytest.raises(OccupiedError, match=r"another scan in it \(of other settings\); take another folder \(--out"):
+    with pytest.raises(OccupiedError, match=r"has a scan of other settings; give another folder \(--out\)"):
         made(tmp_path, {"fmax": 0.02})
     plan = json.loads((tmp_path / PLAN).read_text())
     (tmp_path / PLAN).write_text(json.dumps({**plan, "colour": 1}))
-    with pytest.raises(InputError, match="unknown or missing entries: colour"):
+    with pytest.raises(OccupiedError, match="a scan of other colour"):
         made(tmp_path)
     for content in ("{", "[]"):
         (tmp_path / PLAN).write_text(content)
-        with pytest.raises(UnreadableError, match=r"plan\.json"):
+        with pytest.raises(OccupiedError, match=r"other files called plan\.json"):
             made(tmp_path)
 
 
@@ -86,7 +93,7 @@ def test_the_calculator_has_to_be_the_same(tmp_path):
     for epsilon in (0.1, 0.1, 0.2):
         atoms.calc = LennardJones(epsilon=epsilon)
         if epsilon == 0.2:
-            with pytest.raises(OccupiedError, match=r"\(of other calculator\)"):
-                Attempts(tmp_path, atoms, grid, [], {})
+            with pytest.raises(OccupiedError, match=r"of other calculator;"):
+                begun(tmp_path, atoms, grid, [], {})
         else:
-            Attempts(tmp_path, atoms, grid, [], {})
+            begun(tmp_path, atoms, grid, [], {})

@@ -296,3 +296,25 @@ def test_ethane_by_gfn2():
     assert barrier.max() * 96.485 == pytest.approx(10.85, abs=0.05)
     np.testing.assert_allclose(barrier, np.roll(barrier, 4), atol=1e-4)
     assert found.evaluations <= 100 and len(found.attempts) >= 24
+
+
+def test_a_second_scan_into_the_same_folder_is_told(tmp_path):
+    refused = []
+
+    def meanwhile(done, points, line):
+        if not refused:
+            with pytest.raises(OccupiedError, match="another run writes into"):
+                scan(chain(4, threefold), TURN, RING, folder=tmp_path)
+            refused.append(line)
+
+    found = scan(chain(4, threefold), TURN, RING, folder=tmp_path, progress=meanwhile)
+    again = scan(chain(4, threefold), TURN, RING, folder=tmp_path)
+    assert refused and np.array_equal(found.energies, again.energies)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plan.json", "relaxations"]
+
+
+def test_a_torsion_over_atoms_that_are_not_bonded():
+    atoms = molecule("trans-butane")
+    atoms.calc = EMT()
+    with pytest.warns(UserWarning, match=r"the atoms 2, 0, 1, 3, counted from 0, and 2-0, 1-3 are no bonds; give"):
+        scan(atoms, Dihedral([[2, 0, 1, 3]]), [1.0], evaluations=1, fmax=100.0)

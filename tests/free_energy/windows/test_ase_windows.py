@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from ase import Atoms
 from ase.build import molecule
 from ase.calculators.calculator import Calculator
 from ase.calculators.lj import LennardJones
@@ -67,6 +68,35 @@ class Broken(Calculator):
 
     def calculate(self, *_):
         raise RuntimeError("no convergence")
+
+
+@pytest.mark.parametrize(
+    ("four", "said"),
+    [
+        ([0, 1, 2, 3], None),
+        ([4, 0, 1, 2], None),
+        ([2, 0, 1, 3], "2-0, 1-3 are no bonds"),
+        ([0, 1, 2, 13], None),
+        ([0, 1, 3, 8], "1-3 is no bond"),
+        ([6, 0, 1, 4], None),  # improper torsions: all bonded to atom 0
+        ([6, 4, 0, 7], None),
+    ],
+)
+def test_torsions_over_atoms_that_are_not_bonded(four, said):
+    """Of butane, whose chain is 0-1-2-3."""
+    windows = AseWindows(molecule("trans-butane"), CALCULATOR, {"turn": Dihedral([four])})
+    if said is None:
+        windows.begin()
+    else:
+        with pytest.warns(UserWarning, match=f"turn is a torsion over .* and {said}; give the atoms in the order"):
+            windows.begin()
+
+
+def test_torsions_over_atoms_that_form_no_bonds():
+    """Nobody knows which order of metal atoms is meant."""
+    AseWindows(molecule("Si2H6"), CALCULATOR, {"turn": Dihedral([[2, 0, 1, 5]])}).begin()
+    copper = Atoms("Cu4", [[0, 0, 0], [2.5, 0, 0], [2.5, 2.5, 0], [2.5, 2.5, 2.5]])
+    AseWindows(copper, CALCULATOR, {"turn": Dihedral([[0, 1, 2, 3]])}).begin()
 
 
 def test_coordinates_that_cannot_be_held():

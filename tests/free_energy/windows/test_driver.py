@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from window_samplers import KT, Fake, slope
 
-from kcons.errors import InputError, OccupiedError, UnreadableError
+from kcons.errors import InputError, OccupiedError
 from kcons.free_energy import Settings, Windows
 
 SETTINGS = Settings(production=640, every=10)
@@ -131,6 +131,67 @@ def test_windows_that_failed_before_others_are_added_are_still_told_of(tmp_path)
         assert windows.run(np.linspace(-np.pi, np.pi, 6)[:-1], executor=executor).failed == {}
 
 
+def test_a_second_run_in_the_same_folder_is_told(tmp_path):
+    """While the first one samples; its windows are as they would have been."""
+    first = Windows(Fake(str(tmp_path / "diary"), wait=0.3), tmp_path / "out", SETTINGS)
+    second = Windows(Fake(str(tmp_path / "other")), tmp_path / "out", SETTINGS)
+    refused = []
+
+    def meanwhile(*_):
+        for attempt in (lambda: second.run(PLACES), lambda: second.pull(0.0, 1.0), lambda: second.improve(0.1, 20)):
+            with pytest.raises(OccupiedError, match="another run writes into"):
+                attempt()
+            refused.append(attempt)
+
+    with ThreadPoolExecutor(4) as executor:
+        assert len(first.run(PLACES[:2], executor=executor, progress=meanwhile).windows) == 2
+        assert len(refused) == 12 and not (tmp_path / "other").exists()
+        assert len(second.run(PLACES[:2], executor=executor).windows) == 2
+    assert not (tmp_path / "other").exists()
+
+
+def test_of_two_that_begin_together_with_other_settings_one_is_told(tmp_path):
+    """Both have looked into an empty folder."""
+    one = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
+    other = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
+    with ThreadPoolExecutor(1) as executor:
+        one.run(PLACES[:1], executor=executor)
+        with pytest.raises(OccupiedError, match="windows of other settings"):
+            other.run(PLACES[:1], executor=executor)
+
+
+@pytest.mark.parametrize("name", ["window-0000-up.npz", "free_energy.json", "profile.png"])
+def test_files_of_others_are_not_taken_for_windows(tmp_path, name):
+    (tmp_path / name).write_text("precious")
+    with pytest.raises(OccupiedError, match=f"other files called {name}; give another folder"):
+        Windows(Fake(str(tmp_path / "diary")), tmp_path, SETTINGS)
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "precious"
+
+
+def begun_by_a_process(folder: Path, wait: float) -> subprocess.Popen[bytes]:
+    """A run with two workers that have begun."""
+    path = os.pathsep.join([str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])])
+    (folder / "script.py").write_text(SCRIPT)
+    command = [sys.executable, str(folder / "script.py"), str(folder), "2", str(wait)]
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.DEVNULL)
+    while not (folder / "diary").exists() or len(diary(folder)) < 2:
+        assert process.poll() is None
+        time.sleep(0.05)
+    return process
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_workers_end_with_what_waits_for_them(tmp_path, sent):
+    """However it ends: nothing is written any more, and nobody waits for the windows in hand."""
+    process = begun_by_a_process(tmp_path, 3.0)
+    process.send_signal(sent)
+    assert process.wait(timeout=60) != 0
+    time.sleep(4.0)  # by then windows in hand would have been finished
+    assert not list((tmp_path / "out").glob("window-*")) and len(diary(tmp_path)) == 2
+    _, result = run(tmp_path, PLACES[:1])
+    assert result.failed == {} and not list((tmp_path / "out").glob("*.unfinished"))
+
+
 def test_a_killed_worker_changes_nothing(tmp_path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
@@ -231,7 +292,7 @@ def test_pulls_that_fail_are_told_of(tmp_path):
 def test_bad_input(tmp_path):
     with pytest.raises(InputError, match="folder is 3; give a path"):
         Windows(Fake(str(tmp_path / "diary")), 3, SETTINGS)
-    with pytest.raises(OccupiedError, match=r"windows of other settings; choose another folder"):
+    with pytest.raises(OccupiedError, match=r"windows of other settings; give another folder"):
         run(tmp_path)
         Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
     with pytest.raises(OccupiedError, match=r"windows of other system;"):
@@ -239,9 +300,9 @@ def test_bad_input(tmp_path):
     with pytest.raises(OccupiedError, match=r"window-0001-up.npz was sampled elsewhere than at -1\.5708"):
         run(tmp_path, PLACES[::2])
     assert len(diary(tmp_path)) == 16
-    for text in ('{"seed', "[1]"):
+    for text in ('{"seed', "[1]", '{"precious": 1}'):
         (tmp_path / "out/settings.json").write_text(text)
-        with pytest.raises(UnreadableError, match=r"settings\.json cannot be read"):
+        with pytest.raises(OccupiedError, match=r"other files called settings\.json"):
             Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
     windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
     for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1)), 1.1):

@@ -45,6 +45,11 @@ def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
     assert series.isokinetic_degrees_of_freedom == (49 if thermostat == "isokinetic" else 0)
 
 
+def test_a_torsion_over_atoms_that_are_not_bonded():
+    with pytest.warns(UserWarning, match="phi is a torsion over the atoms 6, 4, 8, 14, .* and 4-8 is no bond"):
+        sampler({"phi": Dihedral([[6, 4, 8, 14]])}).begin()
+
+
 @pytest.mark.parametrize(
     ("coordinate", "target"),
     [

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+import re
+from pathlib import Path
+
 import numpy as np
 import openmm
 import pytest
@@ -11,7 +15,7 @@ from openmm import app
 from openmm_systems import DATA
 
 from kcons.errors import InputError, KconsError, UnsupportedError
-from kcons.free_energy import AseWindows, OpenMMWindows, read_plan
+from kcons.free_energy import AseWindows, OpenMMWindows, Windows, read_plan
 
 PLAN = """
 [structure]
@@ -207,6 +211,62 @@ def test_wrong_plans(folder, old, new, match):
     assert old in PLAN
     with pytest.raises(KconsError, match=match):
         read(folder, PLAN.replace(old, new))
+
+
+FORCES = PLAN[PLAN.index('calculator = "lj"') : PLAN.index("[[coordinate]]")]
+STRANGE = """
+import pathlib
+from ase.calculators.lj import LennardJones
+pathlib.Path(__file__).with_suffix(".ran").touch()
+def made():
+    return LennardJones()
+"""
+
+
+def test_a_plan_runs_no_code_that_nobody_allowed(folder, monkeypatch):
+    """Modules are named by who runs the plan, and nothing of them is imported by reading it."""
+    (folder / "strange.py").write_text(STRANGE)
+    monkeypatch.syspath_prepend(folder)
+    with pytest.raises(InputError, match="--allow-module strange "):
+        read(folder, PLAN.replace(FORCES, 'calculator = "strange:made"\n'))
+    plan = read_plan(folder / "plan.toml", allow_modules=["strange"])
+    assert plan.sampler.begin()[0] == pytest.approx([np.pi])
+    assert not (folder / "strange.ran").exists()
+    Windows(plan.sampler, folder / "out", plan.settings)  # about to run
+    assert (folder / "strange.ran").exists()
+    for name, module in (("cp2k", "ase.calculators.cp2k"), ("os:system", "os")):
+        with pytest.raises(InputError, match=f"--allow-module {module} "):
+            read(folder, PLAN.replace(FORCES, f'calculator = "{name}"\nsettings = {{command = "touch ran"}}\n'))
+
+
+def nothing(state):
+    return 0.0, np.zeros((6, 3))
+
+
+class Touches:
+    """Touches a file when its pickle is read."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_system_of_a_plan_runs_no_code(folder):
+    """A PythonForce is code, which OpenMM runs while it reads the file."""
+    system = openmm.System()
+    for mass in molecule("CH3OH").get_masses():
+        system.addParticle(mass)
+    system.addForce(openmm.PythonForce(nothing))
+    code = pickle.dumps(Touches(folder / "ran")).hex()
+    xml, changed = re.subn('function="[0-9a-f]*"', f'function="{code}"', openmm.XmlSerializer.serialize(system))
+    assert changed == 1
+    (folder / "system.xml").write_text(xml)
+    text = PLAN.replace(FORCES, 'system = "system.xml"\n').replace('[held]\nconstrain = "hbonds"\n', "")
+    with pytest.raises(InputError, match=r"system\.xml has a PythonForce in it, whose code would run"):
+        read(folder, text)
+    assert not (folder / "ran").exists()
 
 
 def test_an_unknown_scheduler(folder, monkeypatch):

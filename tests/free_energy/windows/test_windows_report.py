@@ -45,6 +45,18 @@ def test_files(found, tmp_path):
     assert paths[2].read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("places", [[0.1, 0.5, 0.9], [0.1, 0.5], [0.1, 0.1, 0.5]], ids=str)
+def test_a_profile_or_why_there_is_none(places, tmp_path):
+    """What `integrate` takes: three windows at different places."""
+    profile = len(set(places)) == 3
+    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=640, every=10))
+    found = windows.run(places, executor=ThreadPoolExecutor(1))
+    said = windows_report.summary(found)
+    names = [path.name for path in windows_report.write(found, tmp_path, [True])]
+    assert ("from the lowest to the highest point" in said) == ("profile.csv" in names) == profile
+    assert ("no profile: 2 different windows are too few for a profile; give 3 or more" in said) == (not profile)
+
+
 def test_a_formula_has_its_own_unit(found, tmp_path):
     """Of OpenMM it is in nm, and nobody knows whether it is a length."""
     coordinates = {"f": Formula("x1 * x2", [[0, 1]]), "r": Distance([[0, 1]]), "t": Dihedral([[0, 1, 2, 3]])}

@@ -1,5 +1,7 @@
 """Pictures and files of a check: what they show, and what they do not overwrite."""
 
+import errno
+
 import numpy as np
 import pytest
 import water_files as files
@@ -31,21 +33,34 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_writing_refuses_others_and_leaves_nothing_unfinished(folder, tmp_path, monkeypatch):
+def test_writing_refuses_others_and_follows_no_links(folder, tmp_path):
     one = check_trajectory(folder / "good.xtc", folder / "t.gro", "none", rank=False)
     other = check_trajectory(folder / "good.trr", folder / "t.gro", "none", rank=False)
     report.write(one, tmp_path / "out")
-    with pytest.raises(OccupiedError, match=r"good\.xtc; give another folder"):
+    with pytest.raises(OccupiedError, match=r"of other file \(.*good\.xtc\); give another folder"):
         report.write(other, tmp_path / "out")
-    # A second check that began at the same time has its file there, still empty.
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "check.json").touch()
-    with pytest.raises(OccupiedError):
-        report.write(one, tmp_path / "new")
-    planted = tmp_path / "out" / "check.json.unfinished"
-    planted.symlink_to(tmp_path / "victim")
+    for name in ("check.json.unfinished", ".kcons.lock"):  # links that somebody has put there
+        (tmp_path / "out" / name).symlink_to(tmp_path / "victim")
+    with pytest.raises(OccupiedError, match=r"\.kcons\.lock is a link"):
+        report.write(one, tmp_path / "out")
+    (tmp_path / "out" / ".kcons.lock").unlink()
     report.write(one, tmp_path / "out")
-    assert not (tmp_path / "victim").exists() and not planted.is_symlink()
+    assert not (tmp_path / "victim").exists()
+
+
+def test_a_full_disk_blocks_no_folder(folder, tmp_path, monkeypatch):
+    """What could not be written is not there, and a check of any trajectory can be written there later."""
+    one, other = (check_trajectory(folder / f, folder / "t.gro", "none", rank=False) for f in ("good.xtc", "good.trr"))
+
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(report, "in_one_piece", full)
+        with pytest.raises(OSError, match="No space left"):
+            report.write(one, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+    assert report.write(other, tmp_path / "out")
 
 
 def drawn(monkeypatch, result):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +13,7 @@ from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion
+from kcons.motion.restoring import nearest_point
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -194,3 +196,60 @@ def test_long_chain_off_by_a_fifth() -> None:
     whole = ConstraintSet(held.Distance(np.stack([k[:-1], k[1:]], axis=1), 1.0), x, np.ones(n))
     start = 1.2 * x + 0.05 * np.random.default_rng(0).normal(size=x.shape)
     fulfilled(whole, Motion(whole, x).restore_positions(start))
+
+
+#: Bonds and next neighbours of a chain are held: it bends, and the surface of its rows with it.
+BRACED = np.array([[1.25 * k, 0.45 * (-1) ** k, 0.1 * np.sin(k)] for k in range(9)])
+BRACES = [(k, k + 1) for k in range(8)] + [(k, k + 2) for k in range(7)]
+
+
+def _braced(copies: int) -> tuple[Motion, ConstraintSet, np.ndarray]:
+    x = np.concatenate([BRACED + np.array([0.0, 20.0 * k, 0.0]) for k in range(copies)])
+    masses = np.tile(np.random.default_rng(13).uniform(1, 14, 9), copies)
+    rows = held.Distance([(9 * k + i, 9 * k + j) for k in range(copies) for i, j in BRACES])
+    whole = ConstraintSet(rows, x, masses)
+    return Motion(whole, x), whole, x
+
+
+def _displaced(rng: np.random.Generator, share: float) -> np.ndarray:
+    d = rng.normal(size=BRACED.shape)
+    return d / np.sqrt((d**2).sum(axis=1).mean()) * share * np.linalg.norm(BRACED[1] - BRACED[0])
+
+
+def test_the_nearest_point_is_found_where_the_surface_is_much_bent() -> None:
+    """Curved by nearly as much as the start is away, so that plain rounds hardly gain."""
+    motion, whole, x = _braced(1)
+    rng = np.random.default_rng(13)
+    rng.uniform(1, 14, 9)
+    for share in np.repeat([0.05, 0.1, 0.15, 0.2, 0.25, 0.3], 14):
+        start = x + _displaced(rng, share)
+        found = motion.restore_positions(start, bonds=[])
+        fulfilled(whole, found)
+        assert off_the_perpendicular(whole, motion, start, found) < 1e-9
+
+
+def test_each_of_several_molecules_comes_to_its_nearest_point() -> None:
+    one, _, x = _braced(1)
+    several, whole, _ = _braced(6)
+    rng = np.random.default_rng(5)
+    starts = [x + _displaced(rng, 0.15) for _ in range(6)]
+    shift = np.repeat([[0.0, 20.0 * k, 0.0] for k in range(6)], 9, axis=0)
+    found = several.restore_positions(np.concatenate(starts) + shift, bonds=[]) - shift
+    fulfilled(whole, found + shift)
+    alone = np.concatenate([one.restore_positions(start, bonds=[]) for start in starts])
+    np.testing.assert_allclose(found, alone, rtol=0, atol=1e-9)
+
+
+def test_a_search_that_ends_before_the_nearest_point_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    motion, whole, x = _braced(1)
+    start = x + _displaced(np.random.default_rng(0), 0.15)
+    monkeypatch.setattr(nearest_point, "MOST_ITERATIONS", 2)
+    monkeypatch.setattr(nearest_point, "FAILED", 5)
+    with pytest.warns(UserWarning, match=r"fulfil all rows, but are not the nearest.* Start nearer"):
+        found = motion.restore_positions(start, bonds=[])
+    fulfilled(whole, found)
+    assert off_the_perpendicular(whole, motion, start, found) > 1e-6
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        monkeypatch.undo()
+        motion.restore_positions(start, bonds=[])

@@ -11,7 +11,7 @@ import pytest
 from carried_systems import PEPTIDE, PEPTIDE_FILE, context_of, free, peptide, pull, start, state_of
 from openmm import app, unit
 
-from kcons.constraints import Distance, FixedAtoms, Sphere
+from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, RadiusOfGyration, Sphere
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
@@ -317,3 +317,29 @@ def test_multipliers_of_a_step_have_its_length():
     np.testing.assert_array_equal(part.step_multipliers, made)
     integrator.step(3)
     np.testing.assert_allclose(part.step_multipliers, made, rtol=1e-3)
+
+
+@pytest.mark.parametrize("platform", ["Reference", "CPU"])
+@pytest.mark.parametrize("tie", [Angle([[0, 1, 2]]), RadiusOfGyration([[0, 1, 2]]), Distance([[0, 1], [1, 2]])])
+def test_places_of_a_molecule_that_is_stored_in_several_images(platform, tie):
+    """As the whole molecule without a cell, each place moved along with the image in which its atom is stored."""
+    whole = np.array([[0.98, 0.5, 0.5], [1.03, 0.5, 0.55], [1.06, 0.54, 0.5]])
+    ends = []
+    for images in (np.zeros((3, 3)), np.array([[0, 0, 0], [-1.0, 0, 0], [-1, 2, 0]])):
+        system = free([12.0, 1.0, 16.0], pull(20.0, 3))
+        system.setDefaultPeriodicBoxVectors([1, 0, 0], [0, 1, 0], [0, 0, 1])
+        places = whole + images + [[0, 0.1, 0], [0, -0.1, 0], [0, 0, 0]]
+        rows = [Sphere([0, 1], places[:2]), CenterOfMass([[1, 2]], axes=(0,)), tie]
+        part = hold(system, rows, whole + images, periodic=bool(images.any()))
+        integrator = ProjectedIntegrator(0.001, parts=[part])
+        context = context_of(system, integrator, platform)
+        context.setPositions(whole + images)
+        context.setVelocities(part.motion.project_velocities(whole + images, np.full((3, 3), 0.3)))
+        integrator.step(100)
+        x, v = state_of(context)
+        centers = np.linalg.norm(x[:2] - places[:2], axis=1)
+        np.testing.assert_allclose(centers, np.linalg.norm((whole + images - places)[:2], axis=1), rtol=0, atol=1e-12)
+        ends.append((x - images, v))
+    assert np.abs(ends[0][0] - whole).max() > 0.005
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0, atol=1e-7)

@@ -22,30 +22,41 @@ KINDS = {
 
 
 @njit
-def of_arrays(functions, n, kinds, links, slot_atoms, numbers, base, moves, lattice, periodic, values, lines, which):
+def of_arrays(
+    functions, n, kinds, links, slot_atoms, numbers, base, moves, moved, lattice, periodic, values, lines, which
+):  # fmt: skip
     """`evaluate`, which takes pointers, for the rows of arrays."""
     evaluate(
         functions, 0, n, at_first(kinds), at_first(links), at_first(slot_atoms), at_first(numbers), at_first(base),
-        at_first(moves), at_first(base), lattice, periodic, at_first(values), at_first(lines), which,
+        at_first(moves), at_first(base), at_first(moved), lattice, periodic, at_first(values), at_first(lines), which,
     )  # fmt: skip
 
 
-def evaluated(constraints, x, cell=None, moves=0.0):
-    """Values and dense gradients of the kernel with positions split into whole and moves, in the set's order."""
+def evaluated(constraints, x, cell=None, moves=0.0, moved=0.0):
+    """Values and dense gradients of the kernel with positions split into whole and moves, in the set's order.
+
+    Positions come `moved`, which rows with a place in space take off.
+    """
     constraint_set = ConstraintSet(constraints, x, np.ones(len(x)), cell=cell)
     n = constraint_set.n_rows
     solver = SparseRows(constraint_set, np.arange(n), np.ones(len(x)))
     atoms, slot_atoms, kinds, links = (part_of(solver.tables, k, np.uint32) for k in (1, 3, 4, 5))
     base, change = np.zeros((2, len(atoms), 4))
-    base[:, :3], change[:, :3] = (x - moves)[atoms], np.broadcast_to(moves, x.shape)[atoms]
+    base[:, :3], change[:, :3] = (x - moves + moved)[atoms], np.broadcast_to(moves, x.shape)[atoms]
+    taken = np.zeros((len(slot_atoms), 4))
+    slots = links.reshape(-1, 4)[:, 2]
+    for k, row in enumerate(solver.rows):
+        if not constraint_set.locate(int(row))[0].relative:
+            taken[slots[k] : slots[k + 1], :3] = np.broadcast_to(moved, x.shape)[
+                atoms[slot_atoms[slots[k] : slots[k + 1]]]
+            ]
     lattice = np.zeros((2, 3, 3)) if cell is None else constraint_set.lattice
     values, lines = np.zeros(n), np.zeros(8 * len(slot_atoms))
     for which in range(2):
         of_arrays(
             addresses_for(kinds)[1], n, kinds, links, slot_atoms, solver.numbers, base.ravel(), change.ravel(),
-            lattice, cell is not None, values, lines, which,
+            taken.ravel(), lattice, cell is not None, values, lines, which,
         )  # fmt: skip
-    slots = links.reshape(-1, 4)[:, 2]
     lines = lines.reshape(-1, 8)
     np.testing.assert_array_equal(lines[:, 0:6:2], lines[:, 1:6:2])
     gradient = np.zeros((n, len(x), 3))
@@ -78,6 +89,18 @@ def test_all_kinds_together():
     constraint_set, values, gradient = evaluated([*KINDS.values(), Plane([1], [0, 0.6, 0.8])], x)
     np.testing.assert_allclose(values, constraint_set.measure(x), rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(gradient, constraint_set.jacobian(x).toarray(), atol=1e-12)
+
+
+def test_rows_with_a_place_take_off_what_positions_were_moved_by():
+    """Ties see the atoms where they are, places where they are stored."""
+    rng = np.random.default_rng(10)
+    x, moved = 2 * rng.normal(size=(9, 3)), rng.normal(size=(9, 3))
+    rows = [*KINDS.values(), Plane([1], [0, 0.6, 0.8])]
+    constraint_set, values, _ = evaluated(rows, x, moves=0.1, moved=moved)
+    relative = np.concatenate([np.full(c.n_rows, c.relative) for c in constraint_set.constraints])
+    expected = np.where(relative, constraint_set.measure(x + moved), constraint_set.measure(x))
+    assert 0 < relative.sum() < len(relative)
+    np.testing.assert_allclose(values, expected, rtol=1e-13, atol=1e-13)
 
 
 def test_rows_with_a_period_miss_by_the_shorter_way():

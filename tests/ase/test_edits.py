@@ -1,0 +1,240 @@
+"""Atoms that are edited between steps: refused with the remedy, or put right, and never made into velocity."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import units
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.md.andersen import Andersen
+from ase.md.bussi import Bussi
+from ase.md.langevin import Langevin
+from ase.md.langevinbaoab import LangevinBAOAB
+from ase.md.nptberendsen import NPTBerendsen
+from ase.md.nvtberendsen import NVTBerendsen
+from ase.md.verlet import VelocityVerlet
+from ase.optimize import BFGS, FIRE
+from ase_systems import FS, Free, dumbbells, off, random, water_gas
+
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    ConstrainedNoseHoover,
+    constrain,
+    draw_velocities,
+    rigid_water,
+)
+from kcons.constraints import Angle, Dihedral, Distance
+from kcons.errors import InputError, UnsupportedError
+
+#: Classes of ASE that respect constraints, each a dynamics object for these atoms and this time step.
+OF_ASE = {
+    "VelocityVerlet": VelocityVerlet,
+    "Langevin": lambda a, dt: Langevin(a, dt, temperature_K=250, friction=0.01 / FS, fixcm=False, rng=random()),
+    "NVTBerendsen": lambda a, dt: NVTBerendsen(a, dt, 250, 100 * FS, fixcm=False),
+    "Bussi": lambda a, dt: Bussi(a, dt, 250, 100 * FS, rng=random()),
+    "Andersen": lambda a, dt: Andersen(a, dt, 250, 1e-9, fixcm=False, rng=random()),
+}
+ALL = OF_ASE | {
+    "ConstrainedDynamics": ConstrainedDynamics,
+    "ConstrainedLangevin": lambda a, dt: ConstrainedLangevin(a, dt, 250, 0.01 / FS, rng=5),
+    "ConstrainedNoseHoover": lambda a, dt: ConstrainedNoseHoover(a, dt, 250, 50 * FS, momentum="free"),
+    "BFGS": lambda a, dt: BFGS(a, logfile=None),
+    "FIRE": lambda a, dt: FIRE(a, logfile=None),
+}
+EDITS = {
+    "set_dihedral": lambda a: a.set_dihedral(3, 2, 1, 0, 60, indices=[3]),
+    "rotate_dihedral": lambda a: a.rotate_dihedral(3, 2, 1, 0, 40, indices=[3]),
+    "set_angle": lambda a: a.set_angle(0, 1, 2, 100, indices=[2, 3]),
+    "set_distance": lambda a: a.set_distance(1, 2, a.get_distance(1, 2) + 0.03),
+    "positions": lambda a: a.positions.__setitem__(1, a.positions[1] + 0.02),
+    "apply_constraint": lambda a: a.set_positions(a.positions * 1.002, apply_constraint=False),
+}
+
+
+def held_ethanol():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    held = constrain(atoms, [Distance([[1, 2]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])])
+    draw_velocities(atoms, 250, rng=4)
+    return atoms, held
+
+
+@pytest.mark.parametrize("edit", EDITS)
+@pytest.mark.parametrize("name", ALL)
+def test_an_edit_between_runs_is_refused(name, edit):
+    """The remedy is named, nothing is changed, and after it the run goes on as warm as it was."""
+    atoms, held = held_ethanol()
+    run = ALL[name](atoms, 0.8 * FS)
+    run.run(steps=3)
+    kelvin = atoms.get_temperature()
+    EDITS[edit](atoms)
+    x, p = atoms.get_positions(), atoms.get_momenta()
+    with pytest.raises(InputError, match=r"atoms are off row .*restore\(atoms\)"):
+        run.run(steps=1)
+    assert np.array_equal(atoms.positions, x) and np.array_equal(atoms.get_momenta(), p)
+    held.restore(atoms)
+    run.run(steps=1)
+    assert off(atoms, held) <= 1e-12
+    if name not in ("BFGS", "FIRE"):
+        assert abs(atoms.get_temperature() - kelvin) < 250
+
+
+@pytest.mark.parametrize("name", OF_ASE)
+def test_an_edit_by_an_observer_is_refused(name):
+    atoms, _ = held_ethanol()
+    run = OF_ASE[name](atoms, 0.8 * FS)
+    run.attach(lambda: run.nsteps == 2 and EDITS["rotate_dihedral"](atoms))
+    with pytest.raises(InputError, match=r"off row #2 Dihedral\(3, 2, 1, 0\) by 0\.698132 .*since the last step"):
+        run.run(4)
+    assert run.nsteps == 2
+
+
+@pytest.mark.parametrize("name", [*OF_ASE, "ConstrainedDynamics"])
+def test_what_a_file_rounds_is_put_right_without_heat(name):
+    """The correction alone, in steps as short as these, is 3 % of the speed of its atoms."""
+    ends = []
+    for size in (0.0, 5e-7):
+        atoms, held = held_ethanol()
+        run = ALL[name](atoms, 0.005 * FS)
+        run.run(2)
+        atoms.positions[1] += size * (atoms.positions[1] - atoms.positions[2])
+        run.run(1)
+        assert off(atoms, held) <= 1e-12
+        ends.append(atoms.get_momenta())
+    assert np.abs(ends[1] - ends[0]).max() <= 1e-4 * np.abs(ends[0]).max()
+
+
+# -- the cell ---------------------------------------------------------------------------------------
+
+
+def gas():
+    atoms = water_gas(2)
+    held = constrain(atoms, rigid_water(atoms))
+    draw_velocities(atoms, 250, rng=3)
+    return atoms, held
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.00001, 1.02])
+@pytest.mark.parametrize("name", OF_ASE)
+def test_atoms_scaled_with_the_cell_are_put_right(name, factor):
+    """As after a barostat: lengths are as before, each molecule is about its new center, and no atom is faster."""
+    atoms, held = gas()
+    run = OF_ASE[name](atoms, FS)
+    run.run(2)
+    kinetic, whole = atoms.get_kinetic_energy(), atoms.get_volume()
+    atoms.set_cell(atoms.cell * [factor, 1, 1], scale_atoms=True)
+    run.run(1)
+    assert off(atoms, held) <= 1e-12
+    assert atoms.get_volume() == pytest.approx(factor * whole)
+    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=0.1)
+
+
+def test_a_cell_that_is_changed_alone_is_no_edit():
+    atoms, held = gas()
+    run = VelocityVerlet(atoms, FS)
+    run.run(2)
+    kinetic = atoms.get_kinetic_energy()
+    atoms.set_cell(atoms.cell * 1.1)
+    run.run(2)
+    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-3) and off(atoms, held) <= 1e-12
+
+
+def test_an_edit_in_a_new_cell_is_an_edit():
+    atoms, _ = gas()
+    run = VelocityVerlet(atoms, FS)
+    run.run(2)
+    atoms.set_cell(atoms.cell * 1.001, scale_atoms=True)
+    atoms.positions[0] += 0.05
+    with pytest.raises(InputError, match=r"restore\(atoms\)"):
+        run.run(1)
+
+
+def test_positions_wrapped_between_steps_are_no_edit():
+    atoms, held = dumbbells(6, side=6.0)
+    run = VelocityVerlet(atoms, FS)
+    run.attach(atoms.wrap)
+    kinetic = atoms.get_kinetic_energy()
+    run.run(50)
+    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-9) and off(atoms, held) <= 1e-12
+
+
+def test_berendsen_scales_atoms_in_each_step():
+    atoms, held = dumbbells(6)
+    pressure = {"pressure_au": units.bar, "taup": 100 * FS, "compressibility_au": 10 / units.GPa}
+    run = NPTBerendsen(atoms, FS, temperature_K=300, taut=100 * FS, **pressure)
+    volume = atoms.get_volume()
+    run.run(20)
+    assert atoms.get_volume() != volume and off(atoms, held) <= 1e-12
+
+
+# -- what is at fault -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["Bussi", "NVTBerendsen"])
+def test_an_edit_is_named_before_a_class(name):
+    atoms, _ = held_ethanol()
+    run = OF_ASE[name](atoms, FS)
+    run.run(3)
+    EDITS["set_distance"](atoms)
+    with pytest.raises(InputError) as caught:
+        run.run(1)
+    assert "dynamics class" not in str(caught.value) and "set_distance" in str(caught.value)
+
+
+def test_a_class_that_moves_atoms_within_its_step_is_named():
+    atoms, _ = held_ethanol()
+    with pytest.raises(UnsupportedError, match=r"off row .*restore.*LangevinBAOAB.*ConstrainedNoseHoover.*barostat="):
+        LangevinBAOAB(atoms, FS, temperature_K=250, T_tau=100 * FS, rng=1).run(1)
+
+
+# -- frames -----------------------------------------------------------------------------------------
+
+ROWS = {
+    "CO": [Distance([0, 1])],
+    "H2O": [Distance([[0, 1], [0, 2], [1, 2]])],
+    "CH3CH2OH": [Distance([[0, 1], [1, 2], [2, 3], [0, 6]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])],
+}
+
+
+@pytest.mark.parametrize("digits", [None, 8, 5, 3])
+@pytest.mark.parametrize("name", ROWS)
+def test_frames_on_the_constraints_are_taken(name, digits):
+    """Wherever they are; with the digits of a file they move by what these leave, and end on the constraints."""
+    rng = random(7)
+    reference = molecule(name)
+    for _ in range(60):
+        frame = reference.copy()
+        frame.rotate(rng.uniform(0, 180), rng.normal(size=3))
+        frame.translate(rng.normal(size=3))
+        if digits is not None:
+            frame.positions = np.round(frame.positions, digits)
+        atoms = reference.copy()
+        held = constrain(atoms, ROWS[name])
+        atoms.set_positions(frame.positions)
+        assert np.abs(atoms.positions - frame.positions).max() <= (1e-14 if digits is None else 2 * 10.0**-digits)
+        assert off(atoms, held) <= 1e-12
+
+
+def test_a_frame_is_taken_by_edited_atoms():
+    """It is on the constraints itself, wherever the atoms were."""
+    atoms, held = held_ethanol()
+    frame = atoms.get_positions()
+    EDITS["rotate_dihedral"](atoms)
+    atoms.set_positions(frame)
+    assert np.array_equal(atoms.positions, frame) and off(atoms, held) <= 1e-12
+
+
+def test_positions_that_no_digits_explain_are_refused_as_before():
+    atoms = molecule("CO")
+    atoms.calc = Free()
+    constrain(atoms, Distance([0, 1]))
+    frame = atoms.copy()
+    frame.set_constraint()
+    frame.rotate(170, "x")
+    frame.positions[0] += [0.0, 0.011234567, 0.02]
+    before = atoms.get_positions()
+    with pytest.raises(Exception, match="no positions near the given ones"):
+        atoms.set_positions(frame.positions)
+    assert np.array_equal(atoms.positions, before)

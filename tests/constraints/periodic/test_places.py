@@ -1,0 +1,188 @@
+"""Rows with a place in space take positions as they are stored, whatever ties their atoms: as in open space."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.calculators.calculator import Calculator, all_changes
+from ase.md.verlet import VelocityVerlet
+
+from kcons import ConstraintSet, Motion, System, run
+from kcons.ase import constrain
+from kcons.constraints import (
+    Angle,
+    CenterDistance,
+    CenterOfMass,
+    Custom,
+    CustomVelocity,
+    Cylinder,
+    Dihedral,
+    Distance,
+    Ellipsoid,
+    FixedAtoms,
+    Formula,
+    Line,
+    LinearCombination,
+    Plane,
+    RadiusOfGyration,
+    Sphere,
+    Torus,
+    projection,
+)
+
+CELL = np.array([[10.0, 0, 0], [1.0, 9.0, 0], [-2.0, 1.0, 11.0]])
+WHOLE = np.array([[9.8, 5.0, 5.0], [10.3, 5.1, 5.2], [10.6, 5.4, 5.0], [10.9, 5.2, 5.5], [11.2, 6.0, 5.3]])
+IMAGES = np.array([[0, 0, 0], [-1, 0, 1], [2, 0, 0], [0, -1, 0], [-1, 0, 0]])
+STORED = WHOLE + IMAGES @ CELL
+MASSES = np.array([12.0, 1.0, 16.0, 2.0, 3.0])
+UP = np.array([0.3, -0.5, 0.8])
+
+#: Each takes by how much its atoms are moved from the whole molecule, shape (5, 3).
+PLACES = {
+    "Sphere": lambda s: Sphere(1, WHOLE[1] + s[1] + UP, None),
+    "Cylinder": lambda s: Cylinder(1, WHOLE[1] + s[1] + UP, [0, 1.0, 0.3], None),
+    "Plane": lambda s: Plane(1, UP, None),
+    "Torus": lambda s: Torus(1, WHOLE[1] + s[1] + UP, [0, 0, 1.0], 0.5, None),
+    "Ellipsoid": lambda s: Ellipsoid(1, WHOLE[1] + s[1] + UP, [1.0, 2.0, 1.5], target=None),
+    "Line": lambda s: Line(1, None, UP),
+    "FixedAtoms": lambda s: FixedAtoms(1),
+    "Formula": lambda s: Formula(
+        "(x1 - a)**2 + (y1 - b)*(z1 - c)", 1, dict(zip("abc", s[1] + [8.0, 1.0, 2.0], strict=True)), target=None
+    ),
+    "Custom": lambda s: Custom(1, lambda r: float(np.sin(r[0, 0] - s[1, 0]) + r[0, 1]), target=None),
+    "CenterOfMass": lambda s: CenterOfMass([[1]]),
+    "CenterOfMass of three": lambda s: CenterOfMass([[1, 2, 4]], axes=(0, 2)),
+    "LinearCombination": lambda s: LinearCombination([[1, 3]], [[1.0, 2.0, 0.0], [0.5, 0.0, 1.0]]),
+    "Custom of two": lambda s: Custom(
+        [1, 2],
+        lambda r: float(np.sum((r - s[1:3] - 8.0) ** 2)),
+        lambda r: 2.0 * (r - s[1:3] - 8.0),
+        lambda r, v: 2.0 * v,
+    ),
+    "Formula of a fixed atom": lambda s: (
+        FixedAtoms(3),
+        Formula("x1*(y2 - a) - b*y2", [[1, 3]], {"a": s[3, 1], "b": s[1, 0]}, target=None),
+    ),
+    "Formula of a fixed atom and one that nothing ties": lambda s: (
+        FixedAtoms(3),
+        Formula("x1*(y2 - a) - b*y2", [[4, 3]], {"a": s[3, 1], "b": s[4, 0]}, target=None),
+    ),
+    "CustomVelocity": lambda s: CustomVelocity([[1]], lambda r: np.array([[1.0, r[0, 0] - s[1, 0], 0.0]]), target=0.0),
+}
+TIES = {
+    "gyration": RadiusOfGyration([[0, 1, 2]]),
+    "angle": Angle([[0, 1, 2]]),
+    "dihedral": Dihedral([[0, 1, 2, 3]]),
+    "centres": CenterDistance([0, 3], [1, 2], None),
+    "distances": Distance([[0, 1], [1, 2], [2, 3]]),
+    "angle in a framework": [Distance([[1, 2], [2, 3]]), Angle([[0, 1, 2]])],
+}
+
+
+def _systems(place: str, tie: str) -> list[tuple[Motion, np.ndarray]]:
+    """The molecule in open space, and in a cell with each atom in another image; and by how much atoms are moved."""
+    found = []
+    for x, cell in ((WHOLE, None), (STORED, CELL)):
+        moved = x - WHOLE
+        rows = [Sphere(0, WHOLE[0] + moved[0] + [0, 1.0, 0.2], None), *_list(PLACES[place](moved)), *_list(TIES[tie])]
+        found.append((Motion(ConstraintSet(rows, x, MASSES, cell=cell), x), moved))
+    return found
+
+
+def _list(rows):
+    return list(rows) if isinstance(rows, list | tuple) else [rows]
+
+
+@pytest.mark.parametrize("tie", TIES)
+@pytest.mark.parametrize("place", PLACES)
+def test_a_molecule_is_the_same_in_the_cell_as_in_open_space(place, tie):
+    (there, _), (here, moved) = _systems(place, tie)
+    rng = np.random.default_rng(1)
+    new, v, f = WHOLE + 0.02 * rng.normal(size=WHOLE.shape), rng.normal(size=WHOLE.shape), rng.normal(size=WHOLE.shape)
+    one, other = there.constraint_set, here.constraint_set
+    assert (there.rank, there.plan.kinds[0].clusters) == (here.rank, here.plan.kinds[0].clusters)
+    shifted = np.concatenate([np.full(c.n_rows, not c.relative) for c in other.constraints])
+    np.testing.assert_allclose(one.value(new), other.value(new + moved), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.measure(new)[~shifted], other.measure(new + moved)[~shifted], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.jacobian(new).toarray(), other.jacobian(new + moved).toarray(), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(one.curvature(new, v), other.curvature(new + moved, v), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        there.project_positions(new, WHOLE), here.project_positions(new + moved, STORED) - moved, rtol=0, atol=1e-11
+    )
+    np.testing.assert_allclose(there.restore_positions(new), here.restore_positions(new + moved) - moved, atol=1e-9)
+    tangent = there.project_velocities(WHOLE, v)
+    np.testing.assert_allclose(tangent, here.project_velocities(STORED, v), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        there.acceleration(WHOLE, tangent, f), here.acceleration(STORED, tangent, f), rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        there.constraint_force(WHOLE, tangent, f), here.constraint_force(STORED, tangent, f), rtol=0, atol=1e-9
+    )
+    ends = []
+    for motion, shift in ((there, np.zeros((5, 3))), (here, moved)):
+        system = System(motion, lambda x, t, shift=shift: 3.0 * (WHOLE - (x - shift)))
+        ends.append(run(system, system.initial_state(WHOLE + shift, 0.3 * tangent), 0.005, 40))
+        assert motion.report(ends[-1].positions).residual < 1e-12
+    np.testing.assert_allclose(ends[0].positions, ends[1].positions - moved, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("tie", ["angle", "centres", "distances"])
+def test_a_place_of_several_atoms_does_not_hang_on_what_ties_them(tie):
+    row = CenterOfMass([[0, 1, 2]], axes=(0,))
+    stored = [np.average(STORED[:3, 0], weights=MASSES[:3])]
+    for rows in ([row], [row, *_list(TIES[tie])]):
+        assert ConstraintSet(rows, STORED, MASSES, cell=CELL).measure(STORED)[0] == pytest.approx(stored[0], abs=1e-12)
+
+
+def test_another_image_from_one_call_to_the_next():
+    """A plane along the way an atom is wrapped: where it is stored does not matter, nor what ties it."""
+    rows = [Plane([0, 1], [0, 0, 1.0]), Angle([[0, 1, 2]])]
+    cell = np.diag([10.0, 9.0, 11.0])
+    motion = Motion(ConstraintSet(rows, WHOLE, MASSES, cell=cell), WHOLE)
+    rng = np.random.default_rng(2)
+    new, v = WHOLE + 0.02 * rng.normal(size=WHOLE.shape), rng.normal(size=WHOLE.shape)
+    expected = motion.project_positions(new, WHOLE)
+    for images in rng.integers(-2, 3, (20, *WHOLE.shape)):
+        ahead, behind = images @ cell, rng.integers(-2, 3, WHOLE.shape) @ cell
+        ahead[:2, 2] = behind[:2, 2] = 0.0
+        found = motion.project_positions(new + ahead, WHOLE + behind) - ahead
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            motion.project_velocities(WHOLE + behind, v), motion.project_velocities(WHOLE, v), rtol=0, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("place", ["Sphere", "Formula", "Line", "CenterOfMass of three", "Custom of two"])
+def test_the_oracle_and_the_engine_mean_the_same(place):
+    _, (motion, _) = _systems(place, "gyration")
+    rng = np.random.default_rng(3)
+    held, f = motion.constraint_set, rng.normal(size=STORED.shape)
+    v = motion.project_velocities(STORED, rng.normal(size=STORED.shape))
+    b = held.acceleration_target(STORED, v)
+    a = projection.acceleration(held.jacobian(STORED).toarray(), np.repeat(MASSES, 3), f.ravel(), b)
+    np.testing.assert_allclose(motion.acceleration(STORED, v, f).ravel(), a, rtol=0, atol=1e-9)
+
+
+class _Pull(Calculator):
+    implemented_properties = ["energy", "forces"]
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        forces = 0.5 * (STORED + 0.3 - atoms.positions)
+        self.results = {"energy": float((forces**2).sum()), "forces": forces}
+
+
+@pytest.mark.parametrize("place", ["Sphere", "Plane", "Torus", "Formula", "CenterOfMass of three"])
+def test_ase(place):
+    """Atoms of a molecule that ASE stores in many images stay at their places."""
+    moved = STORED - WHOLE
+    atoms = Atoms("CHONF", positions=STORED, cell=CELL, pbc=True, calculator=_Pull())
+    atoms.set_masses(MASSES)
+    rows = [*_list(PLACES[place](moved)), Angle([[0, 1, 2]])]
+    before = ConstraintSet(rows, STORED, MASSES, cell=CELL).measure(STORED)
+    constrain(atoms, rows)
+    VelocityVerlet(atoms, 0.1).run(20)
+    after = ConstraintSet(rows, atoms.positions, MASSES, cell=CELL).measure(atoms.positions)
+    assert np.abs(atoms.positions - STORED).max() > 1e-3
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-10)
