@@ -54,6 +54,7 @@ class Langevin(ConstantEnergy):
     """
 
     adds_up = True
+    noisy = True
     temperature: float
     friction: float
 

@@ -37,11 +37,12 @@ class RespaWriter(LeanStepWriter):
         p = self.program
         use(p, "xu")
         p.number("inner_left", "inner steps that are left")
-        self.ensemble.declare(p)
+        self._declare_ensemble()
         p.let_others_act()
         done = self.operations
+        last = max(k for k, operation in enumerate(done) if isinstance(operation, Fly)) - (_INNER - 3)
         fastest = self.ensemble.levels[-1].group
-        for block, times in _loops(done, fastest):
+        for block, times in _loops(done[:last], fastest):
             if times == 1:
                 self._write_all(block)
                 continue
@@ -49,6 +50,11 @@ class RespaWriter(LeanStepWriter):
             with p.loop("inner_left > 0", "inner steps"):
                 self._write_all(block)
                 p.let("inner_left", "inner_left-1", "one is made")
+        ends = last + _INNER - 2
+        self._write_all(done[last:ends])
+        self._note_middle("v")
+        self._write_all(done[ends:])
+        self._note_end()
 
     def _write_all(self, operations: Sequence[Operation]) -> None:
         p = self.program

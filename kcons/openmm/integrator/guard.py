@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
+from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import NEAR, Miss, Part
@@ -36,6 +36,8 @@ logger = logging.getLogger("kcons.openmm")
 
 #: With a note in the log, unless it is what a looser tolerance or single precision leaves.
 TIDY = 1e-4
+#: Speed of light, nm/ps: a System whose particles are faster on average has exploded.
+_LIGHT = 299792.458
 #: How often OpenMM's solver is asked for positions: that of OpenCL may need a second call from starts that are off.
 _CALLS = 4
 _REMEDY = "let kcons hold these constraints: take them out of the System and hand them over as constraint objects"
@@ -206,6 +208,7 @@ class Guard:
         #: g of the thermostat, once it is known.
         self.thermal: int | None = None
         self.since_check = 0
+        self._explosive = float(self.rows.masses.sum()) * _LIGHT**2
         self._surroundings: tuple[object, ...] | None = None
         self._good: openmm.State | None = None
         #: When the last check ended, what it took, and how many were put off since.
@@ -353,10 +356,44 @@ class Guard:
         if any(part.steered for part in self.integrator.parts):
             self._parameters = dict(context.getParameters())
 
-    def count(self, steps: int) -> None:
+    def look(self, twice_kinetic: float) -> None:
+        """The end of a call: whether the kinetic energy is finite, which is all that can be seen at next to no cost.
+
+        Raises
+        ------
+        NonFiniteError
+            The Context is put back to where it was checked last.
+        """
+        if twice_kinetic <= self._explosive:
+            return
+        self.disturbed = False
+        context, held = self.context, self.rows.n_rows > 0
+        step, v = context.getStepCount(), velocities_of(context)
+        try:
+            _check_finite(positions_of(context), v, step, held)
+            speeds = np.sqrt(np.einsum("ij,ij->i", v, v))
+            atom = int(np.argmax(speeds))
+            raise NonFiniteError(
+                f"particle {atom} has a velocity of {speeds[atom]:.3g} nm/ps at step {step}, and all have a kinetic "
+                f"energy of {0.5 * twice_kinetic:.3g} kJ/mol: the System has exploded; {_smaller_step(held)}",
+                item="velocity",
+                atom=atom,
+                step=step,
+            )
+        except NonFiniteError as error:
+            self._go_back(error)
+            raise
+
+    def count(self, steps: int, *, ends: bool = False) -> None:
         """Count steps that were made; check where a check is due.
 
         Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
+
+        Parameters
+        ----------
+        steps : int
+        ends : bool
+            Whether a call ends that is checked at its end.
 
         Raises
         ------
@@ -365,12 +402,14 @@ class Guard:
         """
         self.since_check += steps
         self.disturbed = False
-        if not self.integrator.check_every or self.since_check < self.integrator.check_every:
+        due = 0 < self.integrator.check_every <= self.since_check
+        if not (due or ends):
             return
-        spare = self.integrator.spare and self._put_off < MOST
+        spare = self.integrator.spare and (not due or self._put_off < MOST)
         if spare and self._cost > SHARE * (perf_counter() - self._checked):
-            self._put_off += 1
-            self.since_check = 0
+            if due:
+                self._put_off += 1
+                self.since_check = 0
             return
         self.check()
 
@@ -397,16 +436,17 @@ class Guard:
             error.step = step
             if isinstance(error, CertificateError):
                 error.state = self._good
-            if not self.disturbed and self._good is not None:
-                self.put_back()
-                good = context.getStepCount()
-                error.args = (
-                    f"{error}. The Context is back at step {good}, the last that was checked",
-                    *error.args[1:],
-                )
+            self._go_back(error)
             raise
         self._remember(now)
         self._cost = self._checked - begun
+
+    def _go_back(self, error: KconsError) -> None:
+        """The state that was checked last, and the error says so."""
+        if not self.disturbed and self._good is not None:
+            self.put_back()
+            good = self.context.getStepCount()
+            error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
 
     def certify(self, miss: Miss | None, where: str = "") -> None:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
@@ -439,10 +479,10 @@ class Guard:
 
     def explosion(self, words: str, step: int) -> NonFiniteError:
         """The error for a NaN that OpenMM met after `step`, once the state is put back."""
-        solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if self.rows.n_rows else ""
+        remedy = _smaller_step(self.rows.n_rows > 0)
         return NonFiniteError(
             f"{words} It appeared after step {step}; positions and velocities are those of step "
-            f"{self.context.getStepCount()}. Take a smaller time step, or minimise the energy first{solver}",
+            f"{self.context.getStepCount()}. {remedy[0].upper()}{remedy[1:]}",
             item="position",
             step=step,
         )
@@ -483,15 +523,19 @@ def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.
     return 2 * len(np.unique(molecules[off])) <= max(len(np.unique(molecules)), 2)
 
 
+def _smaller_step(held: bool) -> str:
+    """The remedy for what explodes; `held` where the System has constraints."""
+    solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
+    return f"take a smaller time step, or minimize the energy first{solver}"
+
+
 def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
     for array, item in ((x, "position"), (v, "velocity")):
         finite = np.isfinite(array)
         if not finite.all():
             atom = int(np.argmin(finite.all(axis=1)))
-            solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
             raise NonFiniteError(
-                f"the {item} of particle {atom} is not finite at step {step}; take a smaller time step, or minimise "
-                f"the energy first{solver}",
+                f"the {item} of particle {atom} is not finite at step {step}; {_smaller_step(held)}",
                 item=item,
                 atom=atom,
                 step=step,

@@ -120,6 +120,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         writer: type[LeanStepWriter] = getattr(self._ensemble, "writer", None) or self._writer
         self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
+        self._plan.write_look()
         #: What parts know as this integrator, and what its program has set in each.
         self.identity = object()
         self._notes = [part.notes() for part in self.parts]

@@ -158,9 +158,9 @@ class SurfaceIntegrator(ProjectedIntegrator):
         self.surfaces = tuple(part for part in together if isinstance(part, SurfaceRows))
         super().__init__(timestep, scheme, parts=together, **arguments)
 
-    def _run(self, guard: Guard, steps: int) -> None:
+    def _run(self, guard: Guard, steps: int, ends: bool) -> None:
         try:
-            super()._run(guard, steps)
+            super()._run(guard, steps, ends)
         except NonFiniteError:
             # A force that is not finite is seen in the step after the one whose velocities it has spoilt.
             if not all(np.isfinite(array).all() for array in positions_and_velocities(guard.context)):
