@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from typing import Any, Self
 
 import openmm
 from openmm import unit
@@ -143,6 +144,12 @@ class LangevinRespa(Langevin):
         middle_of(levels, slow_kicks)
         counts = tuple(level.steps for level in levels)
         self._keep(groups=tuple(int(level.group) for level in levels), counts=counts, slow_kicks=slow_kicks)
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> Self:
+        rest = dict(values)
+        steps = dict(zip(rest.pop("groups"), rest.pop("counts"), strict=True))
+        return cls(**rest, steps=steps)
 
     def __repr__(self) -> str:
         steps = dict(zip(self.groups, self.counts, strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import openmm
 
@@ -174,6 +174,11 @@ class Value:
 
     def go_on(self, integrator: Integrator, context: openmm.Context) -> None:
         pass
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> Self:
+        """The object that has these attributes, of which lists may stand for tuples; checked as any other."""
+        return cls(**values)
 
     def _keep(self, **attributes: Any) -> None:
         self.__dict__.update(attributes)

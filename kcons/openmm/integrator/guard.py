@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import weakref
+from collections.abc import Iterable
 from itertools import chain
 from time import perf_counter
 from typing import Any
@@ -186,9 +187,7 @@ class Guard:
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.constraints = SystemConstraints(context, integrator)
         self.rows = self.constraints.rows
-        integrator.take_precision(self.constraints.precision)
-        if "coarse" in integrator.program.numbers:
-            integrator.program.write("coarse", float(self.constraints.precision.name == "single"))
+        self._tell_precision()
         refuse_old_positions(integrator, self.system, self.constraints.precision)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
@@ -216,6 +215,18 @@ class Guard:
         self._freedom: int | None = None
         self._left: tuple[int, Any] | None = None
         self._parameters: dict[str, float] | None = None
+
+    def begin_anew(self) -> None:
+        """Others have written the variables of the program: the next step is the first of a run."""
+        self._tell_precision()
+        self.started, self.disturbed = False, True
+
+    def _tell_precision(self) -> None:
+        """Write into the program what it has to know of the platform."""
+        integrator = self.integrator
+        integrator.take_precision(self.constraints.precision)
+        if "coarse" in integrator.program.numbers:
+            integrator.program.write("coarse", float(self.constraints.precision.name == "single"))
 
     @property
     def alive(self) -> openmm.Context | None:
@@ -283,14 +294,15 @@ class Guard:
                 atoms=self.rows.pairs[row],
             )
         asked = [part for part in integrator.parts if not self._steered_away(part)]
-        misses = [found for part in asked if (found := part.worst_miss(context, velocities=False)) is not None]
+        misses = _misses(asked, context)
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
         if not near and not np.any(miss > self.constraints.limit(x)):
             return
+        if not near:
+            self.constraints.hold_positions(integrator.getConstraintTolerance())
+            near = not misses and bool(_misses(asked, context))  # pulled off by the constraints of the System
         if near:
             integrator.applyConstraints(context)
-        else:
-            self.constraints.hold_positions(integrator.getConstraintTolerance())
         now = positions_of(context)
         self.constraints.check(now, None)
         if near or miss[row] > TIDY:
@@ -501,6 +513,11 @@ class Guard:
     def degrees_of_freedom(self) -> int:
         """Also less three where a CMMotionRemover acts."""
         return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+
+
+def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Miss]:
+    """Rows whose positions are off, the worst of each part."""
+    return [found for part in parts if (found := part.worst_miss(context, velocities=False)) is not None]
 
 
 def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:

@@ -16,12 +16,13 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import whole_number
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.states.copies import settings_of
 from kcons.openmm.integrator.states.serialization import note_of
+from kcons.openmm.integrator.states.settings import picoseconds
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 
 #: What one execution of the program of `Ends` does.
@@ -131,7 +132,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         self, timestep: unit.Quantity | float, *, tolerance: float | None = None, check_every: int | None = None
     ) -> None:
         super().__init__()
-        self._ends = Ends(timestep, "rattle", tolerance=tolerance, check_every=check_every)
+        self._ends = Ends(picoseconds(timestep) * unit.picosecond, "rattle", tolerance=tolerance, check_every=check_every)
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
         self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())
         # The first is the one that answers what OpenMM asks: its velocities belong to x.
@@ -262,7 +263,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         InputError
             It is no positive number.
         """
-        self._ends.setStepSize(size)
+        self._ends.setStepSize(picoseconds(size) * unit.picosecond)
         self._verlet.setStepSize(self._dt)
 
     def setConstraintTolerance(self, tol: float) -> None:
@@ -316,16 +317,18 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
 
     def _making(self) -> tuple[Any, ...]:
         every = None if self._ends.spare else self.check_every
-        return self._dt, self._ends.asked_tolerance, every, settings_of(self._ends)
+        return self._ends.getStepSize(), self._ends.asked_tolerance, every, settings_of(self._ends)
 
     def _note(self) -> dict[str, Any]:
         return {**note_of(self._ends), "class": "RattleIntegrator"}
 
     @classmethod
-    def _of_note(cls, plain: openmm.CompoundIntegrator, note: dict[str, Any]) -> RattleIntegrator:
+    def _of_note(cls, plain: openmm.Integrator, note: dict[str, Any]) -> RattleIntegrator:
+        if not isinstance(plain, openmm.CompoundIntegrator) or plain.getNumIntegrators() != 2:
+            raise InputError(f"{type(plain).__name__} is no program of a {cls.__name__}", item="integrator")
         ends = plain.getIntegrator(0)
         settings = {"groups": ends.getIntegrationForceGroups()}
-        return _remade(ends.getStepSize()._value, note["tolerance"], note["check_every"], settings)
+        return _remade(ends.getStepSize(), note["tolerance"], note["check_every"], settings)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _remade, self._making()
@@ -338,7 +341,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         return self.__copy__()
 
 
-def _remade(dt: float, tolerance: float | None, check_every: int | None, settings: dict[str, Any]) -> RattleIntegrator:
+def _remade(
+    dt: unit.Quantity, tolerance: float | None, check_every: int | None, settings: dict[str, Any]
+) -> RattleIntegrator:
     made = RattleIntegrator(dt, tolerance=tolerance, check_every=check_every)
     made.setIntegrationForceGroups(settings["groups"])
     return made

@@ -114,9 +114,9 @@ class OutsideOfSteps(StatesOnConstraints, Integrator):
     # -- temperature that is found --------------------------------------------------------------
 
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
-        """As OpenMM reports it: of the velocities at x, or with a bath that has noise of those in the middle of the step.
+        """As a State has it: of the velocities at x; with a bath that has noise, of those in the middle of the step.
 
-        With such a bath or the leapfrog the next step computes the forces anew, as after any State with energies.
+        With such a bath, and with the leapfrog, the next step computes forces anew, as after any State with energies.
         """
         guard = self._watch(context)
         if self.scheme is None or self.ensemble.noisy:
