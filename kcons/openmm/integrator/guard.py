@@ -373,7 +373,7 @@ class Guard:
 
         Raises
         ------
-        NonFiniteError
+        ConvergenceError, NonFiniteError
             The Context is put back to where it was checked last.
         """
         if twice_kinetic <= self._explosive:
@@ -382,6 +382,7 @@ class Guard:
         context, held = self.context, self.rows.n_rows > 0
         step, v = context.getStepCount(), velocities_of(context)
         try:
+            self.integrator.ensemble.verify(self.integrator)
             _check_finite(positions_of(context), v, step, held)
             speeds = np.sqrt(np.einsum("ij,ij->i", v, v))
             atom = int(np.argmax(speeds))
@@ -392,7 +393,7 @@ class Guard:
                 atom=atom,
                 step=step,
             )
-        except NonFiniteError as error:
+        except (ConvergenceError, NonFiniteError) as error:
             self._go_back(error)
             raise
 

@@ -132,7 +132,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         self, timestep: unit.Quantity | float, *, tolerance: float | None = None, check_every: int | None = None
     ) -> None:
         super().__init__()
-        self._ends = Ends(picoseconds(timestep) * unit.picosecond, "rattle", tolerance=tolerance, check_every=check_every)
+        self._ends = Ends(
+            picoseconds(timestep) * unit.picosecond, "rattle", tolerance=tolerance, check_every=check_every
+        )
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
         self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())
         # The first is the one that answers what OpenMM asks: its velocities belong to x.

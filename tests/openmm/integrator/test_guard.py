@@ -446,7 +446,7 @@ def test_the_leapfrog_comes_back_with_its_kinetic_energy():
     context = started(system, integrator, x, v)
     integrator.step(10)
     kinetic = context.getState(energy=True).getKineticEnergy()
-    integrator.setStepSize(50)
+    integrator.setStepSize(50 * unit.picosecond)
     with pytest.raises(KconsError):
         integrator.step(30)
     integrator.setStepSize(1e-3)

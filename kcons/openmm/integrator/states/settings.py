@@ -6,7 +6,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable
 from types import MethodType
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 import openmm
@@ -43,11 +43,11 @@ class _OfEnsembles(Generic[_Given, _Found]):
 
     def __init__(self, method: Callable[Concatenate[Any, _Given], _Found]) -> None:
         self.method = method
-        functools.update_wrapper(self, method)
+        functools.update_wrapper(cast(Any, self), method)
 
     def __get__(self, integrator: Settings | None, owner: type | None = None) -> Callable[_Given, _Found]:
         if integrator is None:
-            return self.method
+            return self.method  # type: ignore[return-value]
         what = self.method.__name__[3:].lower()
         if self.method.__name__ != "setTemperature" or not integrator.thermostatted:
             integrator._given(what)

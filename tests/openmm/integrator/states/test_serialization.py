@@ -223,7 +223,7 @@ def test_step_sizes_pass_through_a_compound():
     compound.addIntegrator(member)
     started(system, compound, x, v)
     with pytest.raises(InputError, match="cannot follow a time step"):
-        compound.setStepSize(0.5)
+        compound.setStepSize(0.5 * unit.picosecond)
     compound.setStepSize(2 * unit.femtoseconds)
     assert member.getStepSize() == 2 * unit.femtoseconds
 
