@@ -8,7 +8,7 @@ from typing import Any, Self, TypeVar
 
 import openmm
 
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import Part
@@ -76,7 +76,10 @@ def as_projected(
     wanted = program_of(integrator)
     for scheme in _candidates(integrator, bool(parts)):
         making = (integrator.getStepSize(), scheme, parts, integrator.getConstraintTolerance(), check_every, ensemble)
-        made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
+        try:
+            made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
+        except UnsupportedError:  # no integrator of this ensemble and these parts has this scheme
+            continue
         if program_of(made) == wanted:
             apply_settings(made, settings_of(integrator) | {"settings": {}})  # the ensemble is the one that is given
             return made
