@@ -420,7 +420,10 @@ def test_checkpoints_of_other_programs_are_refused(kind):
     before = state_of(taker.context)
     verlet = STOCK["Verlet"]()
     verlet.run(3)
-    for checkpoint in (verlet.context.createCheckpoint(), KINDS["Langevin"]().context.createCheckpoint(), b"", b"x"):
+    own = taker.context.createCheckpoint()
+    damaged = [own[:-40] + b"{" + own[-39:], own[:-60] + own[-30:], own[-24:], own.replace(b'"seeds"', b'"sends"')]
+    others = [verlet.context.createCheckpoint(), KINDS["Langevin"]().context.createCheckpoint(), b"", b"x"]
+    for checkpoint in (*others, *damaged):
         with pytest.raises(InputError, match=r"another integrator.*Load a State"):
             taker.context.loadCheckpoint(checkpoint)
         np.testing.assert_array_equal(state_of(taker.context), before)
