@@ -210,13 +210,14 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
             if not begun:
                 self._ends.execute(_BEGIN)
             self._verlet.step(steps if begun else steps - 1)
-            with self._ends.ending() if last else nullcontext():
-                if last or not goes_on:
+            summed = last and guard.sums
+            with self._ends.ending() if summed else nullcontext():
+                if summed or not goes_on:
                     self._ends.execute(_LOOK if goes_on else _END)
         context.setTime(time + steps * self._dt)
         context.setStepCount(first + steps)
         if last:
-            guard.look(self._ends.getGlobalVariableByName("motion"))
+            guard.look()
 
     def refresh(self) -> None:
         """Compute the forces anew at the next step: to be called after `updateParametersInContext`."""

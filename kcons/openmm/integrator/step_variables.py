@@ -9,7 +9,7 @@ What begins and ends a step, and what may be left out of it, goes by a few numbe
 - `failed` is set by the part whose solve failed. Nothing moves then until Python has read it and set it back to 0; x
   and v go back to `x_last` and `v_last`, the forces are computed anew (`stale`), and `loose` says whether v had been
   complete.
-- `ending` is 1 in the last step of each call, which sums `motion` for `Guard.look`.
+- `ending` is 1 in the last step of each call on GPUs, which sums `motion` for `Guard.look`.
 - `phase` is other than 0 where virtual sites are placed at the end of an execution of the program only: each execution
   is then the part of a step from one force evaluation to the next, and counts on by itself.
 - `first_stage` and `end_stage` are other than 0 and the number of drifts only while constraints are applied outside of

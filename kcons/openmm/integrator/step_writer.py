@@ -62,7 +62,7 @@ class StepWriter:
             self._write_plain()
 
     def write_look(self) -> None:
-        """What `Guard.look` asks for at the end of a call."""
+        """What `Guard.look` asks for at the end of a call on some platforms."""
         p = self.program
         use(p, "ending", "motion")
         with p.when("ending != 0", "a call ends"):

@@ -89,7 +89,7 @@ class Calls(Integrator):
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """The program is executed for the last time in a call."""
+        """The program is executed for the last time in a call, and sums the kinetic energy."""
         self.program.write("ending", 1.0)
         try:
             yield
@@ -159,8 +159,9 @@ class Calls(Integrator):
             part.begin_run()
         try:
             phases = self._plan.phases if guard.in_parts else 1
-            self.program.run(context, steps - ends, phases)
-            if ends:
+            summed = ends and guard.sums
+            self.program.run(context, steps - summed, phases)
+            if summed:
                 with self.ending():
                     self.program.run(context, 1, phases)
         except openmm.OpenMMException as error:
@@ -183,4 +184,4 @@ class Calls(Integrator):
                 self.applyVelocityConstraints(context)
             raise failure
         if ends:
-            guard.look(self.getGlobalVariableByName("motion"))
+            guard.look()
