@@ -66,7 +66,7 @@ class StepWriter:
         p = self.program
         use(p, "ending", "motion")
         with p.when("ending != 0", "a call ends"):
-            p.sum("motion", "m*v*v", "twice the kinetic energy: is it finite?")
+            p.sum("motion", "v*v", "are velocities finite?")
 
     # -- the kinetic energy that is reported ----------------------------------------------------
 

@@ -4,8 +4,8 @@ MUTANTS = [
     # -- programs for OpenMM --
     (
         "openmm/integrator/guard.py",
-        "if twice_kinetic <= self._explosive:",
-        "if not twice_kinetic > 1e300:",
+        "if squares <= self._explosive:",
+        "if not squares > 1e300:",
         "tests/openmm/integrator/states/test_calls.py::test_an_explosion_is_told_where_its_call_ends",
     ),
     (

@@ -89,7 +89,7 @@ class Calls(Integrator):
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """The program is executed for the last time in a call, and sums the kinetic energy."""
+        """The program is executed for the last time in a call, and sums squares of velocities."""
         self.program.write("ending", 1.0)
         try:
             yield

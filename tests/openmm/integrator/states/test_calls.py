@@ -105,6 +105,7 @@ def test_tens_cost_what_one_call_costs(kind, made_by_openmm):
             made.integrator.step(95)
         else:
             simulated(made).step(95)
+        made_by_openmm.pop((3.0,), None)  # a look where a call ends, no step
         work.append(dict(made_by_openmm))
         ends.append(state_of(made.context))
         assert made.context.getStepCount() == 96
@@ -377,13 +378,17 @@ def springs(n=8):
     return system, x, v - v.mean(axis=0)
 
 
+@pytest.mark.parametrize("platform", ["Reference", *on_gpus("mixed")])
 @pytest.mark.parametrize("call", [1, 10, 25])
 @pytest.mark.parametrize("name", [name for name in LOOKING if name != "Isokinetic"])
-def test_an_explosion_is_told_where_its_call_ends(name, call):
+def test_an_explosion_is_told_where_its_call_ends(name, call, platform):
     """Without any check but the first: lengths do not become 1e62 nm without a word."""
+    if call != 10 and platform != "Reference":
+        pytest.skip("each Context compiles its program")
     system, x, v = springs()
     integrator = LOOKING[name](20 * unit.femtosecond)
-    context = started(system, integrator, x, v)
+    context = started(system, integrator, x, v, platform)
+    x, v = state_of(context)
     with pytest.raises(NonFiniteError, match="take a smaller time step") as caught:
         for _ in range(200):
             integrator.step(call)
