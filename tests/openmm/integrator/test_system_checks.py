@@ -226,7 +226,7 @@ BAROSTATS = {
 }
 
 
-@pytest.mark.parametrize(("one", "two"), itertools.combinations_with_replacement(BAROSTATS, 2))
+@pytest.mark.parametrize(("one", "two"), list(itertools.combinations_with_replacement(BAROSTATS, 2)))
 def test_two_barostats_are_refused(one, two):
     system, x = water_box(8)
     for name in (one, two):
