@@ -287,7 +287,7 @@ class Projected(OpenMMMethod):
         from kcons.openmm import ProjectedIntegrator
 
         md_engine = _openmm(test_system)
-        integrator = ProjectedIntegrator(setting * md_engine.time, self.scheme, tolerance=TIGHT)
+        integrator = ProjectedIntegrator(md_engine.step(setting), self.scheme, tolerance=TIGHT)
         context = md_engine.context(md_engine.system, integrator)
         return self._run(_EngineRun, test_system, context, integrator, setting)
 
@@ -314,7 +314,7 @@ class Compiled(OpenMMMethod):
         from kcons.openmm import RattleIntegrator
 
         md_engine = _openmm(test_system)
-        integrator = RattleIntegrator(setting * md_engine.time, tolerance=self.tolerance)
+        integrator = RattleIntegrator(md_engine.step(setting), tolerance=self.tolerance)
         context = md_engine.context(md_engine.system, integrator)
         # Each time somebody looks costs a force evaluation: only the end is looked at.
         return _EngineRun(test_system, context, integrator, setting, records=1)
@@ -341,7 +341,7 @@ class Held(Projected):
         part = hold(
             system, rows, test_system.positions * md_engine.length, take="all", keep_water=not only_water(test_system)
         )
-        integrator = ProjectedIntegrator(setting * md_engine.time, self.scheme, parts=[part], tolerance=TIGHT)
+        integrator = ProjectedIntegrator(md_engine.step(setting), self.scheme, parts=[part], tolerance=TIGHT)
         context = md_engine.context(system, integrator)
         run = self._run(_CarriedRun, test_system, context, integrator, setting)
         run.constraints.watch(part.motion, ENGINE_CALLS)
@@ -360,7 +360,7 @@ class OnSurfaces(Projected):
 
         md_engine, system = _openmm(test_system), _openmm(test_system).copy()
         integrator = SurfaceIntegrator(
-            setting * md_engine.time, self.scheme, surfaces=md_engine.surfaces, system=system, tolerance=TIGHT
+            md_engine.step(setting), self.scheme, surfaces=md_engine.surfaces, system=system, tolerance=TIGHT
         )
         return self._run(_EngineRun, test_system, md_engine.context(system, integrator), integrator, setting)
 
