@@ -251,7 +251,7 @@ class System:
         if not self.far >= 1:
             raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.force, self.potential = force, potential
-        self.velocity_dependent = velocity_dependent and force is not None
+        self.velocity_dependent = bool(velocity_dependent) and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses
         bad = ~(np.isfinite(self.masses) & (self.masses > 0))
@@ -419,11 +419,12 @@ class System:
         Raises
         ------
         InputError
-            Wrong shapes, complex numbers, masked arrays: a state may have been made by hand.
+            Wrong shapes, complex numbers, masked arrays, a time that is no number: a state may have been made by hand.
         """
         x, v, f = state.positions, state.velocities, state.forces
         if state is self.last:
             return x, v, f
+        finite_number(state.time, "time")
         x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
         return x, v, None if f is None or not state.has_forces_of(self) else as_array(f, self._shape, "forces")
 
