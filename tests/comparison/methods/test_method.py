@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numba.core import event
 
 from kcons.comparison import test_systems
 from kcons.comparison.methods import method as runs
@@ -79,14 +77,6 @@ def test_energies_are_read_without_being_counted(pendulum):
     assert potential.evaluations == 1
 
 
-def kernel():
-    pass
-
-
-kernel.__module__ = "kcons.solvers.chains"
-COMPILING = event.Event("numba:compile", event.EventStatus.START, {"dispatcher": SimpleNamespace(py_func=kernel)})
-
-
 def test_interrupted_when_the_time_is_up():
     begun = time.perf_counter()
     with pytest.raises(runs.OverBudgetError, match=r"not done after 0\.1 s"), runs.interrupted_after(0.1):
@@ -101,12 +91,12 @@ def test_a_kernel_that_is_being_compiled_is_waited_for():
     """Interrupted, it would begin again with the next step, and never be done."""
     done = []
     with pytest.raises(runs.OverBudgetError), runs.interrupted_after(0.1):
-        announcer.on_start(COMPILING)
+        announcer.begin()
         try:
             for _ in range(10):
                 time.sleep(0.03)
             done.append("compiled")
         finally:
-            announcer.on_end(COMPILING)
+            announcer.end()
         time.sleep(20)
     assert done == ["compiled"]
