@@ -219,6 +219,10 @@ class UnsupportedError(KconsError, NotImplementedError):
     """The MD engine or method cannot do this; the message says what to use instead."""
 
 
+class MissingSettingError(UnsupportedError, AttributeError):
+    """An object has no such setting; `hasattr` is False for what reads or changes it."""
+
+
 class MissingPackageError(KconsError, ModuleNotFoundError):
     """A package that is an extra is not installed."""
 

@@ -6,8 +6,8 @@
 
 Alanine dipeptide (amber14, no cutoff) with hydrogens of 3 dalton, each atom in a weak well, so that no momentum is
 conserved; Reference platform, 300 K. Energies of bonds and angles are configurational averages. The reported
-temperature is that of velocities at the ends of steps, the other that of velocities after the next half kick. Standard
-errors are from 20 blocks, those of the drift from independent runs.
+temperature is that of the kinetic energy of a State, the other that of the velocities of a State after the next half
+kick. Standard errors are from 20 blocks, those of the drift from independent runs.
 """
 
 from __future__ import annotations

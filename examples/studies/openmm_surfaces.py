@@ -137,7 +137,9 @@ def pendulum(scheme: str, steps: int, duration: float) -> np.ndarray:
     gravity = openmm.CustomExternalForce("z")
     gravity.addParticle(0)
     system.addForce(gravity)
-    integrator = SurfaceIntegrator(duration / steps, scheme, surfaces=Sphere(0, [0, 0, 0], 1.0), system=system)
+    integrator = SurfaceIntegrator(
+        duration / steps * unit.picosecond, scheme, surfaces=Sphere(0, [0, 0, 0], 1.0), system=system
+    )
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
     context.setPositions([[0.8, 0.0, -0.6]])
     context.setVelocities([[0.0, 0.9, 0.0]])

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Literal
 
-import numba
 import numpy as np
 from ase import Atoms, units
 from ase.md.md import MolecularDynamics
@@ -37,6 +36,7 @@ from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import finite_number, numbers
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
 from kcons.motion.certificate import checked_every
@@ -427,7 +427,7 @@ def _plain(values: Any) -> bool:
     return values.dtype is _FLOAT and values.flags.c_contiguous
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
     """Whether x == x0 and p == p0."""
     a, a0, b, b0 = x.ravel(), x0.ravel(), p.ravel(), p0.ravel()
@@ -437,7 +437,7 @@ def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
     return other == 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def write_back(positions, velocities, masses, divisors, x, p, momenta, v):  # type: ignore[no-untyped-def]
     """Put positions and momenta into `x` and `p`, the momenta also into `momenta`, and p/divisors into `v`."""
     a, b, m, d = positions.ravel(), velocities.ravel(), masses.ravel(), divisors.ravel()

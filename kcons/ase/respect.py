@@ -7,12 +7,12 @@ import warnings
 from collections.abc import Callable
 from weakref import WeakSet
 
-import numba
 import numpy as np
 from ase import Atoms
 from ase.cell import Cell
 
 from kcons.constraints.arguments import finite_array
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -267,7 +267,7 @@ def _differ(a: FloatArray, b: FloatArray, much: float) -> bool:
     return not bool((np.abs(a - b) <= much).all())
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def differ(a, b, much):  # type: ignore[no-untyped-def]
     """Whether numbers of contiguous arrays differ by more than `much`; NaN does."""
     p, q = a.ravel(), b.ravel()

@@ -579,7 +579,7 @@ def _free_in_openmm(system: TestSystem, dt: float) -> Run:
 def _projected(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
     from kcons.openmm import ProjectedIntegrator
 
-    integrator = ProjectedIntegrator(dt * _engine(system).time, scheme, tolerance=TIGHT)
+    integrator = ProjectedIntegrator(_engine(system).step(dt), scheme, tolerance=TIGHT)
     return _in_openmm(system, dt, integrator, force_evaluations=each)
 
 
@@ -591,7 +591,7 @@ def _held(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
     made, x = engine.copy(), system.positions * engine.length
     rows: Sequence[Any] = engine.surfaces
     part = hold(made, rows, x, take="all", keep_water=not only_water(system))
-    integrator = ProjectedIntegrator(dt * engine.time, scheme, parts=[part], tolerance=TIGHT)
+    integrator = ProjectedIntegrator(engine.step(dt), scheme, parts=[part], tolerance=TIGHT)
     return _in_openmm(system, dt, integrator, made, force_evaluations=each)
 
 
@@ -601,14 +601,14 @@ def _on_surfaces(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
     engine = _engine(system)
     made = engine.copy()
     options = {"surfaces": engine.surfaces, "system": made, "tolerance": TIGHT}
-    integrator = SurfaceIntegrator(dt * engine.time, scheme, **options)
+    integrator = SurfaceIntegrator(engine.step(dt), scheme, **options)
     return _in_openmm(system, dt, integrator, made, force_evaluations=each)
 
 
 def _compiled(tolerance: float, system: TestSystem, dt: float) -> Run:
     from kcons.openmm import RattleIntegrator
 
-    return _in_openmm(system, dt, RattleIntegrator(dt * _engine(system).time, tolerance=tolerance))
+    return _in_openmm(system, dt, RattleIntegrator(_engine(system).step(dt), tolerance=tolerance))
 
 
 def _bonds_in_openmm(system: TestSystem) -> str | None:

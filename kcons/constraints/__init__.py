@@ -81,8 +81,8 @@ def from_dict(data: Mapping[str, Any]) -> Constraint:
     """
     try:
         family = FAMILIES[data["family"]]
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, IndexError, ValueError):
         raise InputError(
-            f"no constraint family in {dict(data)!r:.80}; known are {', '.join(sorted(FAMILIES))}", item="family"
+            f"no constraint family in {data!r:.80}; known are {', '.join(sorted(FAMILIES))}", item="family"
         ) from None
     return family.restored(data)

@@ -132,6 +132,23 @@ def check_multipliers(multipliers: FloatArray, n_rows: int) -> None:
         raise InputError(f"multipliers must be a writable float64 array of shape ({n_rows},)", item="multipliers")
 
 
+def atom_array(atoms: Any, item: str) -> NDArray[Any]:
+    """Atoms as an array of any shape, a single one as an array of one.
+
+    Raises
+    ------
+    InputError
+        Rows of different length; what is no array.
+    """
+    try:
+        return np.atleast_1d(np.asarray(atoms))
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"{item}: rows name different numbers of atoms, {_shown(atoms)}; use one object for each number",
+            item="atoms",
+        ) from None
+
+
 def check_pairs(pairs: ArrayLike, n_atoms: int | None = None, item: str = "bonds") -> IntArray:
     """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet.
 
@@ -214,14 +231,29 @@ def finite_number(value: Any, item: str) -> float:
     InputError
         It has units, is no number, or is not finite.
     """
+    if isinstance(value, float) and math.isfinite(value):
+        return float(value)
     refuse_units(value, item)
-    try:
-        found = math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError):
-        found = math.nan
+    found = _float(value)
     if not math.isfinite(found):
-        raise InputError(f"{item} is {value!r}; give a finite number", item=item)
+        raise InputError(f"{item} is {_shown(value)}; give a finite number", item=item.rpartition(": ")[2])
     return found
+
+
+def _float(value: Any) -> float:
+    """`value` as a float; NaN for what is no number, or too large for one."""
+    try:
+        return math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # of objects that say they are arrays, the last
+        return math.nan
+
+
+def _shown(value: Any) -> str:
+    """A value in a message: of whole numbers of thousands of digits, which Python does not print, the kind."""
+    try:
+        return f"{value!r:.80}"
+    except ValueError:
+        return f"of the type {type(value).__name__}"
 
 
 def positive(value: float, item: str) -> float:
@@ -232,12 +264,9 @@ def positive(value: float, item: str) -> float:
     InputError
         Not a number above zero, or infinite.
     """
-    try:
-        number = math.nan if np.ndim(value) or isinstance(value, str | bytes | bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
+    number = math.nan if isinstance(value, str | bytes | bool) else _float(value)
     if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{item} is {value!r}; give a positive number", item=item.rpartition(": ")[2])
+        raise InputError(f"{item} is {_shown(value)}; give a positive number", item=item.rpartition(": ")[2])
     return number
 
 
@@ -256,7 +285,7 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
         good = False
     if not good or isinstance(value, bool):
         bounds = f", {least} or more" if most is None else f" from {least} to {most}"
-        raise InputError(f"{item} is {value!r}; give a whole number{bounds}", item=item)
+        raise InputError(f"{item} is {_shown(value)}; give a whole number{bounds}", item=item)
     return found
 
 

@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import atom_array, whole_number
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import dot, norm
@@ -71,16 +72,11 @@ class CenterOfMass(MassWeighted):
     directions: FloatArray
 
     def __init__(self, groups: ArrayLike, axes: Sequence[int] = (0, 1, 2), target: Target = None) -> None:
-        chosen = np.asarray(axes)
-        once = chosen.ndim == 1 and 0 < len(chosen) == len(set(chosen.tolist()))
-        if not once or chosen.dtype.kind not in "iu" or not set(chosen.tolist()) <= {0, 1, 2}:
+        chosen = atom_array(axes, "CenterOfMass: axes")
+        whole = np.iterable(axes) and chosen.ndim == 1 and chosen.dtype.kind in "iu"
+        if not (whole and 0 < len(chosen) == len(set(chosen.tolist())) and set(chosen.tolist()) <= {0, 1, 2}):
             raise InputError(f"CenterOfMass: axes must be some of 0, 1, 2, each once, not {axes!r:.60}", item="axes")
-        try:
-            table = np.atleast_2d(np.asarray(groups))
-        except ValueError:
-            raise InputError(
-                "CenterOfMass: groups have different sizes; use one object for each size", item="groups"
-            ) from None
+        table = np.atleast_2d(atom_array(groups, self.family))
         super().__init__(np.repeat(table, len(chosen), axis=0), target)
         self._keep(directions=np.tile(np.eye(3)[chosen], (self.n_rows // len(chosen), 1)))
 
@@ -132,7 +128,7 @@ class CenterDistance(MassWeighted):
 
     def __init__(self, group_a: ArrayLike, group_b: ArrayLike, target: Target = None) -> None:
         try:
-            a, b = np.atleast_2d(np.asarray(group_a)), np.atleast_2d(np.asarray(group_b))
+            a, b = (np.atleast_2d(atom_array(group, self.family)) for group in (group_a, group_b))
             table = np.hstack([a, b])
         except ValueError:
             raise InputError(
@@ -144,6 +140,7 @@ class CenterDistance(MassWeighted):
         self._settle()
 
     def _settle(self) -> None:
+        whole_number(self.split, "CenterDistance: split", 0)
         if self.n_rows and not 0 < self.split < self.width:
             raise InputError("CenterDistance: a group has no atoms", item="groups")
 

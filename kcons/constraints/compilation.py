@@ -5,8 +5,12 @@ processor has results of its own in the same folder, and several processes may u
 
 - Where the folder of kcons cannot be written to, Numba keeps results below the user's home; where that cannot be
   written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
+- The machine code of a kernel is the same in the process that compiles it and in those that load it (`_Library`), so
+  results are the same to the last bit.
+- What is kept has a digest. A damaged file counts as missing, and that is logged once.
 - A kernel is compiled anew when its own source has changed or that of any kernel it may call: Numba by itself looks at
   its own file only, and what was kept would call others as they were.
+- All of this holds for what `njit` and `cfunc` of this module make, which all kernels of kcons are.
 - Compiling that has taken a second is announced, once in a process, by the logger ``kcons`` (on standard error unless
   logging is set up otherwise).
 - Garbage is not collected while a kernel is compiled: almost nothing of what the compiler makes is garbage before it
@@ -20,14 +24,17 @@ import atexit
 import functools
 import gc
 import hashlib
+import inspect
 import logging
 import os
+import pickle
 import re
 import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+import uuid
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -38,8 +45,11 @@ from kcons.errors import UnsupportedError
 _collected = gc.isenabled()
 gc.disable()
 try:
+    import llvmlite.binding as llvm
     import numba
-    from numba.core import caching, event
+    from numba.core import caching, codegen, compiler
+    from numba.core.ccallback import CFunc
+    from numba.core.sigutils import normalize_signature
 finally:
     if _collected:
         gc.enable()
@@ -96,6 +106,7 @@ def plain_if_small(kernel: Any, size: int) -> Any:
 
 
 _PACKAGE = Path(__file__).parents[1]
+_HAS_KERNELS = re.compile(r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b", re.M)
 _IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 
 
@@ -103,7 +114,7 @@ _IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILIN
 def _kernels_in(path: Path) -> tuple[bytes, frozenset[Path]]:
     """The source of a module with kernels, and the files that it imports from; nothing for other modules."""
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    if not re.search("^(import|from) numba", text, re.MULTILINE):
+    if not _HAS_KERNELS.search(text):
         return b"", frozenset()
     files = set()
     for module, names in _IMPORTS.findall(text):  # a name is a module of that package, or defined in that module
@@ -127,22 +138,177 @@ def kernel_sources(path: Path) -> tuple[frozenset[Path], str]:
     return frozenset(found), digest.hexdigest()
 
 
-class _Locator:
-    """Numba keeps kernels of this package where it would, and they are fresh until one of their sources changes."""
+# -- what is kept on disk ---------------------------------------------------------------------------
 
-    @staticmethod
-    def from_function(function: Any, file: str) -> Any:
-        others = (kind.from_function(function, file) for kind in _locators if kind is not _Locator)
-        locator = next((one for one in others if one is not None), None)
-        if locator is not None and Path(file).is_relative_to(_PACKAGE):
-            sources, digest = kernel_sources(Path(file))
-            if len(sources) > 1:
-                locator.get_source_stamp = lambda: digest
-        return locator
+#: First bytes of what Numba itself writes: an earlier version of kcons left it.
+_PICKLE = b"\x80"
 
 
-_locators: list[Any] = caching.CacheImpl._locator_classes
-_locators.insert(0, _Locator)
+def keep(path: Path, content: bytes) -> None:
+    """Write a file at once, for other processes; its first line, a comment of Python, is the digest of the rest."""
+    unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    try:
+        unfinished.write_bytes(_headed(content))
+        os.replace(unfinished, path)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
+
+
+def kept(path: Path) -> bytes | None:
+    """What `keep` wrote to a file; None if there is no such file, or if it is damaged, which is logged."""
+    try:
+        text = path.read_bytes()
+    except OSError:
+        return None
+    content = text.partition(b"\n")[2]
+    if text == _headed(content):
+        return content
+    if not text.startswith(_PICKLE):
+        _say_once(f"compiled code in {path.parent} is damaged ({path.name}); it is made anew", path.parent)
+    return None
+
+
+def _headed(content: bytes) -> bytes:
+    return b"# " + hashlib.sha256(content).hexdigest().encode() + b"\n" + content
+
+
+_said: set[Path] = set()
+
+
+def _say_once(text: str, folder: Path) -> None:
+    if folder not in _said:
+        _said.add(folder)
+        logger.warning(text)
+
+
+class _Files(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """Numba's index and data of a kernel, written by `keep`; what is damaged, or of other sources, is not there."""
+
+    def __init__(self, folder: str, name: str, stamp: object) -> None:
+        super().__init__(folder, name, stamp)
+        self._made_of = hashlib.sha256(repr((numba.__version__, stamp)).encode()).digest()
+
+    def load(self, key: Any) -> Any:
+        found = super().load(key)
+        # Two processes that write an index at once may give a number twice.
+        return found[1] if found is not None and found[0] == key else None
+
+    def save(self, key: Any, data: Any) -> None:
+        super().save(key, (key, data))
+
+    def _load_index(self) -> Any:
+        content = kept(Path(self._index_path)) or b""
+        made_of, overloads = content[:32], content[32:]
+        return pickle.loads(overloads) if made_of == self._made_of else {}
+
+    def _save_index(self, overloads: Any) -> None:
+        keep(Path(self._index_path), self._made_of + self._dump(overloads))
+
+    def _load_data(self, name: str) -> Any:
+        content = kept(Path(self._data_path(name)))
+        return None if content is None else pickle.loads(content)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        keep(Path(self._data_path(name)), self._dump(data))
+
+
+class _KernelCache(caching.FunctionCache):  # type: ignore[misc]
+    """A kernel is kept where Numba would keep it, and is fresh until one of its sources changes."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        source, stamp = Path(inspect.getfile(function)), self._impl.locator.get_source_stamp()
+        if source.is_relative_to(_PACKAGE):
+            stamp = kernel_sources(source)[1]
+        self._cache_file = _Files(self._cache_path, self._impl.filename_base, stamp)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            folder = Path(self._cache_path)
+            _say_once(f"compiled code cannot be kept in {folder}, and is made anew by each process: {error}", folder)
+
+
+# -- kernels ----------------------------------------------------------------------------------------
+
+
+class _Library(codegen.JITCodeLibrary):  # type: ignore[misc]
+    """The machine code of a kernel, which has its own copies of all kernels that it calls.
+
+    Numba leaves these visible, so that a call goes to the copy that the process met first: the called kernel itself
+    where it was compiled here, and that of some caller where kernels were loaded. And it takes copies after machine
+    code was made of a kernel, which changes it, so that they differ from it. Results then differ in their last bits
+    between the process that compiles and those that load.
+    """
+
+    def _finalize_final_module(self) -> None:
+        module = self._final_module
+        # For callers, as they get it where this kernel was loaded.
+        self._shared_module = llvm.parse_bitcode(self._linkable().as_bitcode())
+        for function in module.functions:
+            if not function.is_declaration and function.linkage == llvm.Linkage.linkonce_odr:
+                function.linkage = llvm.Linkage.internal
+        super()._finalize_final_module()
+
+    def _linkable(self) -> Any:
+        module = self._final_module.clone()
+        for function in module.functions:
+            if not function.is_declaration and function.linkage == llvm.Linkage.external:
+                function.linkage = llvm.Linkage.linkonce_odr
+        return module
+
+
+class _Compiler(compiler.Compiler):  # type: ignore[misc]
+    """Makes a `_Library`, and is watched by the `Announcer`."""
+
+    def compile_extra(self, func: Any) -> Any:
+        self.state.library = _Library(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.library.enable_object_caching()
+        announcer.begin()
+        try:
+            return super().compile_extra(func)
+        finally:
+            announcer.end()
+
+
+def njit(function: Any = None, /, *, cache: bool = False, **options: Any) -> Any:
+    """`numba.njit` for kernels of kcons.
+
+    Its machine code is the same whether it was compiled or loaded, what is kept of it has a digest, and it is compiled
+    anew when any of its sources changes.
+
+    Parameters
+    ----------
+    function : callable, optional
+        Without it a decorator is returned.
+    cache : bool
+        Whether it is kept on disk.
+    **options
+        Of `numba.njit`.
+    """
+
+    def made(function: Any) -> Any:
+        kernel = numba.njit(pipeline_class=_Compiler, **options)(function)
+        if cache:
+            kernel._cache = _KernelCache(function)
+        return kernel
+
+    return made if function is None else made(function)
+
+
+def cfunc(signature: Any, *, cache: bool = False, **options: Any) -> Callable[[Any], Any]:
+    """`numba.cfunc` for kernels of kcons; see `njit`."""
+
+    def made(function: Any) -> Any:
+        kernel: Any = CFunc(function, normalize_signature(signature), {}, options, pipeline_class=_Compiler)
+        if cache:
+            kernel._cache = _KernelCache(function)
+        kernel.compile()
+        return kernel
+
+    return made
 
 
 def _nothing() -> None:
@@ -152,7 +318,7 @@ def _nothing() -> None:
 def keep_somewhere() -> str | None:
     """See that kernels can be kept; returns the folder that this process alone uses, if there is no other."""
     try:
-        numba.njit(cache=True)(_nothing)
+        njit(cache=True)(_nothing)
     except RuntimeError:  # no locator: neither folder can be written to
         folder = tempfile.mkdtemp(prefix="kcons-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -161,7 +327,7 @@ def keep_somewhere() -> str | None:
     return None
 
 
-class Announcer(event.Listener):  # type: ignore[misc]
+class Announcer:
     """Says that kernels of kcons are compiled, once it has taken `PATIENCE`; and no garbage is collected meanwhile.
 
     Attributes
@@ -186,12 +352,10 @@ class Announcer(event.Listener):  # type: ignore[misc]
         """Whether a kernel is being compiled."""
         return bool(self._depth)
 
-    def on_start(self, event: Any) -> None:
-        kernel = event.data["dispatcher"].py_func
+    def begin(self) -> None:
+        """A kernel begins to be compiled; it may be a part of another one."""
         with self._lock:
             thread = threading.get_ident()
-            if not self._depth and str(kernel.__module__).partition(".")[0] != "kcons":
-                return
             self._depth[thread] = self._depth.get(thread, 0) + 1
             if sum(self._depth.values()) > 1:
                 return
@@ -203,11 +367,10 @@ class Announcer(event.Listener):  # type: ignore[misc]
                 self._timer.daemon = True
                 self._timer.start()
 
-    def on_end(self, event: Any) -> None:
+    def end(self) -> None:
+        """It is compiled, or has failed."""
         with self._lock:
             thread = threading.get_ident()
-            if thread not in self._depth:
-                return
             self._depth[thread] -= 1
             if not self._depth[thread]:
                 del self._depth[thread]
@@ -243,4 +406,3 @@ def clock() -> float:
 
 
 announcer = Announcer(keep_somewhere())
-event.register("numba:compile", announcer)

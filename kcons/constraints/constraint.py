@@ -26,6 +26,7 @@ from kcons.constraints.arguments import (
     LENGTH,
     MD_UNITS,
     Kind,
+    atom_array,
     kept,
     numbers,
     out_of_range,
@@ -373,12 +374,7 @@ def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float |
 
 
 def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
-    try:
-        table = np.asarray(atoms)
-    except ValueError:
-        raise InputError(
-            f"{name}: rows name different numbers of atoms; use one object for each number", item="atoms"
-        ) from None
+    table = atom_array(atoms, name)
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import kept, numbers, refuse_other
+from kcons.constraints.arguments import finite_number, kept, numbers, refuse_other
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import find_images
@@ -97,6 +97,7 @@ class ConstraintSet(InCell):
                     "in; hold it in OpenMM (kcons.openmm), or give plain numbers in the units of the positions",
                     item="units",
                 )
+        time = finite_number(time, "time")
         x = contiguous(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
@@ -187,18 +188,22 @@ class ConstraintSet(InCell):
 
     def target(self, time: float = 0.0) -> FloatArray:
         """What each row is held at, shape (n_rows,)."""
+        time = finite_number(time, "time")
         return self._rows(lambda c: c.target_at(time))
 
     def measure(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Natural coordinates q(x), shape (n_rows,); 0 for velocity rows."""
+        time = finite_number(time, "time")
         return self._of_rows(x, lambda c, r: c.measure(r, time) if c.holonomic else np.zeros(c.n_rows))
 
     def value(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """sigma(x, t) = q(x, t) - target(t), shape (n_rows,); 0 for velocity rows (notes eq. 81)."""
+        time = finite_number(time, "time")
         return self._of_rows(x, lambda c, r: self._sigma(c, r, time))
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
+        time = finite_number(time, "time")
         x = self._positions(x)
         y = self.whole(x)
         data, columns, widths = [], [], []
@@ -215,6 +220,7 @@ class ConstraintSet(InCell):
 
     def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
+        time = finite_number(time, "time")
         x = self._positions(x)
         y = self.whole(x)
         return self._rows(lambda c: self._rate(c, self._gather(c, x, y) if c.moving else None, time))
@@ -229,6 +235,7 @@ class ConstraintSet(InCell):
 
     def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
+        time = finite_number(time, "time")
         velocities = self._positions(v, "velocities")
 
         def b_of(c: Constraint, r: FloatArray) -> FloatArray:
@@ -242,11 +249,13 @@ class ConstraintSet(InCell):
 
     def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
+        time = finite_number(time, "time")
         u = self._positions(v, "velocities")
         return self._of_rows(x, lambda c, r: c.curvature(r, u[c.atoms], time))
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
+        time = finite_number(time, "time")
         x = self._positions(x)
         y = self.whole(x)
         rounding = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
@@ -254,6 +263,8 @@ class ConstraintSet(InCell):
 
     def residuals(self, x: FloatArray, v: FloatArray | None = None, time: float = 0.0) -> Residuals:
         """sigma, and A v - c, with what counts as held, in one pass over the constraint objects."""
+        time = finite_number(time, "time")
+        x, v = self._positions(x), v if v is None else self._positions(v, "velocities")
         y = self.whole(x)
         sigma, reach, rates, speeds, sizes = [], [], [], [], []
         for c in self.constraints:

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import atom_array, numbers
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.target import FloatArray, Target
+from kcons.constraints.target import FloatArray, MovingTarget, Target
 from kcons.errors import InputError
 
 
@@ -122,8 +122,8 @@ class LinearRelation(LinearRows):
     family = "LinearRelation"
 
     def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
-        dependent = np.asarray(atoms).reshape(-1, 1)
-        base = np.atleast_2d(np.asarray(bases))
+        dependent = atom_array(atoms, self.family).reshape(-1, 1)
+        base = np.atleast_2d(atom_array(bases, self.family))
         try:
             base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
             w = np.broadcast_to(numbers(weights, "weights"), base.shape)
@@ -165,9 +165,10 @@ class FixedAtoms(LinearRows):
     row_width = 1
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
-        column = np.asarray(atoms).reshape(-1, 1)
-        if target is not None and not callable(target) and np.shape(target) == (3,):  # type: ignore[arg-type]
-            target = np.tile(numbers(target, "target"), len(column))
+        column = atom_array(atoms, self.family).reshape(-1, 1)
+        if not callable(target) and not isinstance(target, MovingTarget | None):
+            place = numbers(target, "target")
+            target = np.tile(place, len(column)) if place.shape == (3,) else place
         super().__init__(np.repeat(column, 3, axis=0), target)
         values, counts = np.unique(column, return_counts=True)
         if np.any(counts > 1):

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import kept, numbers, out_of_range
+from kcons.constraints.arguments import atom_array, kept, numbers, out_of_range
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import FloatArray, Target
@@ -31,7 +31,7 @@ class Surface(Constraint):
     singular_at: ClassVar[str]
 
     def __init__(self, atoms: ArrayLike, target: Target) -> None:
-        super().__init__(np.asarray(atoms).reshape(-1, 1), target)
+        super().__init__(atom_array(atoms, self.family).reshape(-1, 1), target)
 
     def _singular(self, r: FloatArray) -> FloatArray:
         """A length that vanishes where the gradient is undefined, shape (n_rows,)."""
@@ -262,7 +262,7 @@ class Ellipsoid(Constraint):
         rotation: ArrayLike | None = None,
         target: Target = 0.0,
     ) -> None:
-        super().__init__(np.asarray(atoms).reshape(-1, 1), target)
+        super().__init__(atom_array(atoms, self.family).reshape(-1, 1), target)
         axes = numbers(semi_axes, "semi_axes")
         if not np.all(axes > 0):
             raise InputError(f"Ellipsoid: semi-axes must be positive, not {axes}", item="semi_axes")
@@ -356,7 +356,7 @@ class Plane(LinearRows):
     ) -> None:
         if offset is not None and point is not None:
             raise InputError("Plane: give either offset or point, not both", item="point")
-        super().__init__(np.asarray(atoms).reshape(-1, 1), offset)
+        super().__init__(atom_array(atoms, self.family).reshape(-1, 1), offset)
         n = unit(normal, "normal")
         self._keep(coefficients=n if n.ndim == 1 else n[:, None])
         self._settle()
@@ -381,7 +381,7 @@ class Line(LinearRows):
     row_width = 1
 
     def __init__(self, atoms: ArrayLike, point: ArrayLike | None, direction: ArrayLike) -> None:
-        column = np.asarray(atoms).reshape(-1, 1)
+        column = atom_array(atoms, self.family).reshape(-1, 1)
         super().__init__(np.repeat(column, 2, axis=0), None)
         along = _for_each(unit(direction, "direction"), len(column), "direction")
         # Normal to the line and to the coordinate axis it is farthest from.

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, SPEED, TAKES_TIME, check_call, lent, numbers, positive
+from kcons.constraints.arguments import ANY, SPEED, TAKES_TIME, atom_array, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target, contradiction, exact_step, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
@@ -381,7 +381,7 @@ class CustomVelocity(VelocityRows):
 
 
 def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:
-    a, b = np.atleast_1d(np.asarray(first)), np.atleast_1d(np.asarray(second))
+    a, b = atom_array(first, family), atom_array(second, family)
     if a.shape != b.shape or a.ndim != 1:
         raise InputError(f"{family}: {a.shape} and {b.shape} atoms are given; give one pair a row", item="atoms")
     return np.stack([a, b], axis=1)

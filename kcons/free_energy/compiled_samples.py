@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba as nb
 import numpy as np
 
 from kcons.constraints import Angle, Dihedral, Distance, MovingTarget
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.in_cell import joined
@@ -127,23 +127,23 @@ def _table(held: ConstraintSet, atoms: IntArray) -> IntArray:
 # -- vectors ------------------------------------------------------------------------------------------------
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _mixed(p, a, q, b):  # type: ignore[no-untyped-def]
     """p a + q b."""
     return (p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2])
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _between(x, i, j, lattice, periodic):  # type: ignore[no-untyped-def]
     a, b, c = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
     if periodic:
@@ -151,7 +151,7 @@ def _between(x, i, j, lattice, periodic):  # type: ignore[no-untyped-def]
     return (a, b, c)
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _legs(x, row, lattice, periodic):  # type: ignore[no-untyped-def]
     """The differences of atoms that a row depends on: one, two or three."""
     first = _between(x, row[1], row[2], lattice, periodic)
@@ -165,10 +165,10 @@ def _legs(x, row, lattice, periodic):  # type: ignore[no-untyped-def]
 # -- rows ---------------------------------------------------------------------------------------------------
 
 
-_torsion = nb.njit(cache=True, error_model="numpy")(dihedral)
+_torsion = njit(cache=True, error_model="numpy")(dihedral)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _slopes(width, F, G, H, out):  # type: ignore[no-untyped-def]
     """The value of a row; its gradient by each atom is put into `out`, shape (4, 3)."""
     if width == 2:
@@ -191,7 +191,7 @@ def _slopes(width, F, G, H, out):  # type: ignore[no-untyped-def]
     return q
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _curvature(width, F, G, H, dF, dG, dH):  # type: ignore[no-untyped-def]
     """The second derivative of a row along a motion at constant velocities, as in `kcons.constraints.internal`."""
     if width == 2:
@@ -225,7 +225,7 @@ def _curvature(width, F, G, H, dF, dG, dH):  # type: ignore[no-untyped-def]
 # -- matrices -----------------------------------------------------------------------------------------------
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _factor(a):  # type: ignore[no-untyped-def]
     """The root L of a = L L^T in its lower half; the smallest pivot by its diagonal element."""
     least = 1.0
@@ -243,7 +243,7 @@ def _factor(a):  # type: ignore[no-untyped-def]
     return least
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _solve(root, b):  # type: ignore[no-untyped-def]
     """The solution of L L^T y = b, in place."""
     n = len(b)
@@ -257,7 +257,7 @@ def _solve(root, b):  # type: ignore[no-untyped-def]
         b[i] /= root[i, i]
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _products(table, slopes, inverse_masses):  # type: ignore[no-untyped-def]
     """A M^-1 A^T of all rows."""
     n = len(table)
@@ -279,7 +279,7 @@ def _products(table, slopes, inverse_masses):  # type: ignore[no-untyped-def]
     return result
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _bent(table, legs, shares, u, lattice, factor, out):  # type: ignore[no-untyped-def]
     """Add a factor times u^T q'' u of the coordinates, on the surface of the other rows, to `out`, shape (d,)."""
     for row in range(len(table)):
@@ -290,7 +290,7 @@ def _bent(table, legs, shares, u, lattice, factor, out):  # type: ignore[no-unty
             out[i] += factor * shares[i, row] * there
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _on_the_others(product, shares, z):  # type: ignore[no-untyped-def]
     """How all rows answer each coordinate, shape (d, rows), and Z from A M^-1 A^T; False where rows depend."""
     d, rows = shares.shape
@@ -312,7 +312,7 @@ def _on_the_others(product, shares, z):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _changes_of_z(table, legs, shares, directions, lattice, out):  # type: ignore[no-untyped-def]
     """Half the derivative of ln det Z along each direction: sum_j d_j^T q_j'' d_s, polarised."""
     d, n = len(shares), directions.shape[1]
@@ -333,7 +333,7 @@ def _changes_of_z(table, legs, shares, directions, lattice, out):  # type: ignor
             out[j] += there[s]
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _mean_kinetic(table, legs, slopes, shares, product, inverse_masses, lattice, out):  # type: ignore[no-untyped-def]
     """Add the mean of -v^T q'' v over velocities with <v v^T> = M_par^+ of all rows; False where these depend.
 
@@ -365,7 +365,7 @@ def _mean_kinetic(table, legs, slopes, shares, product, inverse_masses, lattice,
     return True
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _sample(x, v, f, atoms, inverse_masses, table, numbers, lattice, periodic, out):  # type: ignore[no-untyped-def]
     d, n, rows = out.shape[1], len(atoms), len(table)
     near, speed = np.empty((n, 3)), np.empty((n, 3))

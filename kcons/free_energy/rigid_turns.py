@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
@@ -147,7 +147,7 @@ def _volume(rows: ConstraintSet, x: FloatArray) -> float:
     return float(np.linalg.slogdet(a @ a.T)[1])
 
 
-@nb.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _torque(x, f, axis, group, bonds, lengths):  # type: ignore[no-untyped-def]
     for b in range(len(bonds)):
         i, j = bonds[b, 0], bonds[b, 1]

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_out, check_pairs
+from kcons.constraints.arguments import as_array, check_out, check_pairs, finite_number, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.motion import failures
@@ -103,6 +103,7 @@ class Motion(Projector):
         UserWarning
             ``bonds=[]``, and the search has ended on the rows before it came to the nearest point.
         """
+        time = finite_number(time, "time")
         if out is not None:
             check_out(out, self._shape)
         self.cell()
@@ -173,6 +174,7 @@ class Motion(Projector):
         self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """`acceleration` and `multipliers` of one solve."""
+        time = finite_number(time, "time")
         mu = np.zeros(self._local.n_rows)
         a, local_a, local_x, force = self._accelerated(x, v, f, time, feedback, mu)
         lam = self.plan.least_norm(local_x, -mu, time)
@@ -181,8 +183,8 @@ class Motion(Projector):
             lam[self.plan.pinned_rows] = 0.0
             others = np.asarray(self._local.jacobian(local_x, time).T @ lam).reshape(-1, 3)
             pinned = self.plan.pinned
-            numbers = pinned if self._atoms is None else self._atoms[pinned]
-            reaction = self.masses[numbers, None] * local_a[pinned] - force[numbers] - others[pinned]
+            atoms = pinned if self._atoms is None else self._atoms[pinned]
+            reaction = self.masses[atoms, None] * local_a[pinned] - force[atoms] - others[pinned]
             lam[self.plan.pinned_rows] = reaction.ravel()
         return a, lam
 
@@ -196,6 +198,7 @@ class Motion(Projector):
         mu: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Accelerations, those of local atoms, local positions, forces; `mu` receives the solvers' multipliers."""
+        time = finite_number(time, "time")
         here = as_array(x, self._shape, "positions")
         speed = as_array(v, self._shape, "velocities")
         force = as_array(f, self._shape, "forces")
@@ -207,7 +210,7 @@ class Motion(Projector):
         with np.errstate(all="ignore"):
             b = self._local.acceleration_target(local_x, local_v, time)
             if feedback is not None:
-                b = b + feedback
+                b = b + numbers(feedback, "feedback")
         if not np.all(np.isfinite(b)):
             arrays = {"velocity": local_v, "position": local_x}
             raise failures.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))
@@ -220,6 +223,7 @@ class Motion(Projector):
         self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None
     ) -> FloatArray:
         """f + z with b = 0: what is left of the force on the surface, for optimisers, shape (n_atoms, 3)."""
+        time = finite_number(time, "time")
         force = as_array(f, self._shape, "forces")
         here = as_array(x, self._shape, "positions")
         if out is not None:
@@ -258,6 +262,7 @@ class Motion(Projector):
         ------
         CertificateError
         """
+        time = finite_number(time, "time")
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
         self.cell()
@@ -270,6 +275,7 @@ class Motion(Projector):
 
         ``condition=False`` leaves out the condition numbers, which take longer than all else in the report.
         """
+        time = finite_number(time, "time")
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
         self.cell()

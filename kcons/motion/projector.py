@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_multipliers, check_out, refuse_other
+from kcons.constraints.arguments import as_array, check_multipliers, check_out, finite_number, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -34,6 +34,7 @@ class Projector:
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         refuse_other(constraint_set, ConstraintSet, "constraint_set", "a kcons.ConstraintSet")
+        time = finite_number(time, "time")
         self._shape = (constraint_set.n_atoms, 3)
         x = as_array(positions, self._shape, "positions")
         self._given = constraint_set
@@ -201,12 +202,14 @@ class Projector:
         inv_dt = 0.0
         if velocities is not None:
             check_out(velocities, self._shape, "velocities")
-            if not dt or not isfinite(dt):
+            if not finite_number(dt, "dt"):
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
-            inv_dt = 1.0 / dt
+            inv_dt = 1.0 / float(dt)  # type: ignore[arg-type]
         if multipliers is not None:
             check_multipliers(multipliers, self.constraint_set.n_rows)
-        reference_time = time if reference_time is None else reference_time
+        if type(time) is not float or not isfinite(time):
+            time = finite_number(time, "time")
+        reference_time = time if reference_time is None else finite_number(reference_time, "reference_time")
         self.cell()
         atoms = self._atoms
         if atoms is None:
@@ -248,6 +251,8 @@ class Projector:
         ConvergenceError, InputError
             As `project_positions`; nothing was changed.
         """
+        if type(time) is not float or not isfinite(time):
+            time = finite_number(time, "time")
         y = as_array(v, self._shape, "velocities")
         here = as_array(x, self._shape, "positions")
         if out is not None:

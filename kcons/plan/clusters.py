@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.compilation import plain_if_small
+from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -77,7 +76,7 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows:
     return labels
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _joined(begins, atoms, n_atoms):  # type: ignore[no-untyped-def]
     """Number of the cluster of each row, by its first row (union-find with path halving)."""
     n = len(begins) - 1
@@ -256,7 +255,7 @@ def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shap
     return Shape("chain", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _walk(pairs, n_atoms, clusters):  # type: ignore[no-untyped-def]
     n = len(pairs)
     bonds = np.full((n_atoms, 2), -1, np.int64)

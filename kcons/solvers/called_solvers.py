@@ -18,13 +18,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
-import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
@@ -166,7 +166,7 @@ def _borrowed(typingctx, address, size):  # type: ignore[no-untyped-def]
     return _NUMBERS(types.int64, types.int64), codegen
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def solve_positions(words, x, x_ref, v, inv_dt, none, lattice, periodic):  # type: ignore[no-untyped-def]
     """Bring `x` onto the constraints of all, and change `v` by that times `inv_dt`, if all arrive.
 
@@ -189,7 +189,7 @@ def solve_positions(words, x, x_ref, v, inv_dt, none, lattice, periodic):  # typ
     return most
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def solve_tangents(words, y, x, none, lattice, periodic):  # type: ignore[no-untyped-def]
     """Make `y` tangent at `x` for all; whether they arrived, with everything as it was if not."""
     alone = words.size == WORDS
@@ -203,7 +203,7 @@ def solve_tangents(words, y, x, none, lattice, periodic):  # type: ignore[no-unt
     return True
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def add(words, x, factor):  # type: ignore[no-untyped-def]
     """Add `factor` times the solutions to `x`."""
     for k in range(0, words.size, WORDS):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Literal
 
-import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
@@ -111,7 +111,7 @@ def lengths_resolved(x: FloatArray, pairs: NDArray[np.uint32], lengths: FloatArr
     return bool(resolved(x, pairs, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None))
 
 
-@nb.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def resolved(x, pairs, lengths, lattice, periodic):  # type: ignore[no-untyped-def]
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]

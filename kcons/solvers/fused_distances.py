@@ -13,11 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers import called_solvers
@@ -128,7 +128,7 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
     header[header[2 * _KIND]] = kind
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _place_others(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     failed, _, iterations, _ = distances.solve_positions(
@@ -140,7 +140,7 @@ def _place_others(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     return -1 if failed else iterations
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _move_others(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     """What `_place_others` has found, and -1 if the lengths are not yet what the positions resolve."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -149,7 +149,7 @@ def _move_others(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     return 0 if resolved(x, piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS), lattice, periodic) else -1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _place_triangles(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     landed, _, iterations, _ = project_triangles(
@@ -159,7 +159,7 @@ def _place_triangles(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     return iterations if landed else -1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _restore_triangles(points, at, kept, tables):  # type: ignore[no-untyped-def]
     """Points of triangles as they were before these were solved, from number `at` of the `kept` points of each."""
     h, u = integers(tables), halves(tables)
@@ -167,7 +167,7 @@ def _restore_triangles(points, at, kept, tables):  # type: ignore[no-untyped-def
     restore_points(points, piece(u, h, _CORNERS), piece(tables, h, _UNDO), groups, 3, kept, at)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _place_chains(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     """As `Chains.positions` does it."""
     t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
@@ -193,7 +193,7 @@ def _place_chains(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     return most
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _turn_others(x, v, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     failed, _, _, _ = distances.solve_tangents(
@@ -205,14 +205,14 @@ def _turn_others(x, v, tables):  # type: ignore[no-untyped-def]
     return not failed
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _slow_others(x, v, tables):  # type: ignore[no-untyped-def]
     """What `_turn_others` has found."""
     distances.apply(v, piece(halves(tables), integers(tables), _ATOMS), piece(tables, integers(tables), _MOVES))
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _turn_triangles(x, v, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     converged, _, _, _ = project_triangles(
@@ -222,7 +222,7 @@ def _turn_triangles(x, v, tables):  # type: ignore[no-untyped-def]
     return converged
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _turn_chains(x, v, tables):  # type: ignore[no-untyped-def]
     t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
     none = none_of(t)
@@ -241,7 +241,7 @@ _POSITION_PARTS = _place_others, _place_triangles, _place_chains, _move_others
 _TANGENT_PARTS = _turn_others, _turn_triangles, _turn_chains, _slow_others
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
@@ -287,7 +287,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     return most
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
     t, h, u = tables, integers(tables), halves(tables)

@@ -9,9 +9,9 @@ shape, spanned by ``s01`` and ``s02``. Two bond vectors describe the triangle
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.solvers.distance_clusters import EightAtATime
 from kcons.solvers.kernels.array_views import at_first
 from kcons.solvers.kernels.eight_wide import (

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -87,7 +87,7 @@ class SingleRows(CalledSolver):
         return int(np.count_nonzero(np.add.reduceat(np.abs(self._pushes), 3 * self._links[:-3:3].astype(np.int64))))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type: ignore[no-untyped-def]
     """Positions of a row's atoms from `room[at]` on, as its function gets them."""
     a, b, c = 0.0, 0.0, 0.0
@@ -108,7 +108,7 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
         at += 3
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-def]
     """Positions of rows of one atom each, as `rows_at_once` takes them."""
     for i in range(stop - begin):
@@ -118,7 +118,7 @@ def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-d
         put(numbers, ROOM + 2 * BLOCK + i, number(x, g + 2))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignore[no-untyped-def]
     """The same of where the multipliers have moved them."""
     for i in range(stop - begin):
@@ -128,7 +128,7 @@ def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignor
         put(numbers, ROOM + 2 * BLOCK + i, number(base, 3 * i + 2) + lam * number(pushes, p + 2))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
     """Whether a gradient has less than `FLAT` of that at the reference along it; `slope` is their product."""
     size = 0.0
@@ -139,7 +139,7 @@ def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
     return slope < FLAT * size
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -153,7 +153,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
                 put(x, g + i, number(x, g + i) + change * number(pushes, 3 * p + i))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
     careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers
 ):
@@ -254,7 +254,7 @@ def _positions(  # type: ignore[no-untyped-def]
     return True, worst, most, worst_row
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)

@@ -9,9 +9,9 @@ import functools
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.solvers.distance_clusters import EightAtATime
 from kcons.solvers.kernels import groups_of_eight as groups
 from kcons.solvers.kernels.array_views import at_first

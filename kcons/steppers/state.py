@@ -254,7 +254,7 @@ class System:
         if not self.far >= 1:
             raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.force, self.potential = force, potential
-        self.velocity_dependent = velocity_dependent and force is not None
+        self.velocity_dependent = bool(velocity_dependent) and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses
         bad = ~(np.isfinite(self.masses) & (self.masses > 0))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
@@ -244,7 +244,7 @@ class NoseHooverChain(Listed):
         return system.total_energy(state) + chain
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _advance(chain, q, twice, kt, time, fractions):  # type: ignore[no-untyped-def]
     """Move the chain on, in place; returns the factor of the velocities."""
     n, scale = len(q), 1.0
@@ -262,7 +262,7 @@ def _advance(chain, q, twice, kt, time, fractions):  # type: ignore[no-untyped-d
     return scale
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _pushed(k, speed, q, excess, kt, h):  # type: ignore[no-untyped-def]
     damp = math.exp(-0.25 * h * speed[k + 1]) if k + 1 < len(q) else 1.0
     driving = excess if k == 0 else q[k - 1] * speed[k - 1] ** 2 - kt

@@ -49,7 +49,7 @@ def test_commands_into_a_pipe_that_nobody_reads(words, buffered):
 def test_a_comparison_is_written_though_nobody_reads_it(tmp_path):
     out = tmp_path / "out"
     status, _, _ = said(f"compare chain --size 3 --methods rattle --dt 10 --out {out}", "| true", **C_LOCALE)
-    assert status == 0 and (out / "compare.json").stat().st_size > 100 and (out / "compare.txt").is_file()
+    assert status == 0 and (out / "compare.csv").stat().st_size > 100 and (out / "compare.txt").is_file()
 
 
 def test_characters_are_replaced_by_their_like(tmp_path, monkeypatch):

@@ -8,17 +8,21 @@ import numpy as np
 import pytest
 
 from kcons.constraints import (
+    CenterDistance,
+    CenterOfMass,
     Custom,
     CustomVelocity,
     Distance,
     Ellipsoid,
     FixedAtoms,
     ImplicitSurface,
+    Line,
     LinearRelation,
     LinearVelocity,
     MovingTarget,
     Plane,
     Sphere,
+    from_dict,
 )
 from kcons.constraints.arguments import (
     as_array,
@@ -308,18 +312,93 @@ def test_whole_numbers(value):
     assert [whole_number(good, "steps") for good in (3, 3.0, np.int32(3))] == [3, 3, 3]
 
 
-@pytest.mark.parametrize("value", [None, "x", "0.5", np.nan, [1.0], 1j])
+class NoArray:
+    """Says that it is an array, and is none."""
+
+    def __array__(self, *_, **__):
+        raise RuntimeError("not here")
+
+
+@pytest.mark.parametrize(
+    "value", [None, "x", "0.5", b"1", np.nan, [1.0], {}, 1j, 10**400, pytest.param(10**5000, id="long"), NoArray()]
+)
 def test_finite_numbers(value):
     with pytest.raises(InputError, match="keep is"):
         finite_number(value, "keep")
     assert finite_number(np.float32(0.5), "keep") == 0.5
 
 
-@pytest.mark.parametrize("value", [None, "x", 0, -1.0, np.nan, np.inf, [1.0, 2.0]])
+@pytest.mark.parametrize(
+    "value", [None, "x", 0, -1.0, np.nan, np.inf, [1.0, 2.0], pytest.param(10**5000, id="long"), NoArray()]
+)
 def test_positive_numbers(value):
     with pytest.raises(InputError, match=r"Custom: length is .*; give a positive number") as caught:
         positive(value, "Custom: length")
     assert caught.value.item == "length"
+
+
+#: Methods that take a time, and how many arrays before it.
+OF_A_SET = {"target": 0, "measure": 1, "value": 1, "jacobian": 1, "velocity_target": 1, "acceleration_target": 2}
+OF_A_SET |= {"curvature": 2, "tolerance": 1, "residuals": 1}
+OF_A_MOTION = {"project_positions": 2, "project_velocities": 2, "restore_positions": 1, "acceleration": 3}
+OF_A_MOTION |= {"multipliers": 3, "constraint_force": 3, "project_forces": 2, "certify": 1, "report": 1}
+#: Calls that take a time, or other numbers of everyday use, and what these are called.
+NUMBERS = {
+    "time of a set": (lambda m, bad: ConstraintSet(Distance([[0, 1]]), X, MASSES, time=bad), "time"),
+    "time of a motion": (lambda m, bad: Motion(m.constraint_set, X, time=bad), "time"),
+    "time of a state": (lambda m, bad: run(System(m), State(X, 0 * X, bad), 0.01, 1), "time"),
+    **{
+        f"time of {name}": (lambda m, bad, name=name, n=n: getattr(m.constraint_set, name)(*[X] * n, time=bad), "time")
+        for name, n in OF_A_SET.items()
+    },
+    **{
+        f"time of {name}": (lambda m, bad, name=name, n=n: getattr(m, name)(*[X] * n, time=bad), "time")
+        for name, n in OF_A_MOTION.items()
+    },
+    "reference_time": (lambda m, bad: m.project_positions(X, X, reference_time=bad), "reference_time"),
+    "dt of velocities": (lambda m, bad: m.project_positions(X, X, velocities=0 * X, dt=bad), "dt"),
+    "dt of a run": (lambda m, bad: run(System(m, lambda x, t: 0 * x), State(X, 0 * X), bad, 1), "dt"),
+    "time_step of Custom": (lambda m, bad: Custom([0], lambda r: 1.0, time_step=bad), "time_step"),
+    "period of Custom": (lambda m, bad: Custom([0], lambda r: 1.0, period=bad), "period"),
+}
+
+
+@pytest.mark.parametrize("bad", [[1.0], {}, 1j, 10**400, b"1", "1", np.nan, NoArray()], ids=lambda bad: f"{bad!r:.6}")
+@pytest.mark.parametrize("call", NUMBERS)
+def test_times_that_are_no_numbers_are_refused(call, bad, motion):
+    make, item = NUMBERS[call]
+    with pytest.raises(InputError) as caught:
+        make(motion, bad)
+    assert caught.value.item == item
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        FixedAtoms,
+        lambda bad: FixedAtoms([0, 1], bad),
+        lambda bad: Sphere(bad, [0, 0, 0], 1.0),
+        lambda bad: Ellipsoid(bad, [0, 0, 0], [1, 1, 1]),
+        lambda bad: Plane(bad, [0, 0, 1]),
+        lambda bad: Line(bad, None, [0, 0, 1]),
+        lambda bad: ImplicitSurface(bad, lambda r: r[:, 0]),
+        lambda bad: LinearRelation(bad, [1, 2], [0.5, 0.5]),
+        lambda bad: LinearRelation(0, bad, [0.5, 0.5]),
+        lambda bad: CenterOfMass([0, 1], bad),
+        lambda bad: CenterDistance(bad, [2, 3]),
+        Distance,
+    ],
+)
+@pytest.mark.parametrize("bad", [[[1], [2, 3]], {}], ids=["ragged", "dict"])
+def test_atoms_that_are_no_table_are_refused(make, bad):
+    with pytest.raises(InputError):
+        make(bad)
+
+
+@pytest.mark.parametrize("bad", [None, [1], 1j, {"family": ["Distance"]}, {"family": None}, "Distance"])
+def test_what_is_no_constraint_in_a_file_is_refused(bad):
+    with pytest.raises(InputError, match="no constraint family in"):
+        from_dict(bad)
 
 
 NONE = ConstraintSet([], X, MASSES)

@@ -92,7 +92,7 @@ def test_masses_are_needed():
         (lambda: CenterOfMass([0, 1], axes=0), "axes must be some of 0, 1, 2"),
         (lambda: CenterOfMass([0, 1], axes=(0.0, 1.0)), "axes must be some of 0, 1, 2"),
         (lambda: CenterOfMass([0, 1], axes=(0, 0)), "axes must be some of 0, 1, 2"),
-        (lambda: CenterOfMass([[0, 1], [2]]), "groups have different sizes"),
+        (lambda: CenterOfMass([[0, 1], [2]]), "different numbers of atoms"),
         (lambda: CenterDistance([0, 1], [1, 2]), "names an atom twice"),
         (lambda: CenterDistance([0, 1], np.zeros((1, 0), int)), "a group has no atoms"),
     ],

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import ast
+import errno
 import logging
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 import time
 from importlib import import_module
 from pathlib import Path
-from types import CodeType, ModuleType, SimpleNamespace
+from types import CodeType, ModuleType
 
 import numba
 import numpy as np
 import pytest
-from numba.core import event
 
 import kcons
 from kcons.constraints import compilation
-from kcons.constraints.compilation import MUCH, SMALL, Announcer, all_compiled, plain_if_small
+from kcons.constraints.compilation import MUCH, SMALL, Announcer, all_compiled, njit, plain_if_small
 
 #: Compiles one small kernel; says how many kernels came from the folder, and how many were compiled.
 ONE_KERNEL = """
@@ -79,6 +80,154 @@ def test_two_processes_at_once(tmp_path):
     both = [started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
     assert {ended(process)[0] for process in both} <= {"0 1", "1 0"}
     assert ended(started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)))[0] == "1 0"
+
+
+#: A few hundred steps with kernels of several kinds: a digest of the last bits of each.
+BITS = """
+import hashlib
+import numpy as np
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import Angle, Distance, Sphere
+from kcons.thermostats import Isokinetic, Langevin
+x = np.array([[0, 0, 0], [2.4, 0, 0], [1.25, 2.2, 0], [1.25, 0.7, 2.0]])
+masses = np.array([63.5, 40.0, 12.0, 1.0])
+force = lambda q, t: -0.3 * (q - x) * (1 + q * q)
+for rows, stepper in (
+    ([Distance([[0, 1]])], None),
+    ([Distance([[0, 1], [1, 2], [0, 2]])], None),
+    ([Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2]])], None),
+    ([Sphere([3], [0.5, 0.5, 0.5], None)], Langevin(0.1, 0.1, seed=1)),
+    ([Distance([[0, 1], [1, 2]])], Isokinetic()),
+):
+    motion = Motion(ConstraintSet(rows, x, masses), x)
+    state = State(x, motion.project_velocities(x, np.random.default_rng(0).normal(size=x.shape) * 0.05))
+    bits = hashlib.sha256()
+    for _ in range(200):
+        state = run(System(motion, force), state, 0.2, 2, **({"stepper": stepper} if stepper else {}))
+        bits.update(state.positions.tobytes())
+    print(bits.hexdigest()[:12])
+"""
+
+
+def test_the_run_that_compiles_gives_the_bits_of_those_that_load(tmp_path):
+    first, second = (ended(started(BITS, NUMBA_CACHE_DIR=str(tmp_path)))[0] for _ in range(2))
+    assert len(set(first.split())) == 5
+    assert first == second
+
+
+def test_a_kernel_calls_its_own_copies_of_others():
+    @njit
+    def called(y):  # too much to become a part of its caller
+        total = 0.0
+        for k in range(int(y)):
+            total += np.sin(k * y) + np.sin(2 * y) * np.cos(3 * k * y) + np.exp(-k * y) * np.log(1 + k) + np.tan(y + k)
+            total += np.sinh(y / (1 + k)) * np.cosh(y) + np.tanh(k * y) + np.arctan(k * y) + np.sqrt(1 + k * y)
+            total += np.sin(4 * k * y) + np.sin(5 * y) * np.cos(6 * k * y) + np.exp(-7 * k * y) + np.tan(y + 8 * k)
+        return total
+
+    @njit
+    def caller(y):
+        return called(y) + called(2 * y)
+
+    caller(3.0)
+    (made,) = caller.overloads.values()
+    copies = [f for f in made.library._final_module.functions if "called" in f.name and not f.is_declaration]
+    assert copies and {f.linkage.name for f in copies} == {"internal"}
+    shared = [f for f in made.library._get_module_for_linking().functions if "called" in f.name]
+    assert {f.linkage.name for f in shared} == {"linkonce_odr"}  # one for all that a further caller links
+
+
+def cut(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def empty(_: bytes) -> bytes:
+    return b""
+
+
+def one_bit(content: bytes) -> bytes:
+    return content[:-9] + bytes([content[-9] ^ 4]) + content[-8:]
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", [cut, empty, one_bit])
+def test_damaged_files_are_made_anew_and_said_once(tmp_path, damage, ending):
+    given = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    whole, _ = ended(started(MOVES, **given))  # two kernels of two modules
+    files = list(tmp_path.rglob(f"*.{ending}"))
+    for file in files:
+        file.write_bytes(damage(file.read_bytes()))
+    assert len(files) > 1
+    found, said = ended(started(MOVES, **given))
+    assert found == whole == "0.0 1"
+    folder = files[0].parent
+    assert said.count(f"compiled code in {folder} is damaged (") == 1, said
+    assert ended(started(MOVES, **given)) == ("0.0 0", "")
+
+
+def test_what_numba_itself_has_kept_is_not_taken_and_not_called_damaged(tmp_path):
+    given = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    ended(started(ONE_KERNEL, **given))
+    for file in tmp_path.rglob("*.nb[ic]"):
+        file.write_bytes(pickle.dumps(numba.__version__) + file.read_bytes())
+    found, said = ended(started(ONE_KERNEL, **given))
+    assert found == "0 1" and "damaged" not in said
+
+
+def test_a_number_given_twice_by_two_processes_gives_nobody_the_kernel_of_the_other(tmp_path):
+    files = compilation._Files(str(tmp_path), "kernel", "source")
+    files.save("one kind of arguments", "its code")
+    files._save_index({"another kind": files._load_index()["one kind of arguments"]})
+    assert files.load("another kind") is None
+    files.save("another kind", "other code")
+    assert files.load("another kind") == "other code"
+
+
+def test_a_folder_that_is_full_costs_the_cache_and_not_the_run(tmp_path, monkeypatch, caplog):
+    @njit(cache=True)
+    def thrice(n):
+        return 3 * n
+
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(compilation, "keep", full)
+    monkeypatch.setattr(compilation, "_said", set())
+    with caplog.at_level(logging.WARNING, "kcons"):
+        assert thrice(2) == 6 and thrice(2.0) == 6.0
+    assert len(caplog.messages) == 1 and "No space left" in caplog.messages[0]
+
+
+AGAIN = """
+import importlib, sys
+import kcons.constraints.compilation as compilation
+{again}
+import numpy as np
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import Distance, Formula
+from kcons.errors import ConvergenceError, KconsError
+x = np.eye(2, 3)
+for row in (Distance([[0, 1]]), Formula("(x1 - x2)**2 + (y1 - y2)**2 - 2", [0, 1])):
+    motion = Motion(ConstraintSet(row, x, [1.0, 1.0]), x)
+    after = run(System(motion, lambda q, t: -q), State(x, motion.project_velocities(x, x[::-1])), 0.1, 3)
+    print(abs(row.measure(after.positions[None], 0.0) - row.measure(x[None], 0.0)).max() < 1e-12)
+import kcons.ase, kcons.openmm
+"""
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        "importlib.reload(compilation)",
+        "import kcons.openmm, kcons.ase, kcons.thermostats\n"
+        "for name in [n for n in sys.modules if n.partition('.')[0] == 'kcons']: del sys.modules[name]",
+    ],
+    ids=["reload", "purge"],
+)
+def test_a_second_import_in_one_process(tmp_path, again):
+    out, err = ended(started(AGAIN.format(again=again), NUMBA_CACHE_DIR=str(tmp_path)))
+    assert out.split() == ["True", "True"]
+    assert err.count("kcons compiles the kernels") <= 1
 
 
 def test_processors_that_share_a_folder(tmp_path):
@@ -205,62 +354,51 @@ def test_the_import_leaves_the_collector_of_garbage_as_it_was(before):
 # -- the announcement -------------------------------------------------------------------------------
 
 
-def compiling(name: str):
-    def kernel():
-        pass
-
-    kernel.__module__ = name
-    return event.Event("numba:compile", event.EventStatus.START, {"dispatcher": SimpleNamespace(py_func=kernel)})
-
-
 def test_announced_after_a_second_in_all(monkeypatch, caplog):
     monkeypatch.setattr(compilation, "PATIENCE", 0.5)
     announcer = Announcer()
     counted = 0.0
 
-    def compiled(*kernels, until):
+    def compiled(kernels, until):
         begun = time.perf_counter()
-        for kernel in kernels:
-            announcer.on_start(kernel)
+        for _ in range(kernels):
+            announcer.begin()
         while not until():
             time.sleep(0.01)
-        for kernel in reversed(kernels):
-            announcer.on_end(kernel)
+        for _ in range(kernels):
+            announcer.end()
         return time.perf_counter() - begun
 
     def passed(seconds):
         end = time.perf_counter() + seconds
         return lambda: time.perf_counter() > end
 
-    kernel, other = compiling("kcons.solvers.chains"), compiling("numpy.linalg")
     with caplog.at_level(logging.WARNING, "kcons"):
-        compiled(other, until=passed(0.6))  # nobody's business
         assert announcer.seconds == 0.0 and not announcer.compiling
-        counted += compiled(kernel, until=lambda: True)
+        counted += compiled(1, until=lambda: True)
         time.sleep(0.6)  # between kernels no time is counted
         assert not caplog.messages
-        counted += compiled(kernel, other, until=lambda: caplog.messages)  # one is a part of the other
-        counted += compiled(kernel, until=passed(0.6))
+        counted += compiled(2, until=lambda: caplog.messages)  # one is a part of the other
+        counted += compiled(1, until=passed(0.6))
     assert announcer.seconds == pytest.approx(counted, abs=0.05)
     assert len(caplog.messages) == 1 and "once on a machine" in caplog.messages[0]
 
 
 def test_kernels_here_are_watched():
     before = compilation.announcer.seconds
-    kernel = numba.njit(lambda y: y + 1)
-    kernel.py_func.__module__ = "kcons.here"
-    assert kernel(np.float32(1)) == 2
+    assert numba.njit(lambda y: y + 2)(np.float32(1)) == 3  # nobody's business
+    assert compilation.announcer.seconds == before
+    assert njit(lambda y: y + 1)(np.float32(1)) == 2
     assert compilation.announcer.seconds > before
 
 
 def test_the_clock_stands_still_while_kernels_are_compiled():
-    kernel = compiling("kcons.solvers.chains")
     whole, timed = time.perf_counter(), compilation.clock()
     for pause in (0.3, 0.1):
         if pause == 0.3:
-            compilation.announcer.on_start(kernel)
+            compilation.announcer.begin()
         time.sleep(pause)
         if pause == 0.3:
-            compilation.announcer.on_end(kernel)
+            compilation.announcer.end()
     whole, timed = time.perf_counter() - whole, compilation.clock() - timed
     assert 0.1 <= timed < whole - 0.29

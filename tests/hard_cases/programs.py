@@ -301,14 +301,16 @@ class KconsInOpenMM(PlainOpenMM):
         self.ensemble = ensemble
 
     def build(self, problem: Problem, dt: float) -> tuple[Any, Any, Any]:
+        from openmm import unit
+
         from kcons.openmm import ProjectedIntegrator, hold
 
-        system = self.bare_system(problem.but(fixed=()) if len(problem.fixed) else problem)
+        system, step = self.bare_system(problem.but(fixed=()) if len(problem.fixed) else problem), dt * unit.picosecond
         rows = problem.rows()
         if not rows:
-            return system, ProjectedIntegrator(dt, ensemble=self.ensemble), None
+            return system, ProjectedIntegrator(step, ensemble=self.ensemble), None
         part = hold(system, rows, problem.x, take="all", keep_water=False)
-        return system, ProjectedIntegrator(dt, parts=[part], ensemble=self.ensemble), part
+        return system, ProjectedIntegrator(step, parts=[part], ensemble=self.ensemble), part
 
     def start(self, problem: Problem, context: Any, part: Any, dt: float, project: bool) -> None:
         context.setPositions(problem.x)

@@ -79,9 +79,8 @@ def on_surface(kind, scheme, dt, platform="Reference", *, atoms=(0, 1, 2), **arg
     """Integrator and context of the three particles, those of `atoms` on surfaces of one kind."""
     atoms = np.array(atoms)
     system = system_of()
-    integrator = SurfaceIntegrator(
-        dt, scheme, surfaces=KINDS[kind](atoms, POSITIONS[atoms]), system=system, positions=POSITIONS, **arguments
-    )
+    surfaces, step = KINDS[kind](atoms, POSITIONS[atoms]), dt * unit.picosecond
+    integrator = SurfaceIntegrator(step, scheme, surfaces=surfaces, system=system, positions=POSITIONS, **arguments)
     return integrator, started(system, integrator, POSITIONS, VELOCITIES, platform)
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -135,7 +135,7 @@ class LennardJones:
         return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _pair(r2, a, b, cutoff, end):  # type: ignore[no-untyped-def]
     """u, u'/r and u'' of two sites, switched off at `end`."""
     r = np.sqrt(r2)
@@ -160,7 +160,7 @@ def _pair(r2, a, b, cutoff, end):  # type: ignore[no-untyped-def]
     return u, d / r, dd
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _line(x, i, j, box, inverse):  # type: ignore[no-untyped-def]
     """From j to i, to the nearest image, and the square of its length."""
     dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
@@ -170,7 +170,7 @@ def _line(x, i, j, box, inverse):  # type: ignore[no-untyped-def]
     return dx, dy, dz, dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _push(f, i, j, fx, fy, fz):  # type: ignore[no-untyped-def]
     f[i, 0] -= fx
     f[i, 1] -= fy
@@ -180,7 +180,7 @@ def _push(f, i, j, fx, fy, fz):  # type: ignore[no-untyped-def]
     f[j, 2] += fz
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-def]
     total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
     n = x.shape[0]
@@ -196,7 +196,7 @@ def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-de
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-def]
     """Squares of forces, laplacian over shifts, squares of torques, laplacian over turns; summed over molecules.
 
@@ -245,7 +245,7 @@ def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-d
     return squares, shifts, torques, turns
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
     """Energy of atoms a..b at y with all others at x."""
     cutoff = reach[0]
@@ -264,7 +264,7 @@ def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _proposed(y, moves, rng):  # type: ignore[no-untyped-def]
     """A molecule at places y, turned about its centre and moved, in place; shape (n, 3)."""
     centre = np.zeros(3)
@@ -281,7 +281,7 @@ def _proposed(y, moves, rng):  # type: ignore[no-untyped-def]
 
 
 # That of near molecules is written out beside it: what takes a function as an argument is compiled by every process.
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _metropolis(x, first, sites, box, cutoff, kt, every, rng, moves, energies):  # type: ignore[no-untyped-def]
     molecules = len(first) - 1
     energy = 0.0

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.comparison.test_systems.lennard_jones import LennardJones, _pair, _proposed, _push
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -69,13 +69,13 @@ class NearMolecules:
         return energies, y, accepted / (every * len(energies) * (len(of.first) - 1))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _image(d, box, inverse):  # type: ignore[no-untyped-def]
     """What takes a difference to its nearest image."""
     return -box * np.rint(d * inverse)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _share(apart, begin, end):  # type: ignore[no-untyped-def]
     """How much a pair counts, and the slope of that over the distance."""
     if apart <= begin:
@@ -85,7 +85,7 @@ def _share(apart, begin, end):  # type: ignore[no-untyped-def]
     return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), -30.0 * t * t * (1.0 - t) * (1.0 - t) * w / apart
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _near(x, first, sites, box, cutoff, begin, end, f):  # type: ignore[no-untyped-def]
     total, inverse = 0.0, 1.0 / box
     for a in range(len(first) - 1):
@@ -113,7 +113,7 @@ def _near(x, first, sites, box, cutoff, begin, end, f):  # type: ignore[no-untyp
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _one_molecule(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
     """Energy of the molecule of atoms a..b at y with all others at x."""
     cutoff, begin, end = reach[0], reach[1], reach[2]
@@ -137,7 +137,7 @@ def _one_molecule(y, a, b, x, first, sites, box, reach):  # type: ignore[no-unty
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _near_metropolis(x, first, sites, box, reach, kt, every, rng, moves, energies):  # type: ignore[no-untyped-def]
     molecules = len(first) - 1
     energy = 0.0

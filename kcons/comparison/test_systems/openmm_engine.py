@@ -99,6 +99,12 @@ class OpenMMEngine:
         """One unit of velocity of the test system in nm/ps."""
         return self.length / self.time
 
+    def step(self, size: float) -> openmm.unit.Quantity:
+        """A time step of the test system as OpenMM takes it."""
+        from openmm import unit
+
+        return size * self.time * unit.picosecond
+
     def potential(self) -> Potential:
         """The forces of the System as the test system's own, on the same platform."""
         import openmm

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, TAKES_TIME, check_call, lent, numbers, positive
+from kcons.constraints.arguments import ANY, TAKES_TIME, atom_array, check_call, lent, numbers, positive
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
@@ -68,16 +68,15 @@ class FunctionRows(Constraint):
         check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
         check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
         check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
-        for name, size in (("length", length), ("time_step", time_step)):
-            if size is not None:
-                positive(size, f"{self.family}: {name}")
+        if length is not None:
+            positive(length, f"{self.family}: length")
         self.function = function
         self.gradient_function = gradient
         self.hessian_vector = hessian_vector
         self.time_derivatives = time_derivatives
         self.time_dependent = timed
         self.length = length
-        self.time_step = float(time_step)
+        self.time_step = positive(time_step, f"{self.family}: time_step")
 
     @property
     def moving(self) -> bool:
@@ -366,7 +365,7 @@ class ImplicitSurface(FunctionRows):
         length: float | None = None,
         time_step: float = 0.02,
     ) -> None:
-        column = np.asarray(atoms).reshape(-1, 1)
+        column = atom_array(atoms, self.family).reshape(-1, 1)
         super().__init__(
             column, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
         )

@@ -1,4 +1,7 @@
-"""Formulas as code: what is written is checked by its names, differentiated by SymPy, and kept in a file.
+"""Formulas as code: what is written is checked, differentiated by SymPy, and kept in a file.
+
+Formulas come from files of others, too. So names are those of a list, and length, depth, numbers, powers and the size
+of the second derivatives are bounded before SymPy sees anything: it would compute 9**9**9 to the last digit.
 
 The file is a module of functions on plain numbers, or on arrays of one number a row: value and gradient, and what
 accelerations need; of a formula that is linear in the velocities its coefficients, and what these need. It lies where
@@ -9,14 +12,14 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import importlib.util
 import math
 import os
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
+from itertools import count
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -24,7 +27,13 @@ from typing import Any
 import numba
 import numpy as np
 
+from kcons.constraints.compilation import keep, kept
 from kcons.errors import InputError, UnsupportedError
+
+#: Characters of a formula, levels of its tree (a sum of n terms has n), and parts of its second derivatives.
+MAX_LENGTH, MAX_DEPTH, MAX_PARTS = 10_000, 200, 20_000
+#: Largest number in a formula or made of its numbers, and largest power that is a number.
+MAX_NUMBER, MAX_POWER = 1e300, 1000
 
 #: Functions of formulas: name -> the one of NumPy; of the same name in SymPy, but for those below.
 FUNCTIONS: dict[str, Any] = {
@@ -32,9 +41,11 @@ FUNCTIONS: dict[str, Any] = {
     **{f"a{name[3:]}": getattr(np, name) for name in ("arcsin", "arccos", "arctan", "arctan2")},
     "abs": np.abs,
 }
+_NUMBER = f"has a number above {MAX_NUMBER:g}", "multiply it by a small number, or write it in other units"
+_POWER = f"has a power above {MAX_POWER}", "give a smaller one"
 _IN_SYMPY = {"abs": "Abs"}
-_COORDINATE = re.compile(r"[xyz]([1-9]\d*)")
-_SPEED = re.compile(r"v[xyz]([1-9]\d*)")
+_COORDINATE = re.compile(r"[xyz]([1-9][0-9]{0,5})")
+_SPEED = re.compile(r"v[xyz]([1-9][0-9]{0,5})")
 _OPERATIONS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
 
 
@@ -48,15 +59,22 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
     """
     if not isinstance(formula, str):
         raise InputError(f"Formula: formula must be text, not {formula!r:.60}", item="formula")
+    if len(formula) > MAX_LENGTH:
+        raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
     try:
         tree = ast.parse(formula.strip(), mode="eval").body
-    except SyntaxError as error:
+    except (SyntaxError, ValueError) as error:  # of bytes that are no text, a ValueError
         remedy = "; write what is held at zero, the left side less the right one" if "=" in formula else ""
-        raise InputError(f"Formula: {formula!r} cannot be read: {error.msg}{remedy}", item="formula") from None
-    found = set()
-    for node in ast.walk(tree):
+        what = error.msg if isinstance(error, SyntaxError) else error
+        raise InputError(f"Formula: {formula!r:.200} cannot be read: {what}{remedy}", item="formula") from None
+    except (RecursionError, MemoryError):
+        raise _too_large(formula, "is nested too deeply") from None
+    _check_depth(formula, tree)
+    found, called = set(), set()
+    for node in ast.walk(tree):  # what contains something comes before it
         match node:
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
+                called.add(node.func)
                 if name not in FUNCTIONS or len(args) != 1 + (name == "atan2"):
                     raise InputError(
                         f"Formula: {ast.unparse(node)} in {formula!r} is no function of formulas; these are "
@@ -73,6 +91,11 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                         "VelocityFormula",
                         item=name,
                     )
+                elif name in FUNCTIONS and node not in called:
+                    raise InputError(
+                        f"Formula: {name} in {formula!r} is a function; write what it is of, as in {name}(x1)",
+                        item=name,
+                    )
                 elif name not in (*FUNCTIONS, *parameters, "t", "pi"):
                     places = "x1, y1, z1, x2, ..." + (", vx1, vy1, ..." if speeds else "")
                     known = ", ".join([places, "t", "pi", *parameters])
@@ -81,7 +104,10 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                         f"parameters={{{name!r}: ...}}",
                         item=name,
                     )
-            case ast.Constant(value=int() | float()) | ast.UnaryOp(op=ast.USub() | ast.UAdd()):
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+                if not value <= MAX_NUMBER:
+                    raise _too_large(formula, *_NUMBER)
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
                 pass
             case ast.BinOp(op=operation) if type(operation) in _OPERATIONS:
                 pass
@@ -94,11 +120,92 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                     f"and functions{hint}",
                     item="formula",
                 )
+    _check_numbers(formula, tree)
+    if _parts(tree)[2] > MAX_PARTS:
+        raise _too_large(formula, f"has second derivatives of more than {MAX_PARTS} parts")
     return tree, found
 
 
+def _too_large(
+    formula: str,
+    what: str,
+    remedy: str = "shorten it, put parentheses around parts of a long sum, or use Custom, which takes a function",
+) -> InputError:
+    return InputError(f"Formula: {formula!r:.60} {what}; {remedy}", item="formula")
+
+
+def _check_depth(formula: str, tree: ast.expr) -> None:
+    level: list[ast.AST] = [tree]
+    for _ in range(MAX_DEPTH):
+        level = [child for node in level for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
+        if not level:
+            return
+    raise _too_large(formula, f"is nested in more than {MAX_DEPTH} levels")
+
+
+def _is_number(tree: ast.expr) -> bool:
+    return not any(isinstance(node, ast.Name) and node.id not in (*FUNCTIONS, "pi") for node in ast.walk(tree))
+
+
+def _check_numbers(formula: str, tree: ast.expr) -> None:
+    """Refuse parts without names whose value is no number in bounds, and powers of powers that are out of bounds."""
+    known = {**FUNCTIONS, "pi": np.float64(np.pi), "": np.float64}
+    left = [(tree, 1.0)]
+    while left:
+        node, power = left.pop()
+        if _is_number(node):
+            what = undefined_part(node, known)
+            if what is not None:
+                raise InputError(
+                    f"Formula: {what} in {formula!r:.200}; give numbers with a finite value", item="formula"
+                )
+            continue
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and _is_number(node.right):
+            power *= max(abs(evaluated(node.right, known)), 1.0)
+            if power > MAX_POWER:
+                raise _too_large(formula, *_POWER)
+        left.extend((child, power) for child in _operands(node))
+
+
+def _operands(tree: ast.expr) -> list[ast.expr]:
+    """The parts of a formula that an operation or a function is done with."""
+    match tree:
+        case ast.Call(args=args):
+            return args
+        case ast.BinOp(left=left, right=right):
+            return [left, right]
+        case ast.UnaryOp(operand=operand):
+            return [operand]
+    return []
+
+
+def _parts(tree: ast.expr) -> tuple[int, int, int]:
+    """About how many parts a formula, its first and its second derivative along a direction are written with."""
+    match tree:
+        case ast.Name(id=name):
+            return 1, int(name != "pi"), 0
+        case ast.UnaryOp(operand=operand):
+            return _parts(operand)
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+            a, b = _parts(left), _parts(right)
+            return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+        case ast.BinOp(left=left, right=right) | ast.Call(args=[left, right]):
+            a, b = _parts(left), _parts(right)
+            size = a[0] + b[0] + 1
+            first = bool(a[1]) * (a[1] + b[0] + 1) + bool(b[1]) * (a[0] + b[1] + 1)
+            both = 2 * (a[1] + b[1] + 1) if a[1] and b[1] else 0
+            return size, first, bool(a[2]) * (a[2] + b[0]) + bool(b[2]) * (a[0] + b[2]) + both + first
+        case ast.Call(args=[inner]):
+            size, first, second = _parts(inner)
+            return size + 1, bool(first) * (size + first + 1), bool(first) * (2 * (size + first) + second + 1)
+    return 1, 0, 0
+
+
 def evaluated(tree: ast.expr, names: dict[str, Any]) -> Any:
-    """The value of a tree, with numbers or symbols for names and functions; ``names[""]`` makes constants."""
+    """The value of a tree, with numbers or symbols for names and functions.
+
+    ``names[""]`` makes constants, and ``names["**"]``, if it is there, powers.
+    """
     match tree:
         case ast.Constant(value=value):
             return names[""](value)
@@ -120,25 +227,24 @@ def evaluated(tree: ast.expr, names: dict[str, Any]) -> Any:
                     return a * b
                 case ast.Div():
                     return a / b
-            return a**b
+            return names["**"](a, b) if "**" in names else a**b
     raise AssertionError(ast.dump(tree))
 
 
 def undefined_part(tree: ast.expr, names: dict[str, Any]) -> str | None:
     """The smallest part of a tree that has no finite value with these numbers, in words; None if all have one."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.expr) and not (isinstance(tree, ast.Call) and node is tree.func):
-            found = undefined_part(node, names)
-            if found:
-                return found
+    inside = _operands(tree)
+    for node in inside:
+        found = undefined_part(node, names)
+        if found:
+            return found
     with np.errstate(all="ignore"):
         value = evaluated(tree, names)
     if np.isfinite(value):
         return None
-    inside = [node for node in ast.iter_child_nodes(tree) if isinstance(node, ast.expr)]
     with np.errstate(all="ignore"):
         if isinstance(tree, ast.Call):
-            return f"{ast.unparse(tree)} is {value} where {ast.unparse(inside[1])} = {evaluated(inside[1], names):g}"
+            return f"{ast.unparse(tree)} is {value} where {ast.unparse(inside[0])} = {evaluated(inside[0], names):g}"
     return f"{ast.unparse(tree)} is {value}"
 
 
@@ -159,7 +265,7 @@ def width_of(formula: str, parameters: Sequence[str], speeds: bool = False) -> i
         )
     width = max(numbers)
     if len(numbers) < width:
-        left_out = min(set(range(1, width)) - numbers)
+        left_out = next(k for k in count(1) if k not in numbers)
         raise InputError(
             f"Formula: {formula!r} names atom {width} of a row and not atom {left_out}; number them from 1 on",
             item="formula",
@@ -221,22 +327,23 @@ _NUMPY: dict[str, Any] = {**FUNCTIONS, "copysign": np.copysign, "__builtins__": 
 
 
 def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> ModuleType:
-    """The module of a formula, from its file if there is one."""
-    meant = repr((ast.unparse(tree), width, parameters, speeds)).encode()
+    """The module of a formula, from its file if there is one that is whole."""
+    meant = repr((formula.strip(), width, parameters, speeds)).encode()
     key = hashlib.sha256(Path(__file__).read_bytes() + meant).hexdigest()[:24]  # other code writes other files
-    folder = _folder()
-    path = folder / f"formula_{key}.py"
-    if not path.exists():
-        text = _written(formula, tree, width, parameters, speeds)
-        handle, name = tempfile.mkstemp(dir=folder, suffix=".py")
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.replace(name, path)  # at once, for other processes
-    spec = importlib.util.spec_from_file_location(f"kcons_{path.stem}", path)
-    assert spec is not None and spec.loader is not None
+    path = _folder() / f"formula_{key}.py"
+    text = kept(path)
+    if text is None:
+        text = _written(formula, tree, width, parameters, speeds).encode()
+        try:
+            keep(path, text)
+        except OSError as error:
+            raise UnsupportedError(
+                f"the code of a formula cannot be written to {path.parent}: {error}; set NUMBA_CACHE_DIR to a folder "
+                "with space in it"
+            ) from error
     # Numba looks for what it has kept by the names of modules.
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
+    exec(compile(b"\n" + text, path, "exec"), module.__dict__)  # the digest is the first line
     return module
 
 
@@ -286,15 +393,18 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
         def _print_Pi(self, expr: Any) -> str:
             return repr(math.pi)
 
-    def constant(value: float) -> Any:
-        return sympy.Rational(value) if 2 * value == int(2 * value) else sympy.Float(value)
+        def _print_Integer(self, expr: Any) -> str:
+            return str(expr.p) if abs(expr.p) < 2**53 else repr(float(expr))
+
+        def _print_Rational(self, expr: Any) -> str:
+            return f"{self._print_Integer(sympy.Integer(expr.p))}/{self._print_Integer(sympy.Integer(expr.q))}"
 
     printer = Printer({"fully_qualified_modules": False})
     axes = [f"{axis}{atom}" for atom in range(1, width + 1) for axis in "xyz"]
     speeds = [f"v{name}" for name in axes]
     symbols = {name: sympy.Symbol(name, real=True) for name in (*axes, *speeds, *parameters, "t")}
     functions = {name: getattr(sympy, _IN_SYMPY.get(name, name)) for name in FUNCTIONS}
-    value = sympy.sympify(evaluated(tree, {**functions, **symbols, "pi": sympy.pi, "": constant}))
+    value = _bounded(formula, tree, {**functions, **symbols, "pi": sympy.pi})
     t = symbols["t"]
     steep = [value.diff(symbols[name]) for name in axes]
     slope = [value.diff(symbols[name]) for name in speeds] if linear else steep
@@ -306,7 +416,7 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
     second = [bend, value.diff(t), 2 * along.diff(t) + value.diff(t, 2)]
     if linear:
         moving = [symbols[name] for name in speeds]
-        rest = sympy.simplify(value.subs(dict.fromkeys(moving, 0)))
+        rest = 0 if _vanishes_at_rest(tree, width, parameters) else value.subs(dict.fromkeys(moving, 0))
         if rest != 0 or any(part.has(*moving) for part in slope):
             raise InputError(
                 f"VelocityFormula: {formula!r} is not a sum of velocities times functions of the positions and the time"
@@ -314,8 +424,7 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
                 item="formula",
             )
         second = [bend + along.diff(t)]
-    sums = [sum(steep[axis::3], sympy.S.Zero) for axis in range(3)]
-    invariant = width > 1 and all(each == 0 or sympy.expand(each) == 0 for each in sums)
+    invariant = width > 1 and _is_invariant(tree, width, parameters)
 
     def function(name: str, arguments: Sequence[str], results: Sequence[Any]) -> str:
         smooth = [part.replace(sympy.DiracDelta, lambda *_: sympy.S.Zero) for part in results]  # beside kinks of abs
@@ -345,3 +454,106 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
             "\n".join(row) + "\n",
         ]
     )
+
+
+def _bounded(formula: str, tree: ast.expr, names: dict[str, Any]) -> Any:
+    """A formula in SymPy, with exact numbers, which are put in when it is known how large they become."""
+    import sympy
+
+    exact: dict[Any, Any] = {}
+
+    def constant(value: float) -> Any:
+        symbol = sympy.Symbol(f"number {value!r}", positive=True)
+        exact[symbol] = sympy.Rational(value) if 2 * value == int(2 * value) else sympy.Float(value)
+        return symbol if value else sympy.S.Zero
+
+    value = sympy.sympify(evaluated(tree, {**names, "": constant}))
+    rough = {symbol: sympy.Float(float(number)) for symbol, number in exact.items()}
+    # exp(3*log(x)) is a power with numbers only, and a power of a power only without them.
+    for power in value.atoms(sympy.Pow) | value.xreplace(rough).atoms(sympy.Pow):
+        base, exponent = (part.xreplace(rough) if part.free_symbols <= exact.keys() else None for part in power.args)
+        if exponent is not None and abs(exponent.evalf()) > MAX_POWER:
+            raise _too_large(formula, *_POWER)
+        if base is not None and exponent is not None and abs((base**exponent).evalf()) > MAX_NUMBER:
+            raise _too_large(formula, *_NUMBER)
+    value = value.xreplace(exact)
+    if any(max(abs(number.p), number.q) > MAX_NUMBER for number in value.atoms(sympy.Rational)):
+        raise _too_large(formula, *_NUMBER)
+    return value
+
+
+# -- what is true everywhere ------------------------------------------------------------------------
+
+#: Digits that formulas are compared with, what they may differ by, and the largest logarithm of a value.
+_DIGITS, _SAME, _LARGEST = 100, 1e-60, 1e5
+
+
+class _Places:
+    """Values of a formula at random places, near and far, with many digits.
+
+    Two formulas that agree at all of them are the same. Multiplying out, which would show it too, has no bound. For
+    what is in ``abs`` both signs are tried, since a place where it changes may be anywhere.
+    """
+
+    def __init__(self, tree: ast.expr, width: int, parameters: Sequence[str]) -> None:
+        import mpmath
+
+        self._numbers = mpmath.MPContext()
+        self._numbers.dps = _DIGITS
+        self.axes = [f"{axis}{atom}" for atom in range(1, width + 1) for axis in "xyz"]
+        self.speeds = [f"v{name}" for name in self.axes]
+        self._tree, self._names = tree, [*self.axes, *self.speeds, *parameters, "t"]
+        self._functions = {name: getattr(self._numbers, name) for name in FUNCTIONS if name != "abs"}
+        for name in ("exp", "sinh", "cosh"):
+            function = self._functions[name]
+            self._functions[name] = lambda value, function=function: self._bounded(value) and function(value)
+
+    def __iter__(self) -> Iterator[tuple[dict[str, Any], Any, np.random.Generator]]:
+        """Numbers by name, a function that evaluates the formula with such numbers, and a generator."""
+        rng = np.random.default_rng(0)
+        for scale in np.logspace(-3, 6, 10).repeat(3):
+            place = {name: self._numbers.mpf(scale * rng.normal()) for name in self._names}
+            signs = rng.choice([-1, 1], 1 + sum(isinstance(node, ast.Call) for node in ast.walk(self._tree))).tolist()
+            yield place, lambda given, signs=signs: self._value(given, iter(signs)), rng
+
+    @staticmethod
+    def _bounded(logarithm: Any) -> bool:
+        """Refuse what would take all memory, such as a power of a power of a power."""
+        if abs(logarithm) > _LARGEST:
+            raise OverflowError
+        return True
+
+    def _value(self, place: dict[str, Any], signs: Iterator[int]) -> Any:
+        """The value there; None where it has none."""
+        known = {**self._functions, "abs": lambda value: next(signs) * value, "pi": self._numbers.pi}
+        known |= {"**": lambda base, power: self._bounded(power * self._numbers.log(base)) and base**power}
+        try:
+            found = evaluated(self._tree, {**known, **place, "": self._numbers.mpf})
+        except (ValueError, TypeError, ArithmeticError):  # atan2 of complex numbers, 0 as a divisor, log(0)
+            return None
+        return found if self._numbers.isfinite(found) else None
+
+
+def _is_invariant(tree: ast.expr, width: int, parameters: Sequence[str]) -> bool:
+    """Whether a common shift of all atoms changes nothing."""
+    places, seen = _Places(tree, width, parameters), 0
+    for place, value, rng in places:
+        shift = dict(zip("xyz", rng.normal(size=3).tolist(), strict=True))
+        size = max(abs(place[name]) for name in places.axes)
+        here, there = value(place), value(place | {name: place[name] + size * shift[name[0]] for name in places.axes})
+        if here is None or there is None:
+            continue
+        seen += 1
+        if abs(there - here) > _SAME * max(abs(here), abs(there)):
+            return False
+    return seen > 5
+
+
+def _vanishes_at_rest(tree: ast.expr, width: int, parameters: Sequence[str]) -> bool:
+    """Whether a formula is zero where all velocities are."""
+    places = _Places(tree, width, parameters)
+    for place, value, _ in places:
+        moving, still = value(place), value(place | dict.fromkeys(places.speeds, 0 * place["t"]))
+        if moving is not None and still is not None and abs(still) > _SAME * max(abs(moving), 1):
+            return False
+    return True

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, MD_UNITS, numbers, out_of_range, positive, without_units
+from kcons.constraints.arguments import ANY, MD_UNITS, atom_array, numbers, out_of_range, positive, without_units
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part, width_of
 from kcons.constraints.target import FloatArray, Target
@@ -83,11 +83,16 @@ class Formula(Constraint):
         self.formula, self.names = formula, list(given)
         self.period = None if period is None else positive(period, "Formula: period")
         for name in self.names:
-            taken = name in (*FUNCTIONS, "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
+            if not isinstance(name, str):
+                raise InputError(
+                    f"Formula: {name!r:.60} cannot be the name of a parameter; give text", item="parameters"
+                )
+            taken = name in (*FUNCTIONS, "copysign", "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
         alone = width_of(formula, self.names, self.of_speeds) == 1
-        super().__init__(np.reshape(atoms, (-1, 1)) if alone and np.ndim(atoms) < 2 else atoms, target)
+        table = atom_array(atoms, self.family)
+        super().__init__(table.reshape(-1, 1) if alone and table.ndim < 2 else table, target)
         columns = []
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)
@@ -185,7 +190,7 @@ class Formula(Constraint):
             axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
             numbers = dict(zip([*axes, "t", *self.names], [*r[k].ravel(), time, *self.values[k]], strict=True))
             numbers |= {f"v{axis}": 1.0 for axis in axes}
-            part = undefined_part(self.code().tree, {**FUNCTIONS, **numbers, "pi": np.pi, "": np.float64})
+            part = undefined_part(self.code().tree, {**FUNCTIONS, **numbers, "pi": np.float64(np.pi), "": np.float64})
             what = part or f"its gradient is {'zero' if size[k] == 0 else 'not finite'}"
             return f"{row}, {self.formula!r}: {what} at the start; move the atoms, or write another formula"
 
@@ -197,8 +202,14 @@ class Formula(Constraint):
         wrong = sorted(wanted.symmetric_difference(set(data) - {"units"}))
         if wrong:
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
-        columns = list(np.asarray(data["values"], dtype=np.float64).T) if data["names"] else []
-        parameters = dict(zip(data["names"], columns, strict=True))
+        table = numbers(data["values"], f"{cls.family}: values")
+        if not isinstance(data["names"], list | tuple) or np.shape(table)[1:] != (len(data["names"]),):
+            raise InputError(
+                f"{cls.family} cannot be read: values have shape {table.shape} for the names {data['names']!r:.80}; "
+                "give a row of one number a name for each row",
+                item="values",
+            )
+        parameters = dict(zip(data["names"], table.T, strict=True))
         period = {name: data[name] for name in cls.shared if name == "period"}
         item = cls(data["formula"], data["atoms"], parameters, data["target"], **period)
         item.units = data.get("units")

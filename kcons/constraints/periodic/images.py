@@ -27,11 +27,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.constraints.compilation import plain_if_small
+from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray, nearest_image
@@ -454,7 +453,7 @@ def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: 
     )
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _with_ancestors(atoms, parents, needed, n_atoms):  # type: ignore[no-untyped-def]
     """Which of `atoms` are needed, or lie between a needed one and its root."""
     marked = np.zeros(n_atoms, np.bool_)

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-import numba as nb
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from kcons.constraints.arguments import FloatArray, IntArray
+from kcons.constraints.compilation import njit
 from kcons.errors import InputError
 
 BoolArray = NDArray[np.bool_]
@@ -115,7 +115,7 @@ def make_whole(x: FloatArray, atoms: IntArray, parents: IntArray, lattice: Float
     return x + cells @ lattice[0]
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def follow_parents(y, atoms, parents, lattice):  # type: ignore[no-untyped-def]
     """`make_whole` for what is done again and again: moves atoms in place, parents before their children."""
     cell, inverse = lattice[0], lattice[1]

@@ -188,7 +188,7 @@ class OpenMMWindows:
             for (name, item), target, rate in zip(self.coordinates.items(), targets, rates, strict=True)
         ]
         part = CollectiveRows(system, rows, positions=self.positions)
-        integrator = ProjectedIntegrator(dt, parts=[part], ensemble=ensemble)
+        integrator = ProjectedIntegrator(dt * unit.picosecond, parts=[part], ensemble=ensemble)
         integrator.setRandomNumberSeed(window.seed % 2**31 + 1)
         chosen = [] if self.platform is None else [openmm.Platform.getPlatformByName(self.platform), self.properties]
         topology = app.Topology()

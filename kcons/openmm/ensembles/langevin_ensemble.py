@@ -25,7 +25,8 @@ class Langevin(ConstantEnergy):
 
     half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator, before
     its Context is made, makes a run reproducible, as far as the platform's forces are. A value: to change temperature
-    or friction of a run, call `setTemperature` and `setFriction` of its integrator.
+    or friction of a run, call `setTemperature` and `setFriction` of its integrator. The kinetic energy of a State is
+    that of the middle of the step, after friction and noise.
 
     Parameters
     ----------
@@ -54,6 +55,7 @@ class Langevin(ConstantEnergy):
     """
 
     adds_up = True
+    noisy = True
     temperature: float
     friction: float
 

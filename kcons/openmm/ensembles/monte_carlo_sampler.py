@@ -216,7 +216,7 @@ class HamiltonianMonteCarlo:
         begun = integrator.getStepSize()
         try:
             for _ in range(proposals):
-                integrator.setStepSize(search.dt)
+                integrator.setStepSize(search.dt * unit.picosecond)
                 before = self._held[SUM]
                 self._propose()
                 search.learn(float(self._held[SUM] - before))
@@ -225,7 +225,7 @@ class HamiltonianMonteCarlo:
             integrator.setStepSize(begun)
             raise
         self._held[ACCEPTED:] = 0.0
-        integrator.setStepSize(search.result)
+        integrator.setStepSize(search.result * unit.picosecond)
         return search.result
 
     # -- a proposal -----------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from typing import Any, Self
 
 import openmm
 from openmm import unit
@@ -37,11 +38,12 @@ class RespaWriter(LeanStepWriter):
         p = self.program
         use(p, "xu")
         p.number("inner_left", "inner steps that are left")
-        self.ensemble.declare(p)
+        self._declare_ensemble()
         p.let_others_act()
         done = self.operations
+        last = max(k for k, operation in enumerate(done) if isinstance(operation, Fly)) - (_INNER - 3)
         fastest = self.ensemble.levels[-1].group
-        for block, times in _loops(done, fastest):
+        for block, times in _loops(done[:last], fastest):
             if times == 1:
                 self._write_all(block)
                 continue
@@ -49,6 +51,11 @@ class RespaWriter(LeanStepWriter):
             with p.loop("inner_left > 0", "inner steps"):
                 self._write_all(block)
                 p.let("inner_left", "inner_left-1", "one is made")
+        ends = last + _INNER - 2
+        self._write_all(done[last:ends])
+        self._note_middle("v")
+        self._write_all(done[ends:])
+        self._note_end()
 
     def _write_all(self, operations: Sequence[Operation]) -> None:
         p = self.program
@@ -137,6 +144,12 @@ class LangevinRespa(Langevin):
         middle_of(levels, slow_kicks)
         counts = tuple(level.steps for level in levels)
         self._keep(groups=tuple(int(level.group) for level in levels), counts=counts, slow_kicks=slow_kicks)
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> Self:
+        rest = dict(values)
+        steps = dict(zip(rest.pop("groups"), rest.pop("counts"), strict=True))
+        return cls(**rest, steps=steps)
 
     def __repr__(self) -> str:
         steps = dict(zip(self.groups, self.counts, strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import openmm
 
@@ -32,12 +32,16 @@ class Ensemble(Protocol):
         Whether the end of a step may be left to the next step if the state is not read between; see `open`.
     measures : bool
         Whether `middle` needs v tangent to the constraints, since it measures K.
+    noisy : bool
+        Whether it has noise, of size `spread` in the program: the kinetic energy that is reported is then that of
+        `v_middle`, since velocities have the temperature of the bath in the middle of a step only.
     """
 
     stays_tangent: bool
     adds_up: bool
     owes: bool
     measures: bool
+    noisy: bool
 
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
@@ -154,6 +158,7 @@ class Value:
 
     owes = False
     measures = False
+    noisy = False
 
     def check_timestep(self, dt: float) -> None:
         pass
@@ -169,6 +174,11 @@ class Value:
 
     def go_on(self, integrator: Integrator, context: openmm.Context) -> None:
         pass
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> Self:
+        """The object that has these attributes, of which lists may stand for tuples; checked as any other."""
+        return cls(**values)
 
     def _keep(self, **attributes: Any) -> None:
         self.__dict__.update(attributes)

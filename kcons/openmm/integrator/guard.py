@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import weakref
+from collections.abc import Iterable
 from itertools import chain
 from time import perf_counter
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
+from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import NEAR, Miss, Part
@@ -36,6 +37,8 @@ logger = logging.getLogger("kcons.openmm")
 
 #: With a note in the log, unless it is what a looser tolerance or single precision leaves.
 TIDY = 1e-4
+#: Speed of light, nm/ps: a System whose particles are faster on average has exploded.
+_LIGHT = 299792.458
 #: How often OpenMM's solver is asked for positions: that of OpenCL may need a second call from starts that are off.
 _CALLS = 4
 _REMEDY = "let kcons hold these constraints: take them out of the System and hand them over as constraint objects"
@@ -184,9 +187,7 @@ class Guard:
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.constraints = SystemConstraints(context, integrator)
         self.rows = self.constraints.rows
-        integrator.take_precision(self.constraints.precision)
-        if "coarse" in integrator.program.numbers:
-            integrator.program.write("coarse", float(self.constraints.precision.name == "single"))
+        self._tell_precision()
         refuse_old_positions(integrator, self.system, self.constraints.precision)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
@@ -206,6 +207,10 @@ class Guard:
         #: g of the thermostat, once it is known.
         self.thermal: int | None = None
         self.since_check = 0
+        self._explosive = len(self.rows.masses) * _LIGHT**2
+        #: Whether the program sums squares of velocities where a call ends. Reference and CPU would make other noise,
+        #: since they draw random numbers with each sum.
+        self.sums = self.constraints.precision.rounds_lengths or not integrator.ensemble.noisy
         self._surroundings: tuple[object, ...] | None = None
         self._good: openmm.State | None = None
         #: When the last check ended, what it took, and how many were put off since.
@@ -213,6 +218,18 @@ class Guard:
         self._freedom: int | None = None
         self._left: tuple[int, Any] | None = None
         self._parameters: dict[str, float] | None = None
+
+    def begin_anew(self) -> None:
+        """Others have written the variables of the program: the next step is the first of a run."""
+        self._tell_precision()
+        self.started, self.disturbed = False, True
+
+    def _tell_precision(self) -> None:
+        """Write into the program what it has to know of the platform."""
+        integrator = self.integrator
+        integrator.take_precision(self.constraints.precision)
+        if "coarse" in integrator.program.numbers:
+            integrator.program.write("coarse", float(self.constraints.precision.name == "single"))
 
     @property
     def alive(self) -> openmm.Context | None:
@@ -280,14 +297,15 @@ class Guard:
                 atoms=self.rows.pairs[row],
             )
         asked = [part for part in integrator.parts if not self._steered_away(part)]
-        misses = [found for part in asked if (found := part.worst_miss(context, velocities=False)) is not None]
+        misses = _misses(asked, context)
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
         if not near and not np.any(miss > self.constraints.limit(x)):
             return
+        if not near:
+            self.constraints.hold_positions(integrator.getConstraintTolerance())
+            near = not misses and bool(_misses(asked, context))  # pulled off by the constraints of the System
         if near:
             integrator.applyConstraints(context)
-        else:
-            self.constraints.hold_positions(integrator.getConstraintTolerance())
         now = positions_of(context)
         self.constraints.check(now, None)
         if near or miss[row] > TIDY:
@@ -353,10 +371,49 @@ class Guard:
         if any(part.steered for part in self.integrator.parts):
             self._parameters = dict(context.getParameters())
 
-    def count(self, steps: int) -> None:
+    def look(self) -> None:
+        """The end of a call: whether velocities are finite and slower than light, root mean square.
+
+        That is what can be seen at next to no cost.
+
+        Raises
+        ------
+        ConvergenceError, NonFiniteError
+            The Context is put back to where it was checked last.
+        """
+        v = None if self.sums else velocities_of(self.context)
+        squares = self.integrator.getGlobalVariableByName("motion") if v is None else float(np.vdot(v, v))
+        if squares <= self._explosive:
+            return
+        self.disturbed = False
+        context, held = self.context, self.rows.n_rows > 0
+        step, v = context.getStepCount(), velocities_of(context)
+        try:
+            self.integrator.ensemble.verify(self.integrator)
+            _check_finite(positions_of(context), v, step, held)
+            speeds = np.sqrt(np.einsum("ij,ij->i", v, v))
+            atom = int(np.argmax(speeds))
+            raise NonFiniteError(
+                f"particle {atom} has a velocity of {speeds[atom]:.3g} nm/ps at step {step}: the System has exploded; "
+                f"{_smaller_step(held)}",
+                item="velocity",
+                atom=atom,
+                step=step,
+            )
+        except (ConvergenceError, NonFiniteError) as error:
+            self._go_back(error)
+            raise
+
+    def count(self, steps: int, *, ends: bool = False) -> None:
         """Count steps that were made; check where a check is due.
 
         Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
+
+        Parameters
+        ----------
+        steps : int
+        ends : bool
+            Whether a call ends that is checked at its end.
 
         Raises
         ------
@@ -365,12 +422,14 @@ class Guard:
         """
         self.since_check += steps
         self.disturbed = False
-        if not self.integrator.check_every or self.since_check < self.integrator.check_every:
+        due = 0 < self.integrator.check_every <= self.since_check
+        if not (due or ends):
             return
-        spare = self.integrator.spare and self._put_off < MOST
+        spare = self.integrator.spare and (not due or self._put_off < MOST)
         if spare and self._cost > SHARE * (perf_counter() - self._checked):
-            self._put_off += 1
-            self.since_check = 0
+            if due:
+                self._put_off += 1
+                self.since_check = 0
             return
         self.check()
 
@@ -397,16 +456,17 @@ class Guard:
             error.step = step
             if isinstance(error, CertificateError):
                 error.state = self._good
-            if not self.disturbed and self._good is not None:
-                self.put_back()
-                good = context.getStepCount()
-                error.args = (
-                    f"{error}. The Context is back at step {good}, the last that was checked",
-                    *error.args[1:],
-                )
+            self._go_back(error)
             raise
         self._remember(now)
         self._cost = self._checked - begun
+
+    def _go_back(self, error: KconsError) -> None:
+        """The state that was checked last, and the error says so."""
+        if not self.disturbed and self._good is not None:
+            self.put_back()
+            good = self.context.getStepCount()
+            error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
 
     def certify(self, miss: Miss | None, where: str = "") -> None:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
@@ -439,10 +499,10 @@ class Guard:
 
     def explosion(self, words: str, step: int) -> NonFiniteError:
         """The error for a NaN that OpenMM met after `step`, once the state is put back."""
-        solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if self.rows.n_rows else ""
+        remedy = _smaller_step(self.rows.n_rows > 0)
         return NonFiniteError(
             f"{words} It appeared after step {step}; positions and velocities are those of step "
-            f"{self.context.getStepCount()}. Take a smaller time step, or minimise the energy first{solver}",
+            f"{self.context.getStepCount()}. {remedy[0].upper()}{remedy[1:]}",
             item="position",
             step=step,
         )
@@ -461,6 +521,11 @@ class Guard:
     def degrees_of_freedom(self) -> int:
         """Also less three where a CMMotionRemover acts."""
         return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+
+
+def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Miss]:
+    """Rows whose positions are off, the worst of each part."""
+    return [found for part in parts if (found := part.worst_miss(context, velocities=False)) is not None]
 
 
 def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:
@@ -483,15 +548,19 @@ def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.
     return 2 * len(np.unique(molecules[off])) <= max(len(np.unique(molecules)), 2)
 
 
+def _smaller_step(held: bool) -> str:
+    """The remedy for what explodes; `held` where the System has constraints."""
+    solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
+    return f"take a smaller time step, or minimize the energy first{solver}"
+
+
 def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
     for array, item in ((x, "position"), (v, "velocity")):
         finite = np.isfinite(array)
         if not finite.all():
             atom = int(np.argmin(finite.all(axis=1)))
-            solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
             raise NonFiniteError(
-                f"the {item} of particle {atom} is not finite at step {step}; take a smaller time step, or minimise "
-                f"the energy first{solver}",
+                f"the {item} of particle {atom} is not finite at step {step}; {_smaller_step(held)}",
                 item=item,
                 atom=atom,
                 step=step,

@@ -105,9 +105,11 @@ class LeanStepWriter(StepWriter):
                 with p.when("exact+1-between != 0", "kicks need it"):
                     self._project()
         with p.when("between+delta(phase-1) = 0", "somebody looks at the velocities"):
+            self._note_middle("v")
             self._kick("0.5*dt", tangent=True)
             if not ensemble.stays_tangent:  # otherwise the next drift absorbs what v has across
                 self._project()
+            self._note_end()
         p.let("behind", "between", "the next step makes up for it")
         p.let("phase", "select(phase, 3-phase, 0)", "what follows")
 

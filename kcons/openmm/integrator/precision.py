@@ -78,3 +78,7 @@ class Precision:
     def seen(self) -> float:
         """Unit roundoff of a coordinate as Forces see it."""
         return 2.0**-53 if self.name == "double" else SINGLE
+
+
+#: What integrators go by until they know their Context.
+DOUBLE = Precision("", "double")

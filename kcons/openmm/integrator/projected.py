@@ -14,7 +14,7 @@ from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard, find_context
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.precision import DOUBLE
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.states.calls import Calls
@@ -24,6 +24,7 @@ from kcons.openmm.integrator.states.outside_of_steps import OutsideOfSteps
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
 from kcons.openmm.integrator.system_checks import require_context
+from kcons.openmm.quantities import relative_tolerance
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
@@ -65,6 +66,11 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
     InputError, UnsupportedError
         A time step that is no positive number, an unknown scheme, parts that do not go together.
 
+    Warns
+    -----
+    UserWarning
+        A time step above 20 fs that has no unit.
+
     Notes
     -----
     A member of a CompoundIntegrator makes its steps with all its checks, as long as kcons is imported.
@@ -90,9 +96,8 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         ensemble: Ensemble | None = None,
     ) -> None:
         super().__init__(picoseconds(timestep))
-        openmm.CustomIntegrator.setConstraintTolerance(self, Precision("", "double").tolerance)
-        if tolerance is not None:
-            self.setConstraintTolerance(tolerance)
+        self.asked_tolerance = None if tolerance is None else relative_tolerance(tolerance)
+        openmm.CustomIntegrator.setConstraintTolerance(self, self.asked_tolerance or DOUBLE.tolerance)
         if check_every is not None:
             self.check_every = check_every
         #: None for the leapfrog.
@@ -120,6 +125,7 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         writer: type[LeanStepWriter] = getattr(self._ensemble, "writer", None) or self._writer
         self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
+        self._plan.write_look()
         #: What parts know as this integrator, and what its program has set in each.
         self.identity = object()
         self._notes = [part.notes() for part in self.parts]
@@ -220,6 +226,8 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
             context = self.context
         self.context = context
         assert self._guard is not None
+        if self._written:
+            self._take_written()
         if served:
             self.take_precision(self._guard.constraints.precision)
             self._guard.disturbed = True

@@ -9,23 +9,24 @@ half kick are those of the first of the next call: n steps cost n evaluations, i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import whole_number
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.states.copies import settings_of
 from kcons.openmm.integrator.states.serialization import note_of
+from kcons.openmm.integrator.states.settings import picoseconds
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 
 #: What one execution of the program of `Ends` does.
-_STEP, _BEGIN, _END = 0.0, 1.0, 2.0
+_STEP, _BEGIN, _END, _LOOK = 0.0, 1.0, 2.0, 3.0
 #: Shorter calls are made by the program itself.
 FEW = 2
 _CLOSED = "a RattleIntegrator has its integrators; make a CompoundIntegrator with a ProjectedIntegrator in it"
@@ -36,7 +37,7 @@ class EndWriter(LeanStepWriter):
 
     def write(self) -> None:
         p = self.program
-        p.control("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
+        p.control("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them, 3 to do neither")
         with p.when("end = 0", "a step"):
             super().write()
         with p.when("end = 1", "leapfrog steps follow"):
@@ -68,7 +69,7 @@ class Ends(ProjectedIntegrator):
                 self.execute(_END)
             context.setTime(time)
             context.setStepCount(count)
-            self._guard.disturbed = False
+            self._guard.count(0, ends=self.spare)
 
     @contextmanager
     def way_back(self, first: int) -> Iterator[None]:
@@ -108,9 +109,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     tolerance : float, optional
         Relative tolerance of the System's constraints; see `ProjectedIntegrator`.
     check_every : int, optional
-        Steps between two checks that OpenMM's solvers did converge; 0 for none but the first. Left open, 1000, and
-        later where checks would take more than a hundredth of the time. One that is due shortly before the end of a
-        call is made there, up to half as many steps late: to stop on the way costs more.
+        Steps between two checks that OpenMM's solvers did converge; 0 for none but the first. Left open, 1000 and at
+        the end of each call, and later where checks would take more than a hundredth of the time. One that is due
+        shortly before the end of a call is made there, up to half as many steps late: to stop on the way costs more.
 
     Raises
     ------
@@ -131,7 +132,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         self, timestep: unit.Quantity | float, *, tolerance: float | None = None, check_every: int | None = None
     ) -> None:
         super().__init__()
-        self._ends = Ends(timestep, "rattle", tolerance=tolerance, check_every=check_every)
+        self._ends = Ends(
+            picoseconds(timestep) * unit.picosecond, "rattle", tolerance=tolerance, check_every=check_every
+        )
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
         self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())
         # The first is the one that answers what OpenMM asks: its velocities belong to x.
@@ -190,27 +193,31 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
             check_is_due = 0 < ends.check_every <= guard.since_check + block
             goes_on = ends.unseen and block == steps and not check_is_due and guard.undisturbed
             if begun or goes_on or (block >= FEW and guard.undisturbed):
-                self._leap(guard, block, begun, goes_on)
+                self._leap(guard, block, begun, goes_on, block == steps)
             else:
-                ends._run(guard, block)
-            guard.count(block)
+                ends._run(guard, block, block == steps)
             steps -= block
+            guard.count(block, ends=ends.spare and not steps and not goes_on)
             begun = goes_on
         guard.leave()
         ends._owe(int(begun))
 
-    def _leap(self, guard: Guard, steps: int, begun: bool, goes_on: bool) -> None:
-        """Leapfrog steps, which others may have begun, and others may end."""
+    def _leap(self, guard: Guard, steps: int, begun: bool, goes_on: bool, last: bool) -> None:
+        """Leapfrog steps, which others may have begun, and others may end; the last of a call are looked at."""
         context = guard.context
         time, first = context.getTime()._value, context.getStepCount()
         with self._ends.way_back(first):
             if not begun:
                 self._ends.execute(_BEGIN)
             self._verlet.step(steps if begun else steps - 1)
-            if not goes_on:
-                self._ends.execute(_END)
+            summed = last and guard.sums
+            with self._ends.ending() if summed else nullcontext():
+                if summed or not goes_on:
+                    self._ends.execute(_LOOK if goes_on else _END)
         context.setTime(time + steps * self._dt)
         context.setStepCount(first + steps)
+        if last:
+            guard.look()
 
     def refresh(self) -> None:
         """Compute the forces anew at the next step: to be called after `updateParametersInContext`."""
@@ -259,7 +266,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         InputError
             It is no positive number.
         """
-        self._ends.setStepSize(size)
+        self._ends.setStepSize(picoseconds(size) * unit.picosecond)
         self._verlet.setStepSize(self._dt)
 
     def setConstraintTolerance(self, tol: float) -> None:
@@ -313,16 +320,18 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
 
     def _making(self) -> tuple[Any, ...]:
         every = None if self._ends.spare else self.check_every
-        return self._dt, self._ends.asked_tolerance, every, settings_of(self._ends)
+        return self._ends.getStepSize(), self._ends.asked_tolerance, every, settings_of(self._ends)
 
     def _note(self) -> dict[str, Any]:
         return {**note_of(self._ends), "class": "RattleIntegrator"}
 
     @classmethod
-    def _of_note(cls, plain: openmm.CompoundIntegrator, note: dict[str, Any]) -> RattleIntegrator:
+    def _of_note(cls, plain: openmm.Integrator, note: dict[str, Any]) -> RattleIntegrator:
+        if not isinstance(plain, openmm.CompoundIntegrator) or plain.getNumIntegrators() != 2:
+            raise InputError(f"{type(plain).__name__} is no program of a {cls.__name__}", item="integrator")
         ends = plain.getIntegrator(0)
         settings = {"groups": ends.getIntegrationForceGroups()}
-        return _remade(ends.getStepSize()._value, note["tolerance"], note["check_every"], settings)
+        return _remade(ends.getStepSize(), note["tolerance"], note["check_every"], settings)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _remade, self._making()
@@ -335,7 +344,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         return self.__copy__()
 
 
-def _remade(dt: float, tolerance: float | None, check_every: int | None, settings: dict[str, Any]) -> RattleIntegrator:
+def _remade(
+    dt: unit.Quantity, tolerance: float | None, check_every: int | None, settings: dict[str, Any]
+) -> RattleIntegrator:
     made = RattleIntegrator(dt, tolerance=tolerance, check_every=check_every)
     made.setIntegrationForceGroups(settings["groups"])
     return made

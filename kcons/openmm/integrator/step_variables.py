@@ -9,6 +9,7 @@ What begins and ends a step, and what may be left out of it, goes by a few numbe
 - `failed` is set by the part whose solve failed. Nothing moves then until Python has read it and set it back to 0; x
   and v go back to `x_last` and `v_last`, the forces are computed anew (`stale`), and `loose` says whether v had been
   complete.
+- `ending` is 1 in the last step of a call, which sums `motion` for `Guard.look`.
 - `phase` is other than 0 where virtual sites are placed at the end of an execution of the program only: each execution
   is then the part of a step from one force evaluation to the next, and counts on by itself.
 - `first_stage` and `end_stage` are other than 0 and the number of drifts only while constraints are applied outside of
@@ -40,6 +41,8 @@ VARIABLES = {
     "h": Variable("number", "length of the drift"),
     "per_h": Variable("number", "1/h after the drift"),
     "kick": Variable("number", "length of a kick as a fraction of the step, with what the last step left out"),
+    "ending": Variable("control", "1 in the last step of a call"),
+    "motion": Variable("number", "sum of squares of velocities where a call ended"),
     "first_stage": Variable("control", "0; more to apply the constraints alone, outside of steps"),
     "end_stage": Variable("setting", "where the stages end"),
     "good_steps": Variable("number", "steps done since the integrator was made"),
@@ -64,6 +67,8 @@ VARIABLES = {
     "x_last": Variable("vector", "positions to come back to"),
     "v_last": Variable("vector", "velocities to come back to"),
     "x_start": Variable("vector", "positions where the drift began"),
+    "v_middle": Variable("vector", "velocities after friction and noise, with which x moved last"),
+    "v_end": Variable("vector", "v at the end of the step that has this v_middle"),
     "v_next": Variable("vector", "velocities with all of (x-xu)/h"),
     "force": Variable("vector", "applied forces at x, kept where OpenMM would compute them again"),
     "impulse": Variable("vector", "change of v by the constraints in the last drift"),

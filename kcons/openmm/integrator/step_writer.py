@@ -52,7 +52,7 @@ class StepWriter:
             # impulse of the forces at x is added, and half that of the constraints in the drift to x.
             p.integrator.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
             p.memory.add(use(p, "impulse"))
-        self.ensemble.declare(p)
+        self._declare_ensemble()
         if self.parts:
             self._declare_guards()
             for part in self.parts:
@@ -60,6 +60,37 @@ class StepWriter:
             self._write_guarded()
         else:
             self._write_plain()
+
+    def write_look(self) -> None:
+        """What `Guard.look` asks for at the end of a call on some platforms."""
+        p = self.program
+        use(p, "ending", "motion")
+        with p.when("ending != 0", "a call ends"):
+            p.sum("motion", "v*v", "are velocities finite?")
+
+    # -- the kinetic energy that is reported ----------------------------------------------------
+
+    def _declare_ensemble(self) -> None:
+        p = self.program
+        self.ensemble.declare(p)
+        if self.ensemble.noisy:
+            use(p, "v_middle", "v_end")
+            # Where others have set v since, it is theirs that counts.
+            p.integrator.setKineticEnergyExpression("m*u*u/2; u=select(spread*delta(v-v_end), v_middle, v)")
+
+    def _note_middle(self, velocities: str) -> None:
+        """The velocities between the last drift of a step and the kick that ends it."""
+        if self.ensemble.noisy:
+            self.program.each("v_middle", self._of_step(velocities, "v_middle"), "its kinetic energy is reported")
+
+    def _note_end(self) -> None:
+        """The step that has this `v_middle` ends."""
+        if self.ensemble.noisy:
+            self.program.each("v_end", self._of_step("v", "v_end"), "to see whether others change v")
+
+    def _of_step(self, value: str, kept: str) -> str:
+        """Constraints that are applied alone, outside of steps, leave a variable as it is."""
+        return f"select(first_stage, {kept}, {value})" if self.parts else value
 
     # -- a step without parts -------------------------------------------------------------------
 
@@ -91,12 +122,14 @@ class StepWriter:
                 self.ensemble.middle(p, f"v+{self._drift(h)}", project)
             impulse = self._drift(h)
         with p.when("phase != 1", "with the forces there"):
+            self._note_middle(f"v+{impulse}")
             if kicks[-1]:
                 self._kick(_of_dt(kicks[-1]), impulse)
             else:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
             if self.scheme is not None and not self._ends_tangent:
                 self._project()
+            self._note_end()
             self.ensemble.close(p)
 
     def _write_plain_loop(self) -> None:
@@ -194,9 +227,11 @@ class StepWriter:
         else:
             with p.when("failed = 0", "all solves converged"):
                 if self._last_drift_apart:
+                    self._note_middle("v+per_h*(x-xu)")
                     self._kick_after("per_h*(x-xu)")
                 if not self._ends_tangent:
                     self._project()
+                self._note_end()
                 self.ensemble.close(p)
                 p.let("good_steps", "good_steps+delta(failed)", "count it")
                 if self.kept:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import openmm
 from numpy.typing import NDArray
-from openmm import unit
 from scipy.sparse import csr_array
 
 from kcons.constraints import Distance
@@ -97,14 +96,28 @@ class SystemRows:
 
     @classmethod
     def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
-        """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`."""
+        """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`.
+
+        Raises
+        ------
+        InputError
+            A length that is not above zero.
+        """
         masses = masses_of(system)
         pairs, lengths, numbers = [], [], []
         for k in range(system.getNumConstraints()):
             i, j, d = system.getConstraintParameters(k)
             if masses[i] or masses[j]:
+                if not 0 < d._value < np.inf:
+                    raise InputError(
+                        f"constraint {k} of the System (particles {i} and {j}) has a length of {d._value:g} nm, and a "
+                        "distance can be held above zero only; give it its length, or make one of the particles a "
+                        "virtual site at the place of the other",
+                        item="constraints",
+                        atoms=(i, j),
+                    )
                 pairs.append((i, j))
-                lengths.append(d.value_in_unit(unit.nanometer))
+                lengths.append(d._value)
                 numbers.append(k)
         table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         given = np.array(lengths, dtype=float)
@@ -294,12 +307,19 @@ def check_system(system: openmm.System) -> None:
     Raises
     ------
     UnsupportedError
-        Particles or forces that need an integrator of their own, a barostat that scales atoms one by one although
-        bonds are held, rigid triangles that OpenMM's solver gets wrong.
+        Particles or forces that need an integrator of their own, more than one barostat, one that scales atoms one by
+        one although bonds are held, rigid triangles that OpenMM's solver gets wrong.
     InputError
-        The pressure of a barostat is not finite.
+        The pressure of a barostat is not finite, the length of a constraint not above zero.
     """
     _refuse_lopsided(SystemRows.of(system))
+    found = [force for force in forces_of(system) if type(force).__name__ in BAROSTATS]
+    acting = [type(force).__name__ for force in found if force.getFrequency() > 0]
+    if len(acting) > 1:
+        raise UnsupportedError(
+            f"the System has {len(acting)} barostats ({', '.join(acting)}): the volume would follow all of them, and "
+            "belong to no ensemble. Remove all but one: system.removeForce(index)"
+        )
     for force in forces_of(system):
         name = type(force).__name__
         if name in _FOREIGN:

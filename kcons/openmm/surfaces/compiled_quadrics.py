@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from threading import get_ident
 from typing import Any
 
-import numba
 import numpy as np
 import openmm
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError, UnsupportedError
@@ -145,7 +145,7 @@ def _positions(state: Any) -> FloatArray:
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _land_on_spheres(start, there, centers, levels, way):  # type: ignore[no-untyped-def]
     """As `_land`, where Q = 1."""
     for i in range(len(levels)):
@@ -162,7 +162,7 @@ def _land_on_spheres(start, there, centers, levels, way):  # type: ignore[no-unt
     return 0
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _land(start, there, matrices, centers, flats, levels, way):  # type: ignore[no-untyped-def]
     """0, or 1 more than the first row without landing; negative if it is not finite."""
     d0, d = np.empty(3), np.empty(3)

@@ -17,6 +17,7 @@ from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedErro
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.integrator.states.settings import picoseconds
 from kcons.openmm.quantities import accepted, nanometers
 from kcons.openmm.surfaces.compiled_quadrics import CompiledQuadricRows
 from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
@@ -156,11 +157,11 @@ class SurfaceIntegrator(ProjectedIntegrator):
             )
         together: tuple[Part, ...] = (*held, *parts)
         self.surfaces = tuple(part for part in together if isinstance(part, SurfaceRows))
-        super().__init__(timestep, scheme, parts=together, **arguments)
+        super().__init__(picoseconds(timestep) * unit.picosecond, scheme, parts=together, **arguments)
 
-    def _run(self, guard: Guard, steps: int) -> None:
+    def _run(self, guard: Guard, steps: int, ends: bool) -> None:
         try:
-            super()._run(guard, steps)
+            super()._run(guard, steps, ends)
         except NonFiniteError:
             # A force that is not finite is seen in the step after the one whose velocities it has spoilt.
             if not all(np.isfinite(array).all() for array in positions_and_velocities(guard.context)):

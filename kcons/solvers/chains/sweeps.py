@@ -10,8 +10,8 @@ for the next Newton step in the opposite direction: a Newton step reads the chai
 """
 
 import numpy as np
-from numba import njit
 
+from kcons.constraints.compilation import njit
 from kcons.solvers.kernels.array_views import at_first
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,

@@ -1,9 +1,9 @@
 """Clusters eight at a time: layout, minimum images, undoing, reporting."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, load_triple, nearest, scatter_points
 
 MAX_ITERATIONS = 50

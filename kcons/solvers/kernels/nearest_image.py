@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
+
+from kcons.constraints.compilation import njit
 
 #: Stands for 'no periodicity' where a kernel needs an array of the right type.
 NO_LATTICE = np.zeros((2, 3, 3))
 
 
-@nb.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def nearest_image(x, y, z, lattice):  # type: ignore[no-untyped-def]
     """Shortest image of a difference; `lattice` holds the cell (rows) and its inverse, both (3, 3)."""
     inverse = lattice[1]

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.compilation import plain_if_small
+from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -155,7 +154,7 @@ def sparse_distances(
     return SparseDistances(rows, pairs, constraint_set.target(time)[rows], inverse_masses)
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _number_atoms(pairs, clusters, n_atoms):  # type: ignore[no-untyped-def]
     """Atoms of each cluster in the order in which its rows meet them, and the rows' ends in that count."""
     n = len(pairs)
@@ -179,7 +178,7 @@ def _number_atoms(pairs, clusters, n_atoms):  # type: ignore[no-untyped-def]
     return atoms[:used].copy(), atom_start, ends
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
     """c_kl with (A M^-1 A^T)_kl = c_kl s_k . s_l for each stored entry; 0 where there is only fill."""
     coupling = np.zeros(len(columns))
@@ -201,7 +200,7 @@ def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
     return coupling
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, periodic, atoms, w, links,
     state, starts, places, moves, solution,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
@@ -232,13 +231,13 @@ def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, p
     return error, total
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _image(vector, lattice):  # type: ignore[no-untyped-def]
     x, y, z = nearest_image(lane(vector, 0), lane(vector, 1), lane(vector, 2), lattice)
     return quad(x, y, z, 0.0)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore[no-untyped-def]
     """Current vectors and right-hand sides; largest and total relative error of the lengths."""
     error, total = 0.0, 0.0
@@ -254,7 +253,7 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
     return error, total
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def solve_positions(  # type: ignore[no-untyped-def]
     careful, x_new, x_ref, lengths, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
     targets, couplings, weights, state, entries, pivots, starts, places, moves, solution, kept_moves, kept_solution,
@@ -313,7 +312,7 @@ def solve_positions(  # type: ignore[no-untyped-def]
     return False, worst, most, worst_row
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _resolved(first, last, state, lengths, places, links):  # type: ignore[no-untyped-def]
     """Whether each |sigma| is max(1e-14 d, 2 eps (|x_i| + |x_j|)) or so, see `step_control.ROUNDINGS`."""
     room = step_control.ROUNDINGS * np.sqrt(last - first)
@@ -328,7 +327,7 @@ def _resolved(first, last, state, lengths, places, links):  # type: ignore[no-un
     return True
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
     """Row of a cluster with the largest relative residual, or the first that is not finite."""
     row, largest = np.int64(first), 0.0
@@ -341,7 +340,7 @@ def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
     return row
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def solve_tangents(  # type: ignore[no-untyped-def]
     x, y, rates, driven, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
     targets, couplings, weights, state, entries, pivots, starts, places, moves, solution,
@@ -403,7 +402,7 @@ def solve_tangents(  # type: ignore[no-untyped-def]
     return False, worst, most, worst_row
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _first_bad(first, last, state):  # type: ignore[no-untyped-def]
     """First row whose vectors or right-hand side are zero or not finite."""
     for k in range(first, last):
@@ -413,7 +412,7 @@ def _first_bad(first, last, state):  # type: ignore[no-untyped-def]
     return np.int64(first)
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _largest(first, last, state):  # type: ignore[no-untyped-def]
     """Row with the largest right-hand side."""
     row = first
@@ -423,7 +422,7 @@ def _largest(first, last, state):  # type: ignore[no-untyped-def]
     return np.int64(row)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def]
     """Multipliers of |r| - d instead of s . r."""
     for k in range(len(solution)):
@@ -431,14 +430,14 @@ def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def
         multipliers[k] = sign * solution[k] * np.sqrt(sx * sx + sy * sy + sz * sz)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def apply(x, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
         g = 3 * entry(atoms, a)
         add_to_point(x, g, load_quad(moves, 4 * a))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
         g = 3 * entry(atoms, a)

@@ -18,12 +18,11 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from kcons.constraints.compilation import plain_if_small
+from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.errors import UnsupportedError
 
@@ -106,7 +105,7 @@ def make_pattern(
     return Pattern(*plain_if_small(_finish, size)(position, struct_start, struct))
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-untyped-def]
     """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""
     n = len(row_start) - 1
@@ -257,7 +256,7 @@ def _unlink(head, tail, following, preceding, degree, k):  # type: ignore[no-unt
         tail[degree] = before
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
     """Order by branches of the elimination tree, then columns and update targets in that order."""
     n = len(position)
@@ -385,7 +384,7 @@ def make_triples(
     return found  # type: ignore[no-any-return]
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _make_triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
     begin = np.zeros(len(columns) + 1, np.uint32)
     for fill in range(2):

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from kcons.constraints.compilation import plain_if_small
+from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -159,7 +158,7 @@ def _addresses(kinds: NDArray[np.uint32]) -> IntArray:
     return np.array([*addresses_for(kinds), *(address_of(*each) for each in kernels)], dtype=np.int64)
 
 
-@nb.njit(cache=True)
+@njit(cache=True)
 def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-def]
     """Atoms cluster by cluster in the order in which rows meet them, and the slots' atoms in that count."""
     place = np.full(n_atoms, -1, np.int64)
@@ -180,7 +179,7 @@ def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-de
     return atoms[:used].copy(), atom_start, numbers
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _factor(  # type: ignore[no-untyped-def]
     first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
 ):
@@ -230,7 +229,7 @@ def _factor(  # type: ignore[no-untyped-def]
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
     begin = entry(links, 4 * first)
     for k in range(first, last):
@@ -243,7 +242,7 @@ def _forward(first, last, links, columns, state, entries):  # type: ignore[no-un
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
     """Backward substitution; adds to the multipliers and moves the atoms along the reference gradients."""
     end, slot = entry(links, 4 * last), entry(links, 4 * last + 2)
@@ -267,7 +266,7 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
             store_quad(moves, a, load_quad(moves, a) + f * second_vector(lines, 8 * slot))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _begin(  # type: ignore[no-untyped-def]
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
     scale, lines, values, inverse_rounding, base, moves, origin, moved, solution, functions,
@@ -299,7 +298,7 @@ def _begin(  # type: ignore[no-untyped-def]
         put(inverse_rounding, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state):  # type: ignore[no-untyped-def]
     """Right-hand sides; largest and total error, the row with the largest, and the largest in units of its rounding."""
     error, total, excess = 0.0, 0.0, 0.0
@@ -321,7 +320,7 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_round
     return error, total, excess, bad
 
 
-@nb.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
     for k in range(first, last):
         if not (abs(state[2 * k + 1]) < np.inf):
@@ -329,7 +328,7 @@ def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
     return first
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=FAST)
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     h = integers(tables)
@@ -338,7 +337,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
         add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
     careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers
 ):
@@ -428,7 +427,7 @@ def _positions(  # type: ignore[no-untyped-def]
     return True, worst, most, worst_row
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)

@@ -28,6 +28,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, is_jitted
 
+from kcons.constraints.compilation import cfunc, njit
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.functions.custom import FunctionRows
@@ -260,7 +261,7 @@ FAMILIES: dict[str, Callable[..., None]] = {
 
 @functools.cache
 def _compiled(function: Callable[..., None]) -> Any:
-    return nb.cfunc(ROW, cache=True, fastmath=FAST, error_model="numpy")(function)
+    return cfunc(ROW, cache=True, fastmath=FAST, error_model="numpy")(function)
 
 
 @functools.cache
@@ -269,7 +270,7 @@ def _of_jitted(function: Any, gradient: Any, width: int, timed: bool) -> Any:
     shape = (width, 3)
     if timed:
 
-        @nb.cfunc(ROW)
+        @cfunc(ROW)
         def row(r, p, t, out):
             x = nb.carray(r, shape)
             out[0] = function(x, t)
@@ -279,7 +280,7 @@ def _of_jitted(function: Any, gradient: Any, width: int, timed: bool) -> Any:
                     out[1 + 3 * i + j] = slope[i, j]
     else:
 
-        @nb.cfunc(ROW)
+        @cfunc(ROW)
         def row(r, p, t, out):
             x = nb.carray(r, shape)
             out[0] = function(x)
@@ -297,16 +298,16 @@ def _of_jitted_coefficients(coefficients: Any, width: int, timed: bool, step: fl
     shape = (width, 3)
     if timed:
 
-        @nb.njit
+        @njit
         def found(x, t):
             return coefficients(x, t)
     else:
 
-        @nb.njit
+        @njit
         def found(x, t):
             return coefficients(x)
 
-    @nb.cfunc(ROW)
+    @cfunc(ROW)
     def row(r, p, t, out):
         x, way = nb.carray(r, shape), 0.0
         slope = np.ascontiguousarray(found(x, t)).copy()

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import RowKind
 from kcons.solvers.called_solvers import address_of, caller_of
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS
@@ -50,7 +50,7 @@ call_evaluate, _call_function = caller_of(_EVALUATE), caller_of(_FUNCTION)
 NOW, REFERENCE = np.int64(0), np.int64(1)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _difference(i, j, base, moves, cell, inverse, periodic):  # type: ignore[no-untyped-def]
     """Vector from atom j to atom i, as three numbers."""
     return near(
@@ -60,7 +60,7 @@ def _difference(i, j, base, moves, cell, inverse, periodic):  # type: ignore[no-
     )  # fmt: skip
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def cell_of(lattice):  # type: ignore[no-untyped-def]
     """A cell and its inverse as tuples, as `near` takes them."""
     cell = (
@@ -76,7 +76,7 @@ def cell_of(lattice):  # type: ignore[no-untyped-def]
     return cell, inverse
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def]
     # No arrays come here: one that passes a branch costs reference counting.
     x, y, z = lane(whole, 0), lane(whole, 1), lane(whole, 2)
@@ -90,19 +90,19 @@ def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def
     return x + lane(change, 0), y + lane(change, 1), z + lane(change, 2)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _put(lines, place, x, y, z):  # type: ignore[no-untyped-def]
     put(lines, place, x)
     put(lines, place + 2, y)
     put(lines, place + 4, z)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def angle(u, w):  # type: ignore[no-untyped-def]
     """Angle between u and w and its gradients by both: dtheta/du = u x (u x w) / (u^2 |u x w|)."""
     ux, uy, uz = u
@@ -117,7 +117,7 @@ def angle(u, w):  # type: ignore[no-untyped-def]
     return value, (fu * ax, fu * ay, fu * az), (fw * bx, fw * by, fw * bz)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _function(  # type: ignore[no-untyped-def]
     kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, moved, lattice, periodic, lines, which
 ):
@@ -170,7 +170,7 @@ def _function(  # type: ignore[no-untyped-def]
     return number(parameters, out)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
     function, first, last, kinds, links, slot_atoms, parameters, base, moves, origin, moved, lattice, periodic, values,
     lines, which,
@@ -226,7 +226,7 @@ def addresses_for(kinds: NDArray[np.uint32]) -> tuple[int, int]:
     return address_of(evaluate, _EVALUATE), address_of(_function, _FUNCTION) if (kinds >= FUNCTION).any() else 0
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def first_flat(first, last, links, lines):  # type: ignore[no-untyped-def]
     """The first row whose gradient has less than `FLAT` of that at the reference along it; -1 if none has."""
     for k in range(first, last):
@@ -241,7 +241,7 @@ def first_flat(first, last, links, lines):  # type: ignore[no-untyped-def]
     return -1
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def miss(value, target, period):  # type: ignore[no-untyped-def]
     """target - value, where there is a period by the shorter way round."""
     difference = target - value

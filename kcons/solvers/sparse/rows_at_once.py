@@ -10,11 +10,11 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import numba as nb
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, register_jitable
 
+from kcons.constraints.compilation import cfunc
 from kcons.solvers.sparse.elimination import FAST
 
 #: The most rows that are taken at once.
@@ -59,7 +59,7 @@ def rows_at_once(function: Callable[..., None]) -> Any:
     # Not compiled apart: what Numba keeps is found again by the function's name, and by no name that it gives itself.
     row = register_jitable(fastmath=FAST, error_model="numpy")(function)
 
-    @nb.cfunc(_ROWS, cache=True, fastmath=FAST, error_model="numpy")
+    @cfunc(_ROWS, cache=True, fastmath=FAST, error_model="numpy")
     def rows(n, r, p, stride, t, out):  # type: ignore[no-untyped-def]
         if stride == 0:
             for i in range(n):

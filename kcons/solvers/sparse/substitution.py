@@ -8,8 +8,7 @@ where its entries and its targets begin and its two ends; atoms are quads (move,
 
 from __future__ import annotations
 
-import numba as nb
-
+from kcons.constraints.compilation import njit
 from kcons.solvers.kernels.two_and_four_wide import (
     entry,
     lane,
@@ -31,7 +30,7 @@ from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE
 CHANGE, RIGHT = 6, 7
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries):  # type: ignore[no-untyped-def]
     """Assemble entry p of a row (vectors x, y, z: s and r) and take it from its column; returns the entry."""
     l = 8 * entry(columns, p)
@@ -44,14 +43,14 @@ def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries): 
     return done
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def update(t, one, two, targets, entries):  # type: ignore[no-untyped-def]
     """Take the product of two entries of a row, to columns l and m, from A_ml and A_lm."""
     e = 4 * entry(targets, t) + 2
     store_pair(entries, e, load_pair(entries, e) - swapped(one) * two)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep."""
     begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
@@ -96,7 +95,7 @@ def factor(first, last, links, columns, targets, couplings, weights, state, entr
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries):  # type: ignore[no-untyped-def]
     l = 8 * entry(columns, p)
     inner = sx * number(state, l + 1) + sy * number(state, l + 3) + sz * number(state, l + 5)
@@ -107,13 +106,13 @@ def _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, stat
     return low, up
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _update_symmetric(t, low, up, targets, entries):  # type: ignore[no-untyped-def]
     e = 4 * entry(targets, t) + 2
     put(entries, e, number(entries, e) - low * up)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
     """`factor` for r = s: half the work."""
     begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
@@ -155,7 +154,7 @@ def factor_symmetric(first, last, links, columns, targets, couplings, weights, s
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
     """Forward substitution with the factor kept from before."""
     begin = entry(links, 4 * first)
@@ -169,7 +168,7 @@ def forward(first, last, links, columns, state, entries):  # type: ignore[no-unt
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def backward(first, last, links, columns, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
     """Backward substitution; adds to the multipliers and moves the atoms along s in the same sweep."""
     end = entry(links, 4 * last)

@@ -6,9 +6,9 @@ of numbers (value and what rounding took from it) only the last rounding of a st
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
@@ -112,7 +112,7 @@ class Point:
 # finite: one more call for that, after a long calculation of forces, costs what the engine takes for ten molecules.
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def all_finite(values):  # type: ignore[no-untyped-def]
     """Whether no number is NaN or infinite."""
     # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
@@ -137,7 +137,7 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
     )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
     b, g, w = flat(v), flat(f), flat(weights)
@@ -146,7 +146,7 @@ def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
     return sound
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
     b, p, g, w = flat(v), flat(push), flat(f), flat(weights)
@@ -156,7 +156,7 @@ def land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
     return sound
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     """Take the kick and `push` into the velocity, then out = x + h v; sums by Dekker's addition.
 
@@ -179,7 +179,7 @@ def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped
     return sound
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     """The same from a start without remainders; `x_low`, `v` and `push` are only written to."""
     sound = kick == 0.0 or all_finite(f)
@@ -198,7 +198,7 @@ def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[
     return sound
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
     a, b0, b, c, g, w = flat(x), flat(v0), flat(v), flat(out), flat(f), flat(weights)
@@ -208,7 +208,7 @@ def fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def
     return sound
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def beyond(x, atoms, anchor, ratio):  # type: ignore[no-untyped-def]
     """Whether the anchor is farther from the origin than `ratio` times any atom is from the anchor."""
     a, b = flat(x), 3 * anchor

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -368,7 +369,7 @@ def _worth_it(chains: Chains, others: int) -> bool:
     return len(chains.rows) > least or len(chains.rows) + others > MOST_ROWS
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
     if fresh:
@@ -378,7 +379,7 @@ def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables):  # typ
     return packed_positions(out, x, work[1], 1.0 / h, tables) if sound else -2
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables):  # type: ignore[no-untyped-def]
     """The end of a step, the first stage of the next, or both, where nothing adds up remainders.
 
@@ -409,7 +410,7 @@ def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables):  # type:
     return took if 0 <= took <= MANY_ITERATIONS else _ENGINE
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def many_flights(  # type: ignore[no-untyped-def]
     what,
     fractions,
@@ -463,7 +464,7 @@ def many_flights(  # type: ignore[no-untyped-def]
     return took
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def _ended(sound, x, v, tables):  # type: ignore[no-untyped-def]
     """Velocities projected after a kick, sound or not; 0, or what `Flights.ended` has to do."""
     if not sound:
@@ -473,7 +474,7 @@ def _ended(sound, x, v, tables):  # type: ignore[no-untyped-def]
     return _after(x, v, tables) if packed_tangents(x, v, tables) else -1
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def _after(x, v, tables):  # type: ignore[no-untyped-def]
     if not all_finite(v):
         return _BAD_VELOCITY

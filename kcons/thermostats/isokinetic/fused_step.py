@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.solvers.fused_distances import MORE, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import integers, piece
@@ -133,14 +133,14 @@ class IsokineticStages(Tables):
         return status, speed, pace, square, factor, log_growth
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _fly(x, u, h, out):  # type: ignore[no-untyped-def]
     a, b, c = x.ravel(), u.ravel(), out.ravel()
     for i in range(a.size):
         c[i] = a[i] + h * b[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _push_others(u, push, t, weights, masses, out):  # type: ignore[no-untyped-def]
     """out = u + t push for atoms that move and are not thermostatted."""
     a, b, c, w, m = u.ravel(), push.ravel(), out.ravel(), weights.ravel(), masses.ravel()
@@ -149,14 +149,14 @@ def _push_others(u, push, t, weights, masses, out):  # type: ignore[no-untyped-d
             c[i] = a[i] + t * b[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _accelerations(f, weights, out):  # type: ignore[no-untyped-def]
     a, w, c = f.ravel(), weights.ravel(), out.ravel()
     for i in range(a.size):
         c[i] = w[i] * a[i]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables):  # type: ignore[no-untyped-def]
     """`IsokineticStages.before`; status, log of the growth, and iterations."""
     header = integers(tables)
@@ -178,7 +178,7 @@ def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables):  # type: ignore
     return (DONE if 0 <= iterations <= MANY_ITERATIONS else ENGINE), log_growth, iterations
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def project_and_kick(x, u, f, twice, t, out, pace, tables):  # type: ignore[no-untyped-def]
     """`IsokineticStages.after`; status, f.M_par^+ f, factor, and log of the growth."""
     header = integers(tables)

@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 
 #: Sums may be taken in any order, so that they are compiled to vector instructions; NaN stays NaN.
@@ -47,7 +47,7 @@ def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
     return Weights(*_weights(aligned, square, twice, t))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _weights(aligned, square, twice, t):  # type: ignore[no-untyped-def]
     a = aligned / twice
     c2 = square / twice if square > 0 else 0.0
@@ -106,7 +106,7 @@ def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t:
 # -- sums over the atoms ----------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, nogil=True, fastmath=_SUMS)
 def sums(u, pace, masses):  # type: ignore[no-untyped-def]
     """u^T M u, u^T M F and F^T M F, flat."""
     a, b, m = u.ravel(), pace.ravel(), masses.ravel()
@@ -119,7 +119,7 @@ def sums(u, pace, masses):  # type: ignore[no-untyped-def]
     return uu, up, pp
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, nogil=True, fastmath=_SUMS)
 def square_sum(u, masses):  # type: ignore[no-untyped-def]
     """u^T M u."""
     a, m = u.ravel(), masses.ravel()
@@ -129,7 +129,7 @@ def square_sum(u, masses):  # type: ignore[no-untyped-def]
     return uu
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, nogil=True, fastmath=_SUMS)
 def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
     """u.f and f.M^-1 f of the atoms whose mass is not 0 here; `weights` is 1/m."""
     a, b, w, m = u.ravel(), f.ravel(), weights.ravel(), masses.ravel()
@@ -144,7 +144,7 @@ def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
 # -- kicks, in one call -----------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def before_drift(u, f, weights, masses, square, twice, t, many, out):  # type: ignore[no-untyped-def]
     """out = keep u + push M^-1 f, with forces that are not projected; log of the growth, and whether it was done.
 
@@ -160,7 +160,7 @@ def before_drift(u, f, weights, masses, square, twice, t, many, out):  # type: i
     return log_growth, True
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def after_drift(u, pace, masses, twice, t, out):  # type: ignore[no-untyped-def]
     """Bring u to its length, and out = keep u + push F.
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from kcons.constraints.compilation import njit
 
-@numba.njit(cache=True, nogil=True)
+
+@njit(cache=True, nogil=True)
 def centres(v, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
     """Velocity of the centre of mass of each cluster that has a sphere for it, else 0, shape (n_clusters, 3)."""
     found = np.zeros((len(totals), 3))
@@ -27,7 +28,7 @@ def centres(v, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def products(v, a, middle_v, middle_a, n_spheres, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
     """u.u', mass-weighted, on each sphere."""
     found = np.zeros(n_spheres)
@@ -45,7 +46,7 @@ def products(v, a, middle_v, middle_a, n_spheres, cluster, spheres, masses, tota
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def combine(v, a, middle_v, middle_a, keep, push, cluster, spheres):  # type: ignore[no-untyped-def]
     """u = keep u + push u' on each sphere; what has no sphere stays."""
     for i in range(len(cluster)):
@@ -63,7 +64,7 @@ def combine(v, a, middle_v, middle_a, keep, push, cluster, spheres):  # type: ig
             v[i, k] = inner
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def rescale(v, w, squares, with_w, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
     """Bring y back onto its sphere: all of it, or u alone, with w as it is."""
     n = len(squares)
@@ -84,7 +85,7 @@ def rescale(v, w, squares, with_w, cluster, spheres, masses, totals):  # type: i
     combine(v, v, middle, middle, keep, push, cluster, spheres)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def turn(v, w, a, t, squares, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
     """The kick: y' = (1 - y y^T/R^2)(F, 0) over a time t, in closed form, with the accelerations a on the constraints.
 
@@ -116,7 +117,7 @@ def turn(v, w, a, t, squares, cluster, spheres, masses, totals):  # type: ignore
     rescale(v, w, squares, True, cluster, spheres, masses, totals)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def stir(v, w, noise, own_noise, keep, spread, squares, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
     """y = R (keep y + spread xi)/|keep y + spread xi|, with noise that is on the constraints."""
     for i in range(len(cluster)):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.periodic.one_piece import follow_parents
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):  # type: ignore[no-untyped-def]
     """By how much atoms move where the cell becomes cell (1 + `change`), each in the image that it is stored in.
 
@@ -57,7 +57,7 @@ def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):
     return torn
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def work_of_shapes(x, f, label, weight, opened, atoms, parents, lattice):  # type: ignore[no-untyped-def]
     """Sum of (r_i - R) (x) f_i over atoms, R the centre of their piece or zero where it stays, shape (3, 3)."""
     y = x.copy()

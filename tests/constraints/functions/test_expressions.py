@@ -41,6 +41,69 @@ def test_what_is_no_formula_is_named(formula, item, message):
     assert caught.value.item == item
 
 
+#: What takes for ever or all memory, or is no formula in other ways: some text, and what is said of it.
+FROM_OTHERS = {
+    "x1*9**9**9": r"9 \*\* 9 \*\* 9 is inf",
+    "x1*10**-9**9": "a power above 1000|a number above",
+    "x1*0.5**10**9": "a power above 1000",
+    "x1+2**2**40": "is inf",
+    "x1**(2**40)": "a power above 1000",
+    "(((9*x1)**99)**99)**99": "a power above 1000",
+    "exp(1000*(1000*(1000*log(9*x1))))": "a power above 1000",
+    "pi**pi**pi**pi*x1": "is inf",
+    "x1*1e200*1e200": "a number above",
+    "x1*1e999": "a number above",
+    "x1+" + "9" * 400: "a number above",
+    "x1+0x" + "f" * 4000: "a number above",
+    "x1+log(0)": "is -inf",
+    "x999999": "names atom 999999 of a row and not atom 1",
+    "x99999999999999999999999": "is not known",
+    "+".join(["x1"] * 900): "more than 200 levels",
+    "x1+" * 5000 + "x1": "at most 10000",
+    "-" * 3000 + "x1": "nested",
+    "(" * 3000 + "x1" + ")" * 3000: "nested",
+    "sin(" * 60 + "x1" + ")" * 60: "second derivatives of more than",
+    "*".join(f"sin(x{k})" for k in range(1, 60)): "second derivatives of more than",
+    "x1*sin": "sin in .* is a function; write what it is of",
+    "x1*True": "is not allowed",
+    "x1\ud800": "cannot be read",
+    "x1\0": "cannot be read",
+    "x\u0661": "is not known",
+}
+
+
+@pytest.mark.parametrize("formula", FROM_OTHERS, ids=range(len(FROM_OTHERS)))
+def test_formulas_without_bound_are_refused_at_once(formula):
+    with pytest.raises(InputError, match=FROM_OTHERS[formula]) as caught:
+        code_of(formula, 1, ())
+    assert len(str(caught.value)) < 500 and caught.value.item
+
+
+@pytest.mark.parametrize(
+    ("formula", "found"),
+    [
+        ("(x1 - x2 + y1 - y2)**60", True),  # multiplied out it has thousands of parts
+        ("sin(x1)*cos(x2) - cos(x1)*sin(x2)", True),
+        ("acos((x1 - x2)/2)", True),
+        ("abs(x1 - x2)", True),
+        ("(x1 + y1 + z1 + x2 + y2 + z2)**60", False),
+        ("abs(x1 - 5e8) + x1 + x1 - x2", False),  # on this side of the wall it is x1 - x2 + 5e8
+        ("x1 - x2 + 1e-30*x1", False),
+        ("exp(exp(exp(exp(x1 - x2))))", True),
+        ("exp(exp(exp(exp(x1 + x2))))", False),
+        ("(x1 - x2)**((x1 - x2)**((x1 - x2)**(x1 - x2)))", True),
+        ("(x1 - x2)**0 + y1 - y2", True),
+    ],
+)
+def test_shifts_are_found_out_where_multiplying_out_has_no_end(formula, found):
+    assert code_of(formula, 2, ()).invariant == found
+
+
+def test_large_numbers_are_written_as_such():
+    code = code_of("x1*12345678901234567890*1e100 + (9*x1)**40", 1, ())
+    assert code.plain_first(2.0, 0.0, 0.0, 0.0)[0] == pytest.approx(2 * 12345678901234567890e100 + 18.0**40)
+
+
 def test_a_gradient_of_zero_is_refused_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     with pytest.raises(InputError, match="does not change with the positions"):
@@ -101,20 +164,43 @@ print(motion.project_positions(x + 0.01, x)[0].tolist())
 """
 
 
+def projected(folder: Path, absent: str = "nothing") -> tuple[str, str]:
+    """What the program prints, and what it says besides."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(absent=absent)],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(expressions.__file__).parents[3],
+        env={**os.environ, "XDG_CACHE_HOME": str(folder), "NUMBA_CACHE_DIR": ""},
+    )
+    return done.stdout, done.stderr
+
+
 def test_another_process_needs_neither_sympy_nor_the_compiler(tmp_path):
     """What the first one wrote serves the second one."""
-    outputs = []
-    for absent in ("nothing", "sympy"):
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM.format(absent=absent)],
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=Path(expressions.__file__).parents[3],
-            env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), "NUMBA_CACHE_DIR": "", "NUMBA_DEBUG_CACHE": "1"},
-        )
-        outputs.append(done.stdout)
-    kept = [[line for line in out.splitlines() if "kcons-formulas" in line] for out in outputs]
-    assert any("data saved" in line for line in kept[0]) and any("data loaded" in line for line in kept[1])
-    assert not any("data saved" in line for line in kept[1])
-    assert outputs[0].splitlines()[-1] == outputs[1].splitlines()[-1]
+    first, _ = projected(tmp_path)
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert {path.suffix for path in files} == {".py", ".nbi", ".nbc"}
+    assert projected(tmp_path, "sympy") == (first, "")
+    assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "\n".join(text.rstrip().splitlines()[:-1]) + "\n",
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: text.replace("2", "3"),
+    ],
+    ids=["a line", "half", "empty", "other numbers"],
+)
+def test_a_file_that_is_damaged_is_written_anew_and_that_is_said(tmp_path, damage):
+    first, _ = projected(tmp_path)
+    (file,) = tmp_path.rglob("formula_*.py")
+    whole = file.read_text()
+    file.write_text(damage(whole))
+    again, said = projected(tmp_path)
+    assert again == first and file.read_text() == whole
+    assert said.count("is damaged") == 1 and file.name in said

@@ -86,6 +86,9 @@ def test_files_keep_formulas():
     assert from_dict(Formula("x1", [0, 1]).todict()).n_rows == 2
     with pytest.raises(InputError, match=r"\['values'\] are missing"):
         from_dict({key: value for key, value in row.todict().items() if key != "values"})
+    for wrong in ([1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]], None):
+        with pytest.raises(InputError, match="values"):
+            from_dict({**row.todict(), "values": wrong})
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,8 @@ def test_files_keep_formulas():
         (lambda: Formula("x1", 0, {"x7": 1.0}), "x7", "cannot be the name"),
         (lambda: Formula("x1", 0, {"sin": 1.0}), "sin", "cannot be the name"),
         (lambda: Formula("x1", 0, {"lambda": 1.0}), "lambda", "cannot be the name"),
+        (lambda: Formula("abs(x1)*copysign", 0, {"copysign": 1.0}), "copysign", "cannot be the name"),
+        (lambda: Formula("x1", 0, {3: 1.0}), "parameters", "3 cannot be the name of a parameter; give text"),
         (lambda: Formula("x1 - b", 0, {"a": 1.0}), "b", "known are .*a. Give it"),
     ],
 )

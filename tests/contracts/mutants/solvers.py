@@ -1,6 +1,31 @@
 """Mutants of the solvers."""
 
 MUTANTS = [
+    # -- compiled kernels and formulas --
+    (
+        "constraints/compilation.py",
+        "function.linkage = llvm.Linkage.internal",
+        "function.linkage = llvm.Linkage.linkonce_odr",
+        "tests/constraints/test_compilation.py::test_a_kernel_calls_its_own_copies_of_others",
+    ),
+    (
+        "constraints/compilation.py",
+        "if text == _headed(content):",
+        "if text:",
+        "tests/constraints/test_compilation.py::test_damaged_files_are_made_anew_and_said_once",
+    ),
+    (
+        "constraints/functions/expressions.py",
+        "power *= max(abs(evaluated(node.right, known)), 1.0)",
+        "power = max(abs(evaluated(node.right, known)), 1.0)",
+        "tests/constraints/functions/test_expressions.py::test_formulas_without_bound_are_refused_at_once",
+    ),
+    (
+        "constraints/functions/expressions.py",
+        "lambda value: next(signs) * value",
+        "abs",
+        "tests/constraints/functions/test_expressions.py::test_shifts_are_found_out_where_multiplying_out_has_no_end",
+    ),
     # -- any rows --
     (
         "solvers/general_clusters.py",

@@ -175,7 +175,7 @@ def test_leapfrog_is_verlet_of_openmm():
     integrator.step(100)
     assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
     with pytest.raises(ConvergenceError, match="step 101"):
-        integrator.setStepSize(0.1)
+        integrator.setStepSize(0.1 * unit.picosecond)
         integrator.step(1)
     assert part.step_multipliers.shape == (21,)
 

@@ -6,6 +6,7 @@ import numpy as np
 import openmm
 import pytest
 from carried_systems import context_of, free, peptide, state_of
+from openmm import unit
 
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
@@ -21,19 +22,19 @@ from kcons.openmm.integrator.precision import Precision
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
 def test_a_step_too_large_is_taken_back(platform):
     part = hold(system := free([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
-    integrator = ProjectedIntegrator(0.1, parts=[part])
+    integrator = ProjectedIntegrator(0.1 * unit.picosecond, parts=[part])
     context = context_of(system, integrator, platform)
     context.setPositions([[-0.5, 0, 0], [0.5, 0, 0]])
     context.setVelocities([[0, -0.5, 0], [0, 0.5, 0]])
     integrator.step(3)
-    integrator.setStepSize(1.5)  # no solution where angle would be asin(1.5)
+    integrator.setStepSize(1.5 * unit.picosecond)  # no solution where angle would be asin(1.5)
     before = state_of(context)
     with pytest.raises(ConvergenceError, match="step 4: time step too large") as caught:
         integrator.step(5)
     assert caught.value.step == 4
     assert caught.value.atoms == (0, 1)
     assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
-    integrator.setStepSize(0.1)
+    integrator.setStepSize(0.1 * unit.picosecond)
     integrator.step(3)
     part.check(context)
 

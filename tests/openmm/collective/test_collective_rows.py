@@ -27,6 +27,7 @@ from collective_cases import (
     state_of,
     with_variable,
 )
+from openmm import unit
 from openmm_systems import PLATFORMS
 
 from kcons import ConstraintSet
@@ -153,7 +154,7 @@ def test_a_step_too_large_is_taken_back(platform, constrained, scheme):
     )
     integrator.step(3)
     x, v = state_of(context)
-    integrator.setStepSize(1.0)
+    integrator.setStepSize(1.0 * unit.picosecond)
     with pytest.raises(ConvergenceError, match=r"step 4: row 0 \(my bond\) is off by .* iterations") as caught:
         integrator.step(2)
     assert caught.value.row == 0
@@ -319,8 +320,8 @@ def test_pushes_are_summed_only_where_rows_meet():
     integrator = ProjectedIntegrator(0.002, parts=[part])
     sums = [k for k in range(integrator.getNumComputations()) if integrator.getComputationStep(k)[0] == 2]
     # Whether x or v, and x, were moved; the sizes at the start of a call, or of a step within; for each row its rate
-    # and its size.
-    assert len(sums) == 2 + 4 + 4 + 8
+    # and its size; the kinetic energy at the end of a call.
+    assert len(sums) == 2 + 4 + 4 + 8 + 1
 
 
 def test_terms_of_a_force_as_rows():

@@ -121,7 +121,7 @@ def test_a_step_that_failed_does_not_move_the_target():
     context, integrator, part = held_chain([Row(bond(0, 3), None, rate=0.2)])
     integrator.step(5)
     x, v = state_of(context)
-    integrator.setStepSize(2.0)
+    integrator.setStepSize(2.0 * unit.picosecond)
     with pytest.raises(ConvergenceError):
         integrator.step(1)
     integrator.setStepSize(0.002)

@@ -85,7 +85,7 @@ def test_order(name, scheme):
     span, many, runs = RUNS[name]
 
     def end(scheme, n):
-        integrator = ProjectedIntegrator(span / n, scheme, tolerance=1e-14, ensemble=Isokinetic())
+        integrator = ProjectedIntegrator(span / n * unit.picosecond, scheme, tolerance=1e-14, ensemble=Isokinetic())
         return state_of(run(system, integrator, x, v, n))[0]
 
     exact = end("isokinetic6", many)

@@ -34,7 +34,7 @@ def relaxed(n):
 
 def waters(dt=0.004, scheme="rattle", kind=WaysBackIntegrator, platform="Reference", n=8, steps=(2, 5), **options):
     system, _ = water_box(n)
-    integrator = kind(dt, scheme)
+    integrator = kind(dt * unit.picosecond, scheme)
     context = context_of(system, integrator, platform)
     context.setPositions(relaxed(n))
     return system, HamiltonianMonteCarlo(context, 300, steps, 3, **{"keep": 0.4} | options)
@@ -168,7 +168,7 @@ def trimer(steps=(3, 8), dt=0.15, spring=0.0, **options):
         for k in range(3):
             force.addParticle(k)
         system.addForce(force)
-    integrator = WaysBackIntegrator(dt)
+    integrator = WaysBackIntegrator(dt * unit.picosecond)
     context = context_of(system, integrator)
     context.setPositions(np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
     return HamiltonianMonteCarlo(context, 1 / GAS_CONSTANT, steps, 21, **options)
@@ -273,7 +273,7 @@ def test_a_start_near_the_constraints_is_brought_onto_them():
     """Once: a rejected proposal goes back to where it was put."""
     sampler = trimer(steps=1, dt=0.01, spring=1.0)
     sampler.context.setPositions(np.array([[1.01, 0, 0], [0, 0, 0], [0, 0.99, 0]]))
-    sampler.integrator.setStepSize(10.0)  # rejected
+    sampler.integrator.setStepSize(10.0 * unit.picosecond)  # rejected
     sampler.step(1)
     x = state_of(sampler.context)[0]
     assert sampler.counts.accepted == 0 and abs(np.linalg.norm(x[0] - x[1]) - 1) < 1e-9

@@ -137,7 +137,7 @@ def test_circles_keep_their_radius_and_are_canonical(platform):
     for k in range(40):
         soft.addParticle(k)
     system.addForce(soft)
-    integrator = ProjectedIntegrator(0.04, ensemble=IsokineticCircles(300, 5.0, TWO))
+    integrator = ProjectedIntegrator(40 * unit.femtosecond, ensemble=IsokineticCircles(300, 5.0, TWO))
     integrator.setRandomNumberSeed(5)
     context = run(system, integrator, x, v, 50, platform)
     masses = np.array([system.getParticleMass(k)._value for k in range(40)])[:, None]
@@ -157,7 +157,7 @@ def test_the_circular_kick_is_that_of_the_core():
 
     system, x, v = trapped(3)
     masses = np.array([10.0, 11.0, 12.0])
-    integrator = ProjectedIntegrator(0.05, ensemble=IsokineticCircles(300, 1e-30, TWO))
+    integrator = ProjectedIntegrator(50 * unit.femtosecond, ensemble=IsokineticCircles(300, 1e-30, TWO))
     context = run(system, integrator, x, v, 1)
     w = np.array([list(row) for row in integrator.getPerDofVariableByName("w")])
     spheres = np.arange(9).reshape(3, 3)

@@ -193,6 +193,19 @@ def test_rows_that_are_near_are_put_right_in_the_first_step(make, off, near, cap
     np.testing.assert_array_equal(state_of(context), [x, v])
 
 
+def test_rows_that_constraints_of_the_system_pull_off_are_put_right_too():
+    """A row that shares particles with them, on its target at the start, as coordinates of a file are."""
+    system, x, _ = alanine()
+    row = openmm.CustomBondForce("r")
+    row.addBond(0, 10)
+    x = x + np.random.default_rng(1).normal(0, 1e-6, x.shape)
+    rows = CollectiveRows(system, [row], positions=x, meets_system=True)
+    context = started(system, integrator := ProjectedIntegrator(1e-3, parts=[rows]), x)
+    integrator.step(2)
+    assert abs(rows.residuals(context)[0]) < 1e-10
+    integrator.check()
+
+
 def test_a_part_that_is_far_off_keeps_the_others_where_they_are():
     system, x, v, near = on_a_plane()
     x[3, 2] += 0.004
@@ -446,7 +459,7 @@ def test_the_leapfrog_comes_back_with_its_kinetic_energy():
     context = started(system, integrator, x, v)
     integrator.step(10)
     kinetic = context.getState(energy=True).getKineticEnergy()
-    integrator.setStepSize(50)
+    integrator.setStepSize(50 * unit.picosecond)
     with pytest.raises(KconsError):
         integrator.step(30)
     integrator.setStepSize(1e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 
 import numpy as np
 import openmm
@@ -214,14 +215,20 @@ def test_leapfrog_at_rest_has_no_kinetic_energy(platform):
 
 
 def ways(program):
-    """Through its blocks, each left out or gone through once: what OpenMM lists when a Context is first used."""
-    outer, here = [], 1
-    for kind, _, _ in program.operations:
+    """Through its blocks, each left out or gone through once: what OpenMM lists when a Context is first used.
+
+    Blocks that neither need forces nor change positions it passes over.
+    """
+    outer, here, counts = [], 1, False
+    for kind, variable, expression in program.operations:
         if kind in ("when", "usual", "loop"):
-            outer.append(here)
-            here = 1
+            outer.append((here, counts))
+            here, counts = 1, False
         elif kind == "end":
-            here = outer.pop() * (1 + here)
+            before, also = outer.pop()
+            here, counts = before * (1 + here if counts else here), counts or also
+        else:
+            counts = counts or kind == "others" or variable == "x" or bool(re.search(r"\b(f|energy)\d*\b", expression))
     return here
 
 

@@ -26,7 +26,7 @@ from openmm_systems import (
     water_box,
 )
 
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.integrator.guard import Guard
 
@@ -363,3 +363,47 @@ def test_reporters():
     gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
     kinetic = np.array([row[2] for row in rows])
     np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
+
+
+# -- checks where calls end -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("through", ["calls", "a Simulation"])
+def test_the_ends_of_calls_are_checked(through):
+    """OpenMM's solvers do not converge on redundant rows, and nothing is due for a thousand steps."""
+    turns = np.arange(6) * np.pi / 3
+    system, x = openmm.System(), 0.14 * np.c_[np.cos(turns), np.sin(turns), np.zeros(6)]
+    for _ in x:
+        system.addParticle(12.0)
+    for i, j in [*[(k, (k + 1) % 6) for k in range(6)], (0, 3), (1, 4), (2, 5)]:
+        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    integrator = RattleIntegrator(2e-3)
+    context = started(system, integrator, x)
+    context.setVelocitiesToTemperature(300, 3)
+    simulation = app.Simulation.__new__(app.Simulation)
+    simulation.context, simulation.integrator, simulation.reporters = context, integrator, []
+    simulation._usesPBC = False
+    step = integrator.step if through == "calls" else simulation.step
+    with pytest.raises(ConvergenceError, match=r"is off by .*The Context is back at step 0"):
+        step(100)
+    assert context.getStepCount() == 0
+
+
+@pytest.mark.parametrize(("given", "checks"), [({}, 1), ({"check_every": 1000}, 0), ({"check_every": 0}, 0)])
+def test_checks_of_ends_are_spared_like_others(monkeypatch, given, checks):
+    """The first says what one costs; with an interval that was asked for, ends are none of it."""
+    system, x, v = dumbbell()
+    integrator = RattleIntegrator(1e-4, **given)
+    context = started(system, integrator, x, v)
+    integrator.step(0)
+    made, check = [], Guard.check
+
+    def dear(self):
+        made.append(self.since_check)
+        check(self)
+        self._cost = 1e6
+
+    monkeypatch.setattr(Guard, "check", dear)
+    for _ in range(20):
+        integrator.step(10)
+    assert len(made) == checks and context.getStepCount() == 200

@@ -7,7 +7,7 @@ import pytest
 from openmm_parts import HeldCoordinates
 
 from kcons.constraints import Sphere
-from kcons.openmm import Isokinetic, ProjectedIntegrator, SurfaceIntegrator
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, SurfaceIntegrator
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.step_variables import VARIABLES, use
 
@@ -33,6 +33,7 @@ def integrators():
     yield ProjectedIntegrator(1e-3, parts=[held()])
     yield ProjectedIntegrator(1e-3, "suzuki4", parts=[held(evaluates=True)])
     yield ProjectedIntegrator(1e-3, ensemble=Isokinetic(300))
+    yield ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1.0))
     yield SurfaceIntegrator(1e-3, surfaces=Sphere([0], (0, 0, 0), 1.0), n_particles=2)
     yield SurfaceIntegrator(1e-3, "suzuki4", surfaces=Sphere([0], (0, 0, 0), 1.0), n_particles=2)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import openmm
 import pytest
@@ -13,10 +15,11 @@ from openmm_systems import (
     started,
     state_of,
     total_energy,
+    water_box,
 )
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator, worst_length
+from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
 from kcons.openmm.integrator.system_checks import SystemRows, refuse_motion_remover
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
@@ -192,3 +195,46 @@ def test_triangles_with_unequal_masses_beside_the_apex_are_refused(order, heavie
         return
     with pytest.raises(UnsupportedError, match=r"particles 0, 1 and 2 .* SETTLE"):
         integrator.step(1)
+
+
+@pytest.mark.parametrize("length", [0.0, -0.1, np.nan, np.inf])
+def test_a_length_that_cannot_be_held_is_refused(length):
+    system = openmm.System()
+    for mass in (23.0, 23.0, 0.0, 0.0):
+        system.addParticle(mass)
+    system.addConstraint(2, 3, length)  # between particles without mass OpenMM holds nothing
+    system.addConstraint(0, 1, 0.1)
+    x = np.array([[0.0, 0, 0], [0.1, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])
+    kept = started(system, integrator := ProjectedIntegrator(2e-3), x)
+    integrator.step(1)
+    del kept
+    system.setConstraintParameters(1, 0, 1, length)
+    for ask in (lambda context: integrator.step(1), worst_length):
+        context = started(system, integrator := ProjectedIntegrator(2e-3), x)
+        with pytest.raises(
+            InputError, match=r"constraint 1 of the System \(particles 0 and 1\) has a length of"
+        ) as caught:
+            ask(context)
+        assert caught.value.atoms == (0, 1)
+
+
+BAROSTATS = {
+    "isotropic": lambda: openmm.MonteCarloBarostat(1, 300),
+    "anisotropic": lambda: openmm.MonteCarloAnisotropicBarostat([1, 1, 1], 300),
+    "membrane": lambda: openmm.MonteCarloMembraneBarostat(1, 0, 300, 0, 0),
+    "flexible": lambda: openmm.MonteCarloFlexibleBarostat(1, 300, 25, True),
+}
+
+
+@pytest.mark.parametrize(("one", "two"), list(itertools.combinations_with_replacement(BAROSTATS, 2)))
+def test_two_barostats_are_refused(one, two):
+    system, x = water_box(8)
+    for name in (one, two):
+        system.addForce(BAROSTATS[name]())
+    context = started(system, integrator := ProjectedIntegrator(2e-3, ensemble=Langevin(300, 1.0)), x)
+    with pytest.raises(UnsupportedError, match=r"the System has 2 barostats \(.*Remove all but one"):
+        integrator.step(1)
+    system.getForce(system.getNumForces() - 1).setFrequency(0)  # switched off
+    context = started(system, integrator := ProjectedIntegrator(2e-3, ensemble=Langevin(300, 1.0)), x)
+    integrator.step(1)
+    assert context.getStepCount() == 1

@@ -8,6 +8,7 @@ from threading import Thread
 import numpy as np
 import openmm
 import pytest
+from openmm import unit
 from openmm_systems import context_of
 from surface_cases import (
     POSITIONS,
@@ -71,7 +72,7 @@ def test_parts_that_are_compiled_go_where_the_others_go(kind, options):
 def test_a_step_without_landing_is_told_by_openmm_s_own_arithmetic_too():
     system = system_of()
     parts = surface_parts(Sphere([0], [0, 0, 0], float(np.linalg.norm(POSITIONS[0]))), system=system, compiled=True)
-    integrator = SurfaceIntegrator(1.0, parts=parts, ensemble=Langevin(300, 0.0))
+    integrator = SurfaceIntegrator(1.0 * unit.picosecond, parts=parts, ensemble=Langevin(300, 0.0))
     context = context_of(system, integrator, "Reference")
     context.setPositions(POSITIONS)
     context.setVelocities(100 * VELOCITIES)

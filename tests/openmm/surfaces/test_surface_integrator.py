@@ -108,7 +108,7 @@ def too_fast(scheme, platform, compiled=False, kind="sphere"):
         "formula": [ExpressionSurface([0, 2], "x^2+y^2+z^2-1")],
         "both": [Sphere([0], [0, 0, 0], 1.0), Torus([2], [0, 0, 0], [0, 0, 1], 0.7, 0.3)],
     }[kind]
-    integrator = SurfaceIntegrator(0.1, scheme, surfaces=surfaces, system=system, compiled=compiled)
+    integrator = SurfaceIntegrator(0.1 * unit.picosecond, scheme, surfaces=surfaces, system=system, compiled=compiled)
     x = np.array([[1.0, 0, 0], [5, 5, 5], [0, 1.0, 0]])
     return integrator, started(system, integrator, x, [[0, 0.5, 0], [1, 2, 3], [0, 0, 0.8]], platform)
 
@@ -151,7 +151,9 @@ def test_a_step_without_solution_is_taken_back(scheme, kind, compiled, platform)
 
 def falling(dt):
     system = system_of(potential="200*z", springs=0)
-    integrator = SurfaceIntegrator(dt, "rattle", surfaces=[Sphere([0], [0, 0, 0], 1.0)], system=system)
+    integrator = SurfaceIntegrator(
+        dt * unit.picosecond, "rattle", surfaces=[Sphere([0], [0, 0, 0], 1.0)], system=system
+    )
     x = np.array([[0.6, 0, 0.8], [5, 5, 5], [0, 1.0, 0]])
     return integrator, started(system, integrator, x, np.zeros((3, 3)))
 
@@ -185,7 +187,7 @@ def test_forces_that_are_not_finite(kind, scheme):
     # The root of a negative number once particle 1 has moved.
     system = system_of(potential="1e-30*sqrt(10+y-1e6*step(0.9-x)*step(y-0.72))", springs=0)
     surfaces = KINDS[kind](atoms, POSITIONS)
-    integrator = SurfaceIntegrator(0.05, scheme, surfaces=surfaces, system=system, positions=POSITIONS)
+    integrator = SurfaceIntegrator(50 * unit.femtosecond, scheme, surfaces=surfaces, system=system, positions=POSITIONS)
     context = started(system, integrator, POSITIONS, VELOCITIES)
     with pytest.raises(NonFiniteError) as caught:
         integrator.step(200)
@@ -297,7 +299,9 @@ def test_periodic_boxes_do_not_repeat_surfaces():
     bonds = openmm.CustomBondForce("0")
     bonds.setUsesPeriodicBoundaryConditions(True)
     system.addForce(bonds)
-    integrator = SurfaceIntegrator(0.1, surfaces=Cylinder([0], [0, 0, 0], [0, 0, 1], 0.5), system=system)
+    integrator = SurfaceIntegrator(
+        0.1 * unit.picosecond, surfaces=Cylinder([0], [0, 0, 0], [0, 0, 1], 0.5), system=system
+    )
     context = started(system, integrator, [[0.5, 0, 0], [1, 1, 1], [1, 0, 1]], [[0, 0, 1], [0, 0, 0], [0, 0, 0]])
     integrator.step(30)
     assert state_of(context)[0][0] == pytest.approx([0.5, 0, 3.0], abs=1e-12)

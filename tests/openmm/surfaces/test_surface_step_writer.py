@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import openmm
 import pytest
+from openmm import unit
 from openmm_systems import PLATFORMS
 from reference import cases
 from surface_cases import (
@@ -173,7 +174,8 @@ def free_on_sphere(scheme, dt, radius=2.0, center=(0.0, 0.0, 0.0), speed=1.0, pl
     """One particle without forces; turns by speed/radius in the xy plane."""
     system = openmm.System()
     system.addParticle(3.0)
-    integrator = SurfaceIntegrator(dt, scheme, surfaces=Sphere([0], center, radius), system=system, **arguments)
+    surface, step = Sphere([0], center, radius), dt * unit.picosecond
+    integrator = SurfaceIntegrator(step, scheme, surfaces=surface, system=system, **arguments)
     start = np.array([[radius, 0.0, 0.0]]) + center
     return integrator, started(system, integrator, start, [[0.0, speed, 0.0]], platform)
 
@@ -203,7 +205,9 @@ def test_geodesic_flies_great_circles_at_any_time_step(platform):
 
 def test_great_circles_leave_resting_and_free_particles_alone():
     system = system_of(potential="0", springs=0)
-    integrator = SurfaceIntegrator(0.1, "geodesic", surfaces=Sphere([0, 1], [0, 0, 0], 1.0), system=system)
+    integrator = SurfaceIntegrator(
+        0.1 * unit.picosecond, "geodesic", surfaces=Sphere([0, 1], [0, 0, 0], 1.0), system=system
+    )
     x = np.array([[1.0, 0, 0], [0, 1.0, 0], [5.0, 0, 0]])
     context = started(system, integrator, x, [[0, 0, 0], [0, 0, 0.5], [0.1, 0.2, 0.3]])
     integrator.step(10)

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
+from kcons.constraints.compilation import njit
 from kcons.mdanalysis.check.frames.four_rows import (
     all_below,
     four_squares,
@@ -88,17 +88,17 @@ def filled(slack: Any) -> Any:
     return result
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _sum(q):  # type: ignore[no-untyped-def]
     return (lane(q, 0) + lane(q, 1)) + (lane(q, 2) + lane(q, 3))
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _largest(q):  # type: ignore[no-untyped-def]
     return max(max(lane(q, 0), lane(q, 1)), max(lane(q, 2), lane(q, 3)))
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def coordinate(x, place, step):  # type: ignore[no-untyped-def]
     """One number of a frame, as the file holds it."""
     value = np.float64(x[place])
@@ -107,7 +107,7 @@ def coordinate(x, place, step):  # type: ignore[no-untyped-def]
     return value
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def difference(x, i, j, limit, lattice, step):  # type: ignore[no-untyped-def]
     """Vector from the atom at offset j to that at i; its shortest image where it is not shorter than the limit."""
     dx = coordinate(x, i, step) - coordinate(x, j, step)
@@ -118,20 +118,20 @@ def difference(x, i, j, limit, lattice, step):  # type: ignore[no-untyped-def]
     return dx, dy, dz
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _square(x, i, j, limit, lattice, step):  # type: ignore[no-untyped-def]
     i, j = 3 * np.int64(i), 3 * np.int64(j)
     dx, dy, dz = difference(x, i, j, limit, lattice, step)
     return dx * dx + dy * dy + dz * dz
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _four(x, first, second, k, step):  # type: ignore[no-untyped-def]
     """Squared distances of four pairs as they lie."""
     return four_squares_on_grid(x, first, second, k, step) if step > 0.0 else four_squares(x, first, second, k, step)
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _images(square, x, first, second, k, limit, lattice, step):  # type: ignore[no-untyped-def]
     """Squared distances of four pairs by their shortest images."""
     if all_below(square, limit):
@@ -144,7 +144,7 @@ def _images(square, x, first, second, k, limit, lattice, step):  # type: ignore[
     )
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _judged(square, rounding, targets, slack, k):  # type: ignore[no-untyped-def]
     """Deviations of four rows, by how much they exceed what is allowed, and 1 where anything can be told of them."""
     held, allowed = load_quad(targets, k), load_quad(slack, k)
@@ -153,7 +153,7 @@ def _judged(square, rounding, targets, slack, k):  # type: ignore[no-untyped-def
     return off, sizes(off) - rounding - allowed, clear
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _add(sums_by_row, k, off, known, clear):  # type: ignore[no-untyped-def]
     total, rounded, counted = sums_by_row[0], sums_by_row[1], sums_by_row[2]
     store_quad(total, k, load_quad(total, k) + off)
@@ -161,7 +161,7 @@ def _add(sums_by_row, k, off, known, clear):  # type: ignore[no-untyped-def]
     store_quad(counted, k, load_quad(counted, k) + clear)
 
 
-@nb.njit(inline="always")
+@njit(inline="always")
 def _place(q, most, k):  # type: ignore[no-untyped-def]
     """Number of the first of four rows from the k-th on that reaches `most`; -1 if none does."""
     for n, value in enumerate((lane(q, 0), lane(q, 1), lane(q, 2), lane(q, 3))):
@@ -170,7 +170,7 @@ def _place(q, most, k):  # type: ignore[no-untyped-def]
     return -1
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def powers_below(x, powers):  # type: ignore[no-untyped-def]
     """The power of two below the largest coordinate of each atom; infinity where that is no number.
 
@@ -186,7 +186,7 @@ def powers_below(x, powers):  # type: ignore[no-untyped-def]
         result[a] = max(max(one, two), three) & _EXPONENT
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def farthest(x):  # type: ignore[no-untyped-def]
     """Bits of the largest |x| of an array of float32; those of NaN exceed those of numbers."""
     bits = x.view(np.int32)
@@ -196,7 +196,7 @@ def farthest(x):  # type: ignore[no-untyped-def]
     return most
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def lengths(x, rows, cell, rounding, powers, summed):  # type: ignore[no-untyped-def]
     """Deviations of all lengths in one frame.
 
@@ -264,7 +264,7 @@ def lengths(x, rows, cell, rounding, powers, summed):  # type: ignore[no-untyped
     return _sum(sums), _sum(squares), _largest(most), worst, max(row, 0), _largest(coarsest), _sum(seen)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def length_rates(x, v, places, n_rows, cell, step):  # type: ignore[no-untyped-def]
     """Rates of change of the lengths, u . (v_i - v_j): sum of squares, largest, its row."""
     lattice, limit = cell
@@ -284,7 +284,7 @@ def length_rates(x, v, places, n_rows, cell, step):  # type: ignore[no-untyped-d
     return squares, worst, row
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def kinetic(v, masses):  # type: ignore[no-untyped-def]
     """Twice the kinetic energy, and the total momentum, of one frame; `v` of shape (3 n_atoms,)."""
     twice, px, py, pz = 0.0, 0.0, 0.0, 0.0
@@ -302,7 +302,7 @@ def coordinate_grid(x: Any, step: float) -> Any:
     return np.rint(exact * (1.0 / step)) * step if step > 0 else exact
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def triangles(x, rows, cell, rounding, powers, summed):  # type: ignore[no-untyped-def]
     """`lengths` of triangles, such as rigid water: each corner is loaded once.
 
@@ -379,7 +379,7 @@ def triangles(x, rows, cell, rounding, powers, summed):  # type: ignore[no-untyp
     return _sum(sums), _sum(squares), _largest(most), worst, side, max(triangle, 0), _largest(coarsest), _sum(seen)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _gather(words, begin, points, powers):  # type: ignore[no-untyped-def]
     """Coordinates of a frame, atom by atom; see `powers_below`."""
     n = len(points)
@@ -390,7 +390,7 @@ def _gather(words, begin, points, powers):  # type: ignore[no-untyped-def]
     powers_below(points.reshape(-1), powers)
 
 
-@nb.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def look_at(words, begin, points, powers, counts, cells, rounding, corners, singles, found):  # type: ignore[no-untyped-def]
     """`triangles` and `lengths` of all frames of a block.
 

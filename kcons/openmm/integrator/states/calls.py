@@ -7,6 +7,8 @@ call; reading the Context makes them first, see `settle`. So steps in tens cost 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
@@ -85,6 +87,15 @@ class Calls(Integrator):
 
     # -- a call ---------------------------------------------------------------------------------
 
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """The program is executed for the last time in a call, and sums squares of velocities."""
+        self.program.write("ending", 1.0)
+        try:
+            yield
+        finally:
+            self.program.write("ending", 0.0)
+
     def step(self, steps: int) -> None:
         """Make `steps` steps.
 
@@ -111,7 +122,7 @@ class Calls(Integrator):
             block = min(steps, max(self.check_every - guard.since_check, 1)) if self.check_every else steps
             check_is_due = 0 < self.check_every <= guard.since_check + block
             goes_on = self.unseen and block == steps and not check_is_due
-            done = self._run_block(guard, block, to_the_end=not goes_on)
+            done = self._run_block(guard, block, to_the_end=not goes_on, ends=block == steps)
             guard.count(done)
             owed = block - done
             steps -= block
@@ -120,7 +131,7 @@ class Calls(Integrator):
             guard.note_surroundings()
         self._owe(owed)
 
-    def _run_block(self, guard: Guard, steps: int, to_the_end: bool) -> int:
+    def _run_block(self, guard: Guard, steps: int, to_the_end: bool, ends: bool) -> int:
         """Make steps, with the shorter program for those after which the state is not read; how many were made."""
         unseen = steps - self._plan.observed if self._plan.lazy and not guard.in_parts else 0
         if self._plan.lean:
@@ -130,23 +141,29 @@ class Calls(Integrator):
         if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
             self.program.write("between", 1.0)
             try:
-                self._run(guard, unseen)
+                self._run(guard, unseen, ends and not to_the_end)
             finally:
                 self.program.write("between", 0.0)
             made = unseen
             if not to_the_end:
                 return made
-        self._run(guard, steps - made)
+        self._run(guard, steps - made, ends)
         return steps
 
-    def _run(self, guard: Guard, steps: int) -> None:
+    def _run(self, guard: Guard, steps: int, ends: bool) -> None:
+        """Make steps; with the last of them a call may end."""
         context, dt = guard.context, self.getStepSize()._value
         time, first = context.getTime().value_in_unit(unit.picosecond), context.getStepCount()
         before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
         for part in self.parts:
             part.begin_run()
         try:
-            self.program.run(context, steps, self._plan.phases if guard.in_parts else 1)
+            phases = self._plan.phases if guard.in_parts else 1
+            summed = ends and guard.sums
+            self.program.run(context, steps - summed, phases)
+            if summed:
+                with self.ending():
+                    self.program.run(context, 1, phases)
         except openmm.OpenMMException as error:
             guard.put_back()
             if "NaN" not in str(error):
@@ -166,3 +183,5 @@ class Calls(Integrator):
                 self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             raise failure
+        if ends:
+            guard.look()

@@ -8,13 +8,14 @@ from typing import Any, Self, TypeVar
 
 import openmm
 
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.schemes import LEAPFROG, SCHEMES
 from kcons.openmm.integrator.states.serialization import ensemble_in, note_in, note_of, note_of_ensemble, read_plain
 from kcons.openmm.integrator.step_variables import VARIABLES
+from kcons.openmm.quantities import relative_tolerance
 from kcons.steppers.splitting import Splitting
 
 _Kind = TypeVar("_Kind", bound=Integrator)
@@ -75,7 +76,10 @@ def as_projected(
     wanted = program_of(integrator)
     for scheme in _candidates(integrator, bool(parts)):
         making = (integrator.getStepSize(), scheme, parts, integrator.getConstraintTolerance(), check_every, ensemble)
-        made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
+        try:
+            made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
+        except UnsupportedError:  # no integrator of this ensemble and these parts has this scheme
+            continue
         if program_of(made) == wanted:
             apply_settings(made, settings_of(integrator) | {"settings": {}})  # the ensemble is the one that is given
             return made
@@ -155,16 +159,16 @@ class Copies(Integrator):
     def _of_note(cls, plain: openmm.CustomIntegrator, note: dict[str, Any], **arguments: Any) -> Self:
         if not note:
             return as_projected(cls, plain, **arguments)
-        if note["parts"] and not arguments.get("parts"):
+        if note.get("parts") and not arguments.get("parts"):
             raise InputError(
                 f"the integrator in the file holds {note['parts']} parts, which no file contains; read it by "
                 "ProjectedIntegrator.from_xml(text, parts=[...]) with the same parts as when it was made",
                 item="parts",
             )
-        made = as_projected(
-            cls, plain, **{"check_every": note["check_every"], "ensemble": ensemble_in(note), **arguments}
-        )
-        made.asked_tolerance = note["tolerance"]
+        asked = None if note["tolerance"] is None else relative_tolerance(note["tolerance"])
+        ensemble = arguments.get("ensemble") or ensemble_in(note)
+        made = as_projected(cls, plain, **{"check_every": note["check_every"], **arguments, "ensemble": ensemble})
+        made.asked_tolerance = asked
         return made
 
     @classmethod
@@ -175,7 +179,7 @@ class Copies(Integrator):
     def _making(self) -> tuple[Any, ...]:
         scheme = LEAPFROG if self.scheme is None else self.scheme
         every = None if self.spare else self.check_every
-        return self._dt, scheme, self.parts, self.asked_tolerance, every, self.ensemble
+        return self.getStepSize(), scheme, self.parts, self.asked_tolerance, every, self.ensemble
 
     def __reduce__(self) -> tuple[Any, ...]:
         return remade, (type(self), self._making(), settings_of(self))

@@ -131,13 +131,9 @@ def _load_checkpoint(original: Callable[..., None], context: openmm.Context, che
     if not heard:
         original(context, checkpoint)
         return
-    end = len(checkpoint) - len(_MARK) - 8
-    origin = None
-    if end >= 0 and checkpoint[end + 8 :] == _MARK:
-        begin = end - int.from_bytes(checkpoint[end : end + 8], "big")
-        origin, checkpoint = json.loads(checkpoint[begin:end]), checkpoint[:begin]
+    origin, checkpoint = _written_by(checkpoint)
     here = _origin(heard)
-    if origin is None or origin["program"] != here["program"]:
+    if origin.get("program") != here["program"] or len(origin.get("seeds", ())) != len(here["seeds"]):
         raise InputError(
             f"the checkpoint was written by another integrator than {heard[0]!r}, and OpenMM would read its numbers "
             "as those of this one; nothing was changed. Load a State: Simulation.saveState and loadState",
@@ -149,6 +145,19 @@ def _load_checkpoint(original: Callable[..., None], context: openmm.Context, che
             _draw_anew(context)
     finally:
         _loaded(heard, context)
+
+
+def _written_by(checkpoint: bytes) -> tuple[dict[str, Any], bytes]:
+    """What `_origin` has said of who wrote a checkpoint, nothing where that is damaged; and the bytes of OpenMM."""
+    end = len(checkpoint) - len(_MARK) - 8
+    if end < 0 or checkpoint[end + 8 :] != _MARK:
+        return {}, checkpoint
+    begin = end - int.from_bytes(checkpoint[end : end + 8], "big")
+    try:
+        origin = json.loads(checkpoint[max(begin, 0) : end])
+    except ValueError:
+        return {}, checkpoint
+    return (origin if isinstance(origin, dict) else {}), checkpoint[:begin]
 
 
 def _draw_anew(context: openmm.Context) -> None:

@@ -114,11 +114,14 @@ class OutsideOfSteps(StatesOnConstraints, Integrator):
     # -- temperature that is found --------------------------------------------------------------
 
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
-        """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
+        """As a State has it: of the velocities at x; with a bath that has noise, of those in the middle of the step.
+
+        With such a bath, and with the leapfrog, the next step computes forces anew, as after any State with energies.
+        """
         guard = self._watch(context)
-        if self.scheme is None:
-            state = guard.context.getState(energy=True, groups=self.getIntegrationForceGroups())
-            return state.getKineticEnergy()
+        if self.scheme is None or self.ensemble.noisy:
+            groups = self.getIntegrationForceGroups() if self.scheme is None else 0
+            return guard.context.getState(energy=True, groups=groups).getKineticEnergy()
         v = velocities_of(guard.context)
         return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
 

@@ -75,16 +75,55 @@ def note_of_ensemble(ensemble: Ensemble) -> list[Any]:
 
 
 def note_in(text: str) -> dict[str, Any] | None:
-    """What a file says of its integrator; None for those of others."""
+    """What a file says of its integrator; None for those of others.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or has no class, tolerance or interval of checks.
+    """
     found = ElementTree.fromstring(text).get(_NAME)
-    return None if found is None else json.loads(found)
+    if found is None:
+        return None
+    try:
+        note = json.loads(found)
+    except ValueError as error:
+        raise damaged(f"cannot be read ({error})") from None
+    if (
+        not isinstance(note, dict)
+        or not isinstance(note.get("class"), str)
+        or not {"check_every", "tolerance"} <= {*note}
+    ):
+        raise damaged("lacks class, check_every or tolerance")
+    return note
+
+
+def damaged(words: str) -> InputError:
+    """The error for what a file says of its integrator."""
+    return InputError(
+        f"what the file says of its integrator, the attribute {_NAME!r}, {words}; take a file that "
+        "openmm.XmlSerializer has written, or make the integrator anew",
+        item="integrator",
+    )
 
 
 def ensemble_in(note: dict[str, Any]) -> Ensemble:
-    """The ensemble that a file names."""
-    name, values = note["ensemble"]
-    ensemble = object.__new__(_kind(Value, name))
-    ensemble._keep(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+    """The ensemble that a file names, made as by hand, so that its numbers are looked at.
+
+    Raises
+    ------
+    InputError
+        There is no such ensemble, or none of such numbers.
+    """
+    match note.get("ensemble"):
+        case [str(name), dict(values)]:
+            kind = _kind(Value, name)
+        case _:
+            raise damaged("names no ensemble")
+    try:
+        ensemble: Ensemble = kind.of(values)
+    except (TypeError, KeyError) as error:
+        raise damaged(f"has other values than {name} takes ({error})") from None
     return ensemble
 
 
@@ -104,7 +143,10 @@ def _read(original: Callable[..., openmm.Integrator], text: str) -> openmm.Integ
     root = ElementTree.fromstring(text)
     note = note_in(text)
     if note is not None:
-        return _kind(StatesOnConstraints, note["class"])._of_note(original(text), note)
+        kind = _kind(StatesOnConstraints, note["class"])
+        if not hasattr(kind, "_of_note"):
+            raise damaged(f"names {kind.__name__}, which is no integrator")
+        return kind._of_note(original(text), note)
     compound = openmm.CompoundIntegrator()
     for node in root.findall("Integrator"):
         compound.addIntegrator(_read(original, ElementTree.tostring(node, encoding="unicode")))

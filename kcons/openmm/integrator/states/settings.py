@@ -2,28 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+import functools
+import warnings
+from collections.abc import Callable, Iterable
+from types import MethodType
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import whole_number
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, MissingSettingError, UnsupportedError
 from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.isokinetic_ensemble import kelvins
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard, find_context
 from kcons.openmm.integrator.interface import Integrator
-from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.precision import DOUBLE, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import number, relative_tolerance
 from kcons.steppers.splitting import Splitting
 
 #: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
 _SAME = 1e-6
+#: A time step in ps without a unit that is longer may be one in fs.
+_LONG = 0.02
+
+
+_Given = ParamSpec("_Given")
+_Found = TypeVar("_Found")
+
+
+class _OfEnsembles(Generic[_Given, _Found]):
+    """A method that an integrator has where its ensemble has what it is about, as integrators of OpenMM do.
+
+    So programs can ask by `hasattr` whether there is a thermostat.
+    """
+
+    def __init__(self, method: Callable[Concatenate[Any, _Given], _Found]) -> None:
+        self.method = method
+        functools.update_wrapper(cast(Any, self), method)
+
+    def __get__(self, integrator: Settings | None, owner: type | None = None) -> Callable[_Given, _Found]:
+        if integrator is None:
+            return self.method  # type: ignore[return-value]
+        what = self.method.__name__[3:].lower()
+        if self.method.__name__ != "setTemperature" or not integrator.thermostatted:
+            integrator._given(what)
+        return MethodType(self.method, integrator)
 
 
 class Settings(Integrator):
@@ -40,6 +68,8 @@ class Settings(Integrator):
     scheme: Splitting | None
     #: Of the System's constraints; None where the platform decides.
     asked_tolerance: float | None = None
+    #: Whether variables were written by their numbers.
+    _written = False
     _ensemble: Ensemble
     _guard: Guard | None
 
@@ -59,6 +89,7 @@ class Settings(Integrator):
 
     # -- temperature and friction ---------------------------------------------------------------
 
+    @_OfEnsembles
     def setTemperature(self, temperature: unit.Quantity | float) -> None:
         """Change the temperature (K if a float) of the ensemble.
 
@@ -66,24 +97,26 @@ class Settings(Integrator):
         ------
         InputError
             It is below zero; with `Isokinetic`, zero.
-        UnsupportedError
-            The ensemble has none.
+        MissingSettingError
+            At constant energy.
         """
         self._take(self.ensemble.at(kelvins(temperature)))
         guard = self._guard
         if guard is not None and guard.alive is not None and guard.started:
             warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
 
+    @_OfEnsembles
     def getTemperature(self) -> unit.Quantity:
         """The temperature of the ensemble.
 
         Raises
         ------
-        UnsupportedError
-            It has none.
+        MissingSettingError
+            It has none; so `hasattr` is False.
         """
         return self._given("temperature") * unit.kelvin
 
+    @_OfEnsembles
     def setFriction(self, friction: unit.Quantity | float) -> None:
         """Change the friction (1/ps if a float) of the ensemble.
 
@@ -91,20 +124,20 @@ class Settings(Integrator):
         ------
         InputError
             It is below zero.
-        UnsupportedError
+        MissingSettingError
             The ensemble has none.
         """
-        self._given("friction")
         assert isinstance(self.ensemble, Langevin)
         self._take(self.ensemble.with_friction(friction))
 
+    @_OfEnsembles
     def getFriction(self) -> unit.Quantity:
         """The friction of the ensemble.
 
         Raises
         ------
-        UnsupportedError
-            It has none.
+        MissingSettingError
+            It has none; so `hasattr` is False.
         """
         return self._given("friction") / unit.picosecond
 
@@ -112,7 +145,7 @@ class Settings(Integrator):
         value = getattr(self.ensemble, what, None)
         if not isinstance(value, float):
             name = "constant energy" if not self.thermostatted else repr(self.ensemble)
-            raise UnsupportedError(f"there is no {what} at {name}; give ensemble=Langevin(temperature, friction)")
+            raise MissingSettingError(f"there is no {what} at {name}; give ensemble=Langevin(temperature, friction)")
         return value
 
     def _take(self, ensemble: Ensemble) -> None:
@@ -134,6 +167,11 @@ class Settings(Integrator):
         ------
         InputError
             It is no positive number, or more than the ensemble can follow.
+
+        Warns
+        -----
+        UserWarning
+            It is above 20 fs and has no unit.
         """
         dt = picoseconds(size)
         self.ensemble.check_timestep(dt)
@@ -142,13 +180,18 @@ class Settings(Integrator):
     def setConstraintTolerance(self, tol: float) -> None:
         """Change the relative tolerance of the System's constraints.
 
+        One that was left open stays so where it is set to what an integrator without a Context, or this one, has.
+
         Raises
         ------
         InputError
             It is not between 0 and 1.
         """
-        self.asked_tolerance = relative_tolerance(tol)
-        super().setConstraintTolerance(self.asked_tolerance)
+        wanted = relative_tolerance(tol)
+        if self.asked_tolerance is None and wanted in (DOUBLE.tolerance, self.getConstraintTolerance()):
+            return
+        self.asked_tolerance = wanted
+        super().setConstraintTolerance(wanted)
 
     def take_precision(self, precision: Precision) -> None:
         """The Context is known: tolerances that were left open become those of its platform."""
@@ -172,8 +215,27 @@ class Settings(Integrator):
         super().setGlobalVariableByName(name, value)
 
     def setGlobalVariable(self, index: int, value: float) -> None:
-        """As `setGlobalVariableByName`."""
-        self.setGlobalVariableByName(self.getGlobalVariableName(index), value)
+        """Write a variable of the program by its number, as programs do that copy all of them; a run begins anew.
+
+        A setting that has another value than the integrator's by the next step is put right and refused there; the
+        methods that change settings write their variables.
+        """
+        self.program.write(self.getGlobalVariableName(index), value)
+        self._written = True
+
+    def _take_written(self) -> None:
+        """What `setGlobalVariable` has written is taken, but for settings and what controls the program."""
+        self._written = False
+        differing = self.program.differing()
+        self.program.push()
+        self.refresh()
+        if self._guard is not None:
+            self._guard.begin_anew()
+        if differing:
+            raise UnsupportedError(
+                f"setGlobalVariable wrote {', '.join(differing)}, which is a setting of the integrator and has its "
+                "value again: use setTemperature, setFriction, or set_target of a part"
+            )
 
     def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
         """Choose the force groups that act; groups that carry rows never do.
@@ -233,7 +295,7 @@ class Settings(Integrator):
         if other or not self._forces_kept(context):
             self.refresh()
         if self._guard is not None:
-            self._guard.started, self._guard.disturbed = False, True
+            self._guard.begin_anew()
 
     def _hear_reinitialized(self) -> None:
         """The Context has read the System again."""
@@ -255,10 +317,17 @@ class Settings(Integrator):
 
 
 def picoseconds(timestep: Any) -> float:
+    """A time step; a long one without a unit, which may be meant in fs, draws a warning where the caller was called."""
     dt = number(timestep, unit.picosecond, "timestep")
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
             f"the time step is {timestep}; give a positive one; to go back in time, reverse the velocities",
             item="timestep",
+        )
+    if dt > _LONG and not unit.is_quantity(timestep):
+        warnings.warn(
+            f"the time step is {dt:g} ps, that is {dt * 1e3:g} fs: is it meant in fs? Give it with its unit, "
+            f"{dt:g} * unit.femtoseconds or {dt:g} * unit.picoseconds",
+            stacklevel=3,
         )
     return dt

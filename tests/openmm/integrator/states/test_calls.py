@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from collections import Counter
 
@@ -9,10 +10,19 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
-from openmm_systems import alanine, context_of, dumbbell, residuals, started, state_of
+from openmm_systems import (
+    PLATFORMS,
+    alanine,
+    context_of,
+    dumbbell,
+    on_gpus,
+    residuals,
+    started,
+    state_of,
+)
 
 from kcons.errors import InputError, KconsError, NonFiniteError
-from kcons.openmm import Langevin, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import Isokinetic, Langevin, LangevinRespa, ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.integrator.states import calls
 from tests.openmm.integrator.states.test_settings import KINDS, carried_at
 
@@ -95,6 +105,7 @@ def test_tens_cost_what_one_call_costs(kind, made_by_openmm):
             made.integrator.step(95)
         else:
             simulated(made).step(95)
+        made_by_openmm.pop((3.0,), None)  # a look where a call ends, no step
         work.append(dict(made_by_openmm))
         ends.append(state_of(made.context))
         assert made.context.getStepCount() == 96
@@ -336,3 +347,98 @@ def test_checks_that_come_more_often_make_no_step_more(before):
     other = started(system, at_once, x, v)
     at_once.step(150)
     np.testing.assert_array_equal(state_of(context)[0], state_of(other)[0])
+
+
+# -- a look where a call ends ------------------------------------------------------------------------
+
+LOOKING = {
+    "rattle": lambda step: ProjectedIntegrator(step, check_every=0),
+    "leapfrog": lambda step: ProjectedIntegrator(step, "leapfrog", check_every=0),
+    "suzuki4": lambda step: ProjectedIntegrator(step, "suzuki4", check_every=0),
+    "Langevin": lambda step: ProjectedIntegrator(step, check_every=0, ensemble=Langevin(300, 1.0)),
+    "LangevinRespa": lambda step: ProjectedIntegrator(
+        step, check_every=0, ensemble=LangevinRespa(300, 1.0, {0: 1, 1: 2})
+    ),
+    "Isokinetic": lambda step: ProjectedIntegrator(step, check_every=0, ensemble=Isokinetic(300)),
+    "RattleIntegrator": lambda step: RattleIntegrator(step, check_every=0),
+}
+
+
+def springs(n=8):
+    """A chain of stiff springs that no step of 20 fs can follow, and none of the solvers of constraints notice."""
+    system, force = openmm.System(), openmm.HarmonicBondForce()
+    for k in range(n):
+        system.addParticle(12.0)
+        if k:
+            force.addBond(k - 1, k, 0.1, 3e5)
+    force.setForceGroup(1)
+    system.addForce(force)
+    x = np.c_[0.1 * np.arange(n), 0.05 * (np.arange(n) % 2), np.zeros(n)]
+    v = np.random.default_rng(2).normal(0, 0.4, x.shape)
+    return system, x, v - v.mean(axis=0)
+
+
+@pytest.mark.parametrize("platform", ["Reference", *on_gpus("mixed")])
+@pytest.mark.parametrize("call", [1, 10, 25])
+@pytest.mark.parametrize("name", [name for name in LOOKING if name != "Isokinetic"])
+def test_an_explosion_is_told_where_its_call_ends(name, call, platform):
+    """Without any check but the first: lengths do not become 1e62 nm without a word."""
+    if call != 10 and platform != "Reference":
+        pytest.skip("each Context compiles its program")
+    system, x, v = springs()
+    integrator = LOOKING[name](20 * unit.femtosecond)
+    context = started(system, integrator, x, v, platform)
+    x, v = state_of(context)
+    with pytest.raises(NonFiniteError, match="take a smaller time step") as caught:
+        for _ in range(200):
+            integrator.step(call)
+            assert np.abs(state_of(context)[1]).max() < 1e6
+    assert caught.value.step % call == 0 and 0 <= caught.value.atom < 8
+    np.testing.assert_array_equal(state_of(context), [x, v])
+    assert context.getStepCount() == 0
+    integrator.setStepSize(0.5 * unit.femtosecond)
+    integrator.step(call)
+
+
+@pytest.mark.parametrize("name", ["rattle", "Langevin", "RattleIntegrator"])
+def test_a_simulation_tells_of_an_explosion(name):
+    system, x, v = springs()
+    integrator = LOOKING[name](20 * unit.femtosecond)
+    place = openmm.Platform.getPlatformByName("Reference")
+    simulation = app.Simulation(topology_of(system), system, integrator, place)
+    simulation.context.setPositions(x)
+    simulation.context.setVelocities(v)
+    with pytest.raises(NonFiniteError, match="velocity of"):
+        simulation.step(60)
+    np.testing.assert_array_equal(state_of(simulation.context), [x, v])
+
+
+@pytest.mark.parametrize("platform", [*PLATFORMS, *on_gpus("mixed")])
+@pytest.mark.parametrize("name", LOOKING)
+def test_a_look_changes_nothing(name, platform):
+    system, x, v = springs()
+    ends = []
+    for looked in (True, False):
+        integrator = LOOKING[name](0.5 * unit.femtosecond)
+        if name.startswith("Langevin"):
+            integrator.setFriction(0)  # no noise, which numbers drawn for the look would change
+        context = started(system, integrator, x, v, platform)
+        if not looked:
+            inner = getattr(integrator, "_ends", integrator)
+            inner.ending = contextlib.nullcontext
+            inner._watch(context).look = lambda: None
+        for _ in range(3):
+            integrator.step(7)
+        ends.append(state_of(context))
+    np.testing.assert_array_equal(*ends)
+
+
+def test_light_is_the_limit_and_no_smaller_speed():
+    """Particles may be fast: 1 dalton at a tenth of the speed of light is no explosion of a System of many."""
+    system, x, _ = springs()
+    integrator = LOOKING["rattle"](1e-6 * unit.femtosecond)
+    context = started(system, integrator, x, np.eye(8)[:, :3] * 3e4)
+    integrator.step(1)
+    context.setVelocities(np.full((8, 3), 3e5))
+    with pytest.raises(NonFiniteError, match=r"particle \d has a velocity of 5.2e\+05 nm/ps at step 2"):
+        integrator.step(1)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import copy
 import gc
+import json
 import pickle
+import re
+from xml.sax.saxutils import escape
 
 import numpy as np
 import openmm
@@ -13,7 +16,16 @@ from openmm import app, unit
 from openmm_systems import DATA, alanine, started, state_of
 
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import (
+    Isokinetic,
+    IsokineticCircles,
+    Langevin,
+    LangevinRespa,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    RattleIntegrator,
+)
 from kcons.openmm.integrator.states.hearing import live
 from kcons.openmm.integrator.states.serialization import read_plain
 
@@ -223,7 +235,7 @@ def test_step_sizes_pass_through_a_compound():
     compound.addIntegrator(member)
     started(system, compound, x, v)
     with pytest.raises(InputError, match="cannot follow a time step"):
-        compound.setStepSize(0.5)
+        compound.setStepSize(0.5 * unit.picosecond)
     compound.setStepSize(2 * unit.femtoseconds)
     assert member.getStepSize() == 2 * unit.femtoseconds
 
@@ -232,3 +244,70 @@ def test_chain_orders_of_numpy_are_written():
     made = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300, 1, chain_order=np.int64(4)))
     read = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(made))
     assert read.ensemble == made.ensemble
+
+
+# -- files that others have written -----------------------------------------------------------------
+
+
+def changed(integrator, change):
+    """The text of a file in which what kcons says is another."""
+    text = xml.serialize(integrator)
+    found = re.search(r'kcons="([^"]*)"', text)
+    note = change(json.loads(found[1].replace("&quot;", '"')))
+    note = note if isinstance(note, str) else json.dumps(note)
+    return text[: found.start(1)] + escape(note, {'"': "&quot;"}) + text[found.end(1) :]
+
+
+def ensemble_of(name, **values):
+    return lambda note: {**note, "ensemble": [name, values]}
+
+
+BATH = {"temperature": 300, "friction": 1.0}
+WRONG = {
+    "-5 K": (ensemble_of("Langevin", temperature=-5, friction=1), "temperature"),
+    "a friction in words": (ensemble_of("Langevin", temperature=300, friction="much"), "friction"),
+    "no number": (ensemble_of("Langevin", temperature=float("nan"), friction=1), "temperature"),
+    "no temperature": (ensemble_of("Langevin", friction=1), "other values than Langevin takes"),
+    "one value more": (ensemble_of("Langevin", **BATH, more=1), "other values than Langevin takes"),
+    "no groups": (ensemble_of("LangevinRespa", **BATH), "other values than LangevinRespa takes"),
+    "an unknown ensemble": (ensemble_of("Magic"), "names Magic"),
+    "a class of another kind": (ensemble_of("Value"), "give one of kcons.openmm"),
+    "another ensemble": (ensemble_of("NoseHoover", temperature=300, frequency=1.0), "no program of"),
+    "no ensemble": (lambda note: {k: v for k, v in note.items() if k != "ensemble"}, "names no ensemble"),
+    "an ensemble in words": (lambda note: {**note, "ensemble": "Langevin"}, "names no ensemble"),
+    "a tolerance in words": (lambda note: {**note, "tolerance": "a"}, "tolerance"),
+    "a tolerance below zero": (lambda note: {**note, "tolerance": -1}, "tolerance"),
+    "half a check": (lambda note: {**note, "check_every": 0.5}, "check_every"),
+    "no tolerance": (lambda note: {k: v for k, v in note.items() if k != "tolerance"}, "lacks class, check_every or"),
+    "no class": (lambda note: {**note, "class": None}, "lacks class"),
+    "a base class": (lambda note: {**note, "class": "StatesOnConstraints"}, "is no integrator"),
+    "a class of one kind": (lambda note: {**note, "class": "RattleIntegrator"}, "no program of a RattleIntegrator"),
+    "a class of nobody": (lambda note: {**note, "class": "Popen"}, "names Popen"),
+    "a list": (lambda note: [], "lacks class"),
+    "cut": (lambda note: json.dumps(note)[:-9], "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_a_file_says_is_looked_at(name):
+    change, words = WRONG[name]
+    text = changed(ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1.0)), change)
+    with pytest.raises(InputError, match=words):
+        xml.deserialize(text)
+
+
+@pytest.mark.parametrize(
+    "ensemble",
+    [
+        Langevin(0, 1.0),
+        LangevinRespa(300, 1.0, {3: 1, 0: 4}, "middle"),
+        IsokineticCircles(300, 1.0, {0: 1, 1: 2}),
+        Isokinetic(kinetic_energy=3.0, convention="notes"),
+        NoseHoover(300, 1.0, length=4, chain_order=6, repeats=2),
+        NoseHooverMiddle(300, 1.0, momentum="free"),
+    ],
+    ids=lambda ensemble: type(ensemble).__name__,
+)
+def test_each_ensemble_comes_back_from_a_file(ensemble):
+    again = xml.deserialize(xml.serialize(ProjectedIntegrator(1e-3, ensemble=ensemble)))
+    assert again.ensemble == ensemble

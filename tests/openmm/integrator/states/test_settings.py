@@ -14,7 +14,7 @@ from openmm_systems import potential_energy, started, state_of
 from tied_cluster import EVERYTHING, MASSES, X, begun, cluster, thermostatted
 
 from kcons.constraints import Distance, Plane, Sphere
-from kcons.errors import InputError, KconsError, OverdeterminedError
+from kcons.errors import InputError, KconsError, OverdeterminedError, UnsupportedError
 from kcons.openmm import (
     CollectiveRows,
     Isokinetic,
@@ -24,6 +24,7 @@ from kcons.openmm import (
     RattleIntegrator,
     Row,
     SurfaceIntegrator,
+    WaysBackIntegrator,
     hold,
 )
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
@@ -419,7 +420,10 @@ def test_checkpoints_of_other_programs_are_refused(kind):
     before = state_of(taker.context)
     verlet = STOCK["Verlet"]()
     verlet.run(3)
-    for checkpoint in (verlet.context.createCheckpoint(), KINDS["Langevin"]().context.createCheckpoint(), b"", b"x"):
+    own = taker.context.createCheckpoint()
+    damaged = [own[:-40] + b"{" + own[-39:], own[:-60] + own[-30:], own[-24:], own.replace(b'"seeds"', b'"sends"')]
+    others = [verlet.context.createCheckpoint(), KINDS["Langevin"]().context.createCheckpoint(), b"", b"x"]
+    for checkpoint in (*others, *damaged):
         with pytest.raises(InputError, match=r"another integrator.*Load a State"):
             taker.context.loadCheckpoint(checkpoint)
         np.testing.assert_array_equal(state_of(taker.context), before)
@@ -457,3 +461,83 @@ def test_what_is_no_force_group_is_refused(groups):
 def test_what_is_no_tolerance_is_refused(tolerance):
     with pytest.raises(InputError, match="tolerance"):
         ProjectedIntegrator(1e-3).setConstraintTolerance(tolerance)
+
+
+# -- variables that are written by their numbers ----------------------------------------------------
+
+
+def written(integrator, values):
+    """As programs do that copy all variables, of `values` by name."""
+    for k in range(integrator.getNumGlobalVariables()):
+        name = integrator.getGlobalVariableName(k)
+        integrator.setGlobalVariable(k, values.get(name, integrator.getGlobalVariable(k)))
+
+
+def everything_of(integrator):
+    return {
+        integrator.getGlobalVariableName(k): integrator.getGlobalVariable(k)
+        for k in range(integrator.getNumGlobalVariables())
+    }
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "RattleIntegrator"])
+def test_variables_of_a_copy_begin_a_run_anew(kind):
+    """From the state where it is, with the settings that the integrator has."""
+    ran, fresh = KINDS[kind](), KINDS[kind]()
+    if "Langevin" in kind:
+        ran.integrator.setFriction(0)
+        fresh.integrator.setFriction(0)
+    ran.run(5)
+    written(ran.integrator, everything_of(copy.deepcopy(ran.integrator)))
+    fresh.context.setState(ran.context.getState(positions=True, velocities=True))
+    ran.run(5)
+    fresh.run(5)
+    within = 1e-3 if "leapfrog" in kind else 1e-9
+    np.testing.assert_allclose(state_of(ran.context), state_of(fresh.context), rtol=0, atol=within)
+
+
+def test_a_setting_that_was_written_by_its_number_is_refused_once():
+    made = thermostatted(Langevin(300, 1.0))()
+    made.run(2)
+    before = state_of(made.context)
+    written(made.integrator, dict.fromkeys(everything_of(made.integrator), 0.0))
+    with pytest.raises(UnsupportedError, match=r"setGlobalVariable wrote kT, friction.*use setTemperature"):
+        made.run()
+    np.testing.assert_array_equal(state_of(made.context), before)
+    assert made.integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
+    made.run()
+    written(made.integrator, {"kT": GAS_CONSTANT * 310})
+    made.integrator.setTemperature(310)  # which writes it as well
+    made.run()
+    assert made.integrator.getTemperature() == 310 * unit.kelvin
+
+
+def test_a_tolerance_that_was_left_open_stays_so_where_it_is_copied():
+    integrator, other = ProjectedIntegrator(0.002), ProjectedIntegrator(0.002)
+    integrator.setConstraintTolerance(other.getConstraintTolerance())
+    assert integrator.asked_tolerance is None
+    integrator.setConstraintTolerance(1e-7)
+    assert integrator.asked_tolerance == integrator.getConstraintTolerance() == 1e-7
+    integrator.setConstraintTolerance(1e-10)
+    assert integrator.asked_tolerance == 1e-10
+    assert ProjectedIntegrator(0.002, tolerance=1e-10).asked_tolerance == 1e-10
+
+
+# -- time steps -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [ProjectedIntegrator, RattleIntegrator, WaysBackIntegrator])
+@pytest.mark.parametrize("step", [4, 0.0201, 2.0])
+def test_a_long_time_step_without_a_unit_is_asked_about(make, step):
+    with pytest.warns(UserWarning, match=f"the time step is {step:g} ps, that is .* fs: is it meant in fs") as seen:
+        integrator = make(step)
+    assert [warning.filename for warning in seen] == [__file__]
+    with pytest.warns(UserWarning, match="is it meant in fs") as seen:
+        integrator.setStepSize(step)
+    assert len(seen) == 1 and seen[0].filename == __file__
+    integrator.setStepSize(0.02)
+    integrator.setStepSize(step * unit.picosecond)
+    for again in (copy.copy(integrator), pickle.loads(pickle.dumps(integrator)), make(integrator.getStepSize())):
+        assert again.getStepSize() == integrator.getStepSize()
+    again = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(integrator))
+    assert again.getStepSize() == integrator.getStepSize()

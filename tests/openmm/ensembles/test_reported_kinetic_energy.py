@@ -1,0 +1,229 @@
+"""The kinetic energy that a State reports: with noise that of the middle of the step, else that of its velocities."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import PLATFORMS, alanine, masses_of, on_gpus, started, state_of
+
+from kcons.constraints import Distance, Sphere
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    IsokineticCircles,
+    Langevin,
+    LangevinRespa,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    Row,
+    SurfaceIntegrator,
+    hold,
+    surface_parts,
+)
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
+#: A time step, and an oscillator whose velocities at the ends of steps have 1 - (w h)^2/4 = 0.64 of the temperature.
+STEP, PART = 0.02, 0.64
+SPRING = 12.0 * (1.2 / STEP) ** 2
+TWO = {0: 1, 1: 4}
+
+
+def oscillators(n=200, spring=SPRING):
+    system = openmm.System()
+    for group, share in ((1, 1.0), (0, 0.01)):
+        force = openmm.CustomExternalForce(f"0.5*{share * spring}*(x^2+y^2+z^2)")
+        force.setForceGroup(group)
+        system.addForce(force)
+    for _ in range(n):
+        k = system.addParticle(12.0)
+        for force in system.getForces():
+            force.addParticle(k)
+    return system, np.random.default_rng(1).normal(0, np.sqrt(GAS_CONSTANT * 300 / SPRING), (n, 3))
+
+
+def beside(system, x):
+    """Two particles more, which move freely at their distance."""
+    a, b = (system.addParticle(12.0) for _ in range(2))
+    return a, b, np.vstack([x, [[0.0, 0, 0], [1.0, 0, 0]]])
+
+
+def collective(system, x):
+    force = openmm.CustomBondForce("r")
+    a, b, x = beside(system, x)
+    force.addBond(a, b)
+    return x, [CollectiveRows(system, [Row(force, 1.0)], positions=x)]
+
+
+def carried(system, x):
+    a, b, x = beside(system, x)
+    return x, [hold(system, Distance([[a, b]], 1.0), x)]
+
+
+def kelvins(integrator, context, platform):
+    """Means of the reported temperature and of that of the velocities of a State, and a standard error."""
+    masses, freedom = masses_of(context.getSystem()), integrator.degrees_of_freedom()
+    values = []
+    for _ in range(100):
+        integrator.step(12)
+        state = context.getState(energy=True, velocities=True)
+        v = state.getVelocities(asNumpy=True)._value
+        reported = 2 * state.getKineticEnergy()._value / (GAS_CONSTANT * freedom)
+        asked = integrator.computeSystemTemperature()._value
+        assert asked == pytest.approx(reported * integrator.ensemble.warmth(integrator), rel=1e-6)
+        values.append((asked, masses @ np.einsum("ij,ij->i", v, v) / (GAS_CONSTANT * freedom)))
+    blocks = np.array(values).reshape(20, 5, 2).mean(axis=1)
+    return (*blocks.mean(axis=0), blocks[:, 0].std(ddof=1) / np.sqrt(20))
+
+
+def bath(ensemble, step=STEP, parts=lambda system, x: (x, [])):
+    def make(platform):
+        system, x = oscillators()
+        x, held = parts(system, x)
+        integrator = ProjectedIntegrator(step * unit.picosecond, parts=held, ensemble=ensemble)
+        integrator.setRandomNumberSeed(11)
+        return integrator, started(system, integrator, x, platform=platform)
+
+    return make
+
+
+BATHS = {
+    "Langevin": bath(Langevin(300, 10.0)),
+    "collective": bath(Langevin(300, 10.0), parts=collective),
+    "carried": bath(Langevin(300, 10.0), parts=carried),
+}
+
+
+@pytest.mark.parametrize("platform", [*PLATFORMS, *on_gpus("mixed")])
+@pytest.mark.parametrize("name", BATHS)
+def test_with_noise_the_temperature_of_the_bath_is_reported(name, platform):
+    """Velocities at the ends of steps, which the State has, are colder; temperatures within four standard errors."""
+    if name == "carried" and " " in platform:
+        pytest.skip("the program is that of the other parts")
+    integrator, context = BATHS[name](platform)
+    integrator.setVelocitiesToTemperature(context, 300, 5)
+    integrator.step(150)
+    reported, of_velocities, error = kelvins(integrator, context, platform)
+    assert abs(reported - 300) < 4 * error < 12
+    assert of_velocities == pytest.approx(PART * 300, abs=4 * error)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("ensemble", [LangevinRespa(300, 10.0, TWO), IsokineticCircles(300, 10.0, TWO)])
+def test_of_several_time_steps_the_middle_of_the_last_inner_one_is_reported(ensemble, platform):
+    """The fast motion, of which the kick at the end takes a third; what is left is of the slow kicks."""
+    integrator, context = bath(ensemble, 4 * STEP)(platform)
+    integrator.setVelocitiesToTemperature(context, 300, 5)
+    integrator.step(60)
+    reported, of_velocities, error = kelvins(integrator, context, platform)
+    assert abs(reported - 300) < 4 * error + 9
+    assert of_velocities < 0.75 * reported
+
+
+def test_on_a_surface_it_is_the_motion_along_it():
+    system, x = oscillators(40, 1e-6)
+    x = 0.5 * x / np.linalg.norm(x, axis=1)[:, None]
+    surface = Sphere(list(range(40)), [0, 0, 0], 0.5)
+    integrator = SurfaceIntegrator(0.005, parts=surface_parts(surface, system=system), ensemble=Langevin(300, 20.0))
+    context = started(system, integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 5)
+    integrator.step(50)
+    reported, of_velocities, error = kelvins(integrator, context, "Reference")
+    assert integrator.degrees_of_freedom() == 80
+    assert abs(reported - 300) < 4 * error < 40
+    assert of_velocities == pytest.approx(reported, rel=1e-2)
+
+
+def test_the_middle_is_half_a_kick_before_the_end():
+    system, x = oscillators(5)
+    integrator = ProjectedIntegrator(STEP, ensemble=Langevin(300, 10.0))
+    context = started(system, integrator, x)
+    for steps in (1, 7):
+        integrator.step(steps)
+        state = context.getState(energy=True, velocities=True, forces=True)
+        v = state.getVelocities(asNumpy=True)._value - 0.5 * STEP * state.getForces(asNumpy=True)._value / 12.0
+        assert state.getKineticEnergy()._value == pytest.approx(6.0 * np.sum(v**2), rel=1e-12)
+        assert integrator.kinetic_energy()._value == pytest.approx(6.0 * np.sum(v**2), rel=1e-12)
+
+
+def energy_of(context):
+    return context.getState(energy=True).getKineticEnergy()._value
+
+
+@pytest.mark.parametrize("parts", [lambda system, x: (x, []), collective])
+def test_of_velocities_that_others_have_set_it_is_theirs(parts):
+    system, x = oscillators(5)
+    x, held = parts(system, x)
+    integrator = ProjectedIntegrator(STEP, parts=held, ensemble=Langevin(300, 10.0))
+    context = started(system, integrator, x)
+    integrator.step(3)
+    kept = context.getState(positions=True, velocities=True)
+    reported = energy_of(context)
+    v = state_of(context)[1]
+    assert reported != pytest.approx(6.0 * np.sum(v**2), rel=1e-3)
+    integrator.setVelocitiesToTemperature(context, 500, 3)
+    assert energy_of(context) == pytest.approx(6.0 * np.sum(state_of(context)[1] ** 2), rel=1e-12)
+    assert integrator.kinetic_energy()._value == energy_of(context)
+    context.setVelocities(0 * v)
+    assert energy_of(context) == 0
+    context.setState(kept)
+    assert energy_of(context) == reported
+    integrator.applyVelocityConstraints(context)  # constraints applied alone are no step
+    assert energy_of(context) == pytest.approx(reported, rel=1e-2)
+    other = ProjectedIntegrator(STEP, parts=held, ensemble=Langevin(300, 10.0))
+    fresh = started(system, other, x)
+    fresh.setState(kept)
+    assert energy_of(fresh) == pytest.approx(6.0 * np.sum(v**2), rel=1e-12)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_checkpoints_and_states_bring_it_along(platform):
+    system, x = oscillators(5)
+    integrators = [ProjectedIntegrator(STEP, ensemble=Langevin(300, 10.0)) for _ in range(3)]
+    ours, second, third = (started(system, one, x, platform=platform) for one in integrators)
+    integrators[0].step(4)
+    second.loadCheckpoint(ours.createCheckpoint())
+    third.setState(ours.getState(positions=True, velocities=True, integratorParameters=True))
+    assert energy_of(second) == energy_of(third) == energy_of(ours)
+
+
+@pytest.mark.parametrize(
+    "ensemble",
+    [None, NoseHoover(300, 5.0), NoseHooverMiddle(300, 5.0), Isokinetic(300), Langevin(300, 0.0), Langevin(0, 10.0)],
+    ids=["constant energy", "NoseHoover", "NoseHooverMiddle", "Isokinetic", "no friction", "0 K"],
+)
+def test_without_noise_it_is_that_of_the_velocities(ensemble):
+    system, x = oscillators(5)
+    integrator = ProjectedIntegrator(STEP, ensemble=ensemble)
+    context = started(system, integrator, x, np.random.default_rng(3).normal(0, 0.5, x.shape))
+    for steps in (1, 5):
+        integrator.step(steps)
+        assert energy_of(context) == pytest.approx(6.0 * np.sum(state_of(context)[1] ** 2), rel=1e-12)
+
+
+def test_a_reporter_shows_it():
+    system, x, v = alanine("HBonds")
+    pdb_atoms = app.Topology()
+    residue = pdb_atoms.addResidue("X", pdb_atoms.addChain())
+    for k in range(len(x)):
+        pdb_atoms.addAtom(f"C{k}", app.element.carbon, residue)
+    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0))
+    place = openmm.Platform.getPlatformByName("Reference")
+    simulation = app.Simulation(pdb_atoms, system, integrator, place)
+    simulation.context.setPositions(x)
+    simulation.context.setVelocities(v)
+    table = io.StringIO()
+    simulation.reporters.append(app.StateDataReporter(table, 5, temperature=True, kineticEnergy=True))
+    simulation.step(20)
+    kinetic, temperature = (float(word) for word in table.getvalue().split()[-1].split(","))
+    assert kinetic == energy_of(simulation.context)
+    freedom = integrator.degrees_of_freedom()
+    assert temperature == pytest.approx(2 * kinetic / (GAS_CONSTANT * freedom), rel=1e-12)
+    own = 0.5 * masses_of(system) @ np.einsum("ij,ij->i", *[state_of(simulation.context)[1]] * 2)
+    assert kinetic != pytest.approx(own, rel=1e-4)
