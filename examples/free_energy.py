@@ -1,7 +1,7 @@
-"""Free energy along a torsion: hydrogen peroxide with GFN2-xTB, held at seven angles, mean forces integrated.
+"""Free energy along a torsion: hydrogen peroxide with GFN2-xTB, held at four angles, mean forces integrated.
 
-Run with ``python examples/free_energy.py``; some ten seconds: so few steps make large errors, and warnings say
-so. ``--full`` samples long enough for a result, some minutes. Windows are kept in the folder ``free_energy``: a run that was stopped goes on.
+Run with ``python examples/free_energy.py``; some ten seconds, which is short: warnings say that errors are not yet
+to be relied on. ``--full`` samples long enough, in some minutes. Windows are kept in a folder; a stopped run goes on.
 """
 
 import sys
@@ -24,12 +24,12 @@ sampler = AseWindows(atoms, model, {"torsion": torsion}, [bonds])
 settings = Settings(relax=2, pull=20, equilibration=20, production=5000 if full else 170, every=5)
 
 windows = Windows(sampler, f"free_energy{'_full' if full else ''}", settings, both_sides=full)
-result = windows.run(np.radians(np.arange(90, 181, 15)), executor=ThreadPoolExecutor(1))
+result = windows.run(np.radians(np.arange(90, 181, 30)), executor=ThreadPoolExecutor(1))
 assert not result.failed
 for window in result.windows:
     angle, force, error = np.degrees(window.value[0]), window.force[0], window.error[0]
-    print(f"{angle:6.1f} degrees: mean force {force:7.2f} ± {error:.2f} kJ/mol/rad")
+    print(f"{angle:6.1f} degrees: mean force {force:8.3f} ± {error:.3f} kJ/mol/rad")
 
 rise = result.profile.difference(np.pi, np.pi / 2)
-print(f"free energy at 90 degrees, above that at 180: {rise.value:.1f} ± {rise.error:.1f} kJ/mol")
+print(f"free energy at 90 degrees, above that at 180: {rise.value:.2f} ± {rise.error:.2f} kJ/mol")
 plot_profile(result.profile, coordinate="torsion / rad", energy="kJ/mol").savefig("free_energy.png")
