@@ -1,6 +1,6 @@
 """Rigid water in ASE: hold every molecule, run dynamics, read off what the constraints did.
 
-Run with ``python examples/01_rigid_water_ase.py``; about ten seconds.
+Run with ``python examples/rigid_water_ase.py``; about ten seconds.
 """
 
 import numpy as np

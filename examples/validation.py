@@ -17,7 +17,8 @@ def check(what, error, bound):
 
 def path(held, x, v, masses, force=None):
     system = System(Motion(ConstraintSet(held, x, masses), x), force)
-    return run(system, State(np.array(x), np.array(v)), 0.01, 1000, stepper=steppers.BlanesMoan6(), record=1)
+    state = State(np.array(x, float), np.array(v, float))
+    return run(system, state, 0.01, 1000, stepper=steppers.BlanesMoan6(), record=1)
 
 
 ball = constraints.Sphere([0], [0.0, 0.0, 0.0], 2.0)
@@ -29,15 +30,13 @@ swing = path(ball, [[2.0, 0.0, 0.0]], [[0.0, 1.5, 0.5]], [1.0], lambda x, t: np.
 x, v = swing.positions[:, 0].T, swing.velocities[:, 0].T
 check("spherical pendulum: energy changes by", np.ptp(0.5 * (v**2).sum(axis=0) + 9.81 * x[2]), 1e-11)
 check("spherical pendulum: angular momentum J_z changes by", np.ptp(x[0] * v[1] - x[1] * v[0]), 1e-12)
-rod = constraints.Distance([[0, 1]])
-flight = path(rod, [[2.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], [[0.5, 3.0, 0.0], [0.5, -1.5, 0.0]], [1.0, 2.0])
+flight = path(constraints.Distance([[0, 1]]), [[2, 0, 0], [-1, 0, 0]], [[0.5, 3, 0], [0.5, -1.5, 0]], [1, 2])
 exact = 0.5 * free.times[:, None, None] * [1.0, 0.0, 0.0] + np.stack([2 * turn, -turn], axis=1)
 check("dumbbell that turns and flies: off its closed form", abs(flight.positions - exact).max(), 1e-12)
-
 field, box = openmm.app.ForceField("tip3p.xml"), openmm.app.Modeller(openmm.app.Topology(), [])
 box.addSolvent(field, boxSize=openmm.Vec3(1.6, 1.6, 1.6))  # nm
 system = field.createSystem(box.topology, nonbondedMethod=openmm.app.CutoffPeriodic, nonbondedCutoff=0.75)
-context = openmm.Context(system, RattleIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+context = openmm.Context(system, RattleIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
 context.setPositions(box.positions)
 openmm.LocalEnergyMinimizer.minimize(context, maxIterations=50)
 context.setVelocitiesToTemperature(300, 1)
@@ -56,8 +55,6 @@ before = after(RattleIntegrator(0.001), -v, steps=1)
 verlet = after(openmm.VerletIntegrator(0.001), (x - before) / 0.001)  # has velocities half a step behind
 for each in RattleIntegrator(0.001), ProjectedIntegrator(0.001):
     check(f"rigid water, {type(each).__name__}: nm off OpenMM's own", abs(after(each, v) - verlet).max(), 1e-12)
-rows = hold(
-    system, take_constraints(system, keep_water=False), x
-)  # by kcons' solver; OpenMM's rounds lengths to floats
+rows = hold(system, take_constraints(system, keep_water=False), x)  # OpenMM rounds lengths of water to floats
 own = after(ProjectedIntegrator(0.001, parts=[rows]), v)
 check("rigid water, kcons' own solver: nm off OpenMM's own", abs(own - verlet).max(), 1e-7)
