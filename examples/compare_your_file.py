@@ -22,8 +22,8 @@ if path == "villin.pdb":  # comes with OpenMM; without its water it takes second
 force_field = ("amber14-all.xml", "amber14/tip3pfb.xml")  # files of OpenMM, or yours
 system = test_systems.from_file(path, quick=True, constrain="hbonds", force_field=force_field)
 print(system.title)
-methods = ["rattle", "blanes-moan4", "openmm-verlet"]  # `kcons list` names all
-table = compare(system, methods, budget=3)  # a row a method and time step
+methods = ["rattle", "blanes-moan4", "openmm-verlet"]  # `kcons compare --list` names all
+table = compare(system, methods, budget=2, rounds=1)  # a row a method and time step; seconds for each method
 
 print(table[["title", "setting", "error", "sigma", "step_seconds"]].to_string(index=False))
 print(text(table, rank(table)))

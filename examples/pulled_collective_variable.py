@@ -10,6 +10,7 @@ import numpy as np
 from openmm import Platform, app, unit
 
 from kcons.constraints import Distance
+from kcons.free_energy import work_along
 from kcons.openmm import Langevin, ProjectedIntegrator, hold, positions_of
 
 pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))
@@ -29,14 +30,14 @@ context.setPositions(x)
 simulation.minimizeEnergy(maxIterations=100)
 integrator.setVelocitiesToTemperature(context, 300 * unit.kelvin, 1)
 
-print("time/ps   distance/nm   force/(kJ/mol/nm)   work/(kJ/mol)")
+print("time/ps   distance/nm   mean force/(kJ/mol/nm)   work/(kJ/mol)")
 forces = []
-for step in range(251):
+for step in range(501):
     if step:
         simulation.step(1)
     forces.append(rows.multipliers(context)[0])
-    if step % 50 == 0:
-        work = np.trapezoid(forces, dx=0.004 * speed)
+    if step % 100 == 0:
+        work = work_along(start + 0.004 * speed * np.arange(step + 1), forces)[-1] if step else 0.0
         distance = np.linalg.norm(np.subtract(*positions_of(context)[ends]))
-        print(f"{step * 0.004:7.1f} {distance:13.6f} {forces[-1]:19.1f} {work:15.1f}")
+        print(f"{step * 0.004:7.1f} {distance:13.6f} {np.mean(forces[-100:]):24.1f} {work:15.1f}")
         assert abs(distance - start - speed * step * 0.004) < 1e-9
