@@ -43,7 +43,7 @@ from kcons.thermostats import (
     thermal_velocities,
 )
 
-RESULTS = Path(__file__).parents[1] / "docs" / "results" / "constant_pressure.json"
+RESULTS = Path(__file__).parents[2] / "docs" / "results" / "constant_pressure.json"
 
 # -- fluids of rigid molecules --------------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ from kcons.solvers import SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
 STEP = 2.0  # fs
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 
 
 # -- systems: positions (Å), masses (amu), pairs --------------------------------------------------

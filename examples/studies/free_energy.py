@@ -28,7 +28,7 @@ from kcons.free_energy import FreeEnergy, HeldCoordinates, Recorder, Settings, W
 from kcons.steppers import Stepper
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 
-RESULT = Path(__file__).parents[1] / "docs" / "results" / "free_energy.json"
+RESULT = Path(__file__).parents[2] / "docs" / "results" / "free_energy.json"
 MASSES = np.array([12.0, 14.0, 16.0, 12.0])
 LENGTHS = (1.5, 1.4, 1.5)
 KT, BEND, BENT, PULL = 2.494, 40.0, 1.95, 6.0  # kJ/mol, and angstrom, u: the unit of time is 0.1 ps
@@ -223,7 +223,7 @@ def windows_of_phi(folder: Path) -> tuple[Windows, FreeEnergy]:
 
     from kcons.free_energy import OpenMMWindows
 
-    pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
+    pdb = app.PDBFile(str(Path(__file__).parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
     sampler = OpenMMWindows(
         pdb.topology, _system(pdb), pdb.positions, {"phi": Dihedral([[4, 6, 8, 14]])}, platform="Reference"
     )
@@ -352,7 +352,7 @@ def umbrella(place: float, number: int, steps: int, folder: str) -> np.ndarray:
     file = Path(folder) / f"umbrella-{number}.npy"
     if file.exists():
         return np.load(file)
-    pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
+    pdb = app.PDBFile(str(Path(__file__).parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
     system = _system(pdb)
     bias = openmm.CustomTorsionForce(f"{STIFFNESS / 2}*min(d, 2*pi-d)^2; d=abs(theta-place); pi=3.141592653589793")
     bias.addGlobalParameter("place", float(place))
@@ -390,7 +390,7 @@ def recording(turns: int = 40, steps: int = 200) -> dict[str, object]:
     from kcons.free_energy import HeldCoordinatesReporter, OpenMMWindows, Window
     from kcons.openmm import Langevin as Bath
 
-    pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
+    pdb = app.PDBFile(str(Path(__file__).parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
     torsions = {"phi": Dihedral([[4, 6, 8, 14]]), "psi": Dihedral([[6, 8, 14, 16]])}
     default = Settings().every
     found: dict[str, object] = {"every": default, "platform": Platform.getPlatformByName("Reference").getName()}

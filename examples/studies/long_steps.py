@@ -32,7 +32,7 @@ from kcons.thermostats import (
     thermal_velocities,
 )
 
-RESULT = Path(__file__).parents[1] / "docs" / "results" / "long_steps.json"
+RESULT = Path(__file__).parents[2] / "docs" / "results" / "long_steps.json"
 
 
 # -- a small system, against Metropolis -----------------------------------------------------------------

@@ -31,7 +31,7 @@ from kcons.free_energy import (
     plot_surface,
 )
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 KT = 0.00831446261815324 * 300.0  # kJ/mol
 
 

@@ -26,7 +26,7 @@ from rich.table import Table
 
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 
 
 def measure_collective(full: bool = False) -> dict[str, Any]:

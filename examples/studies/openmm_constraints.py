@@ -44,7 +44,7 @@ from kcons.openmm import (
     velocities_of,
 )
 
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 KT = 2.494  # 300 K in kJ/mol
 
 

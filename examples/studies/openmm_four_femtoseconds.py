@@ -39,7 +39,7 @@ from kcons.constraints import Angle, Constraint, Distance
 from kcons.openmm import Langevin, ProjectedIntegrator, constraints_of, hold, positions_of
 from kcons.topology import HeldRows, bond_angles
 
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 TEMPERATURE, STEP, CALL = 300.0, 0.004, 50
 #: Platforms, steps and numbers of villin's other runs, each from a start of its own.
 AGAIN = (("OpenCL mixed", STEP, 3), ("OpenCL double", STEP, 1), ("OpenCL mixed", STEP / 2, 1))

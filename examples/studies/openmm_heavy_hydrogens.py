@@ -35,7 +35,7 @@ from kcons.openmm import (
     velocities_of,
 )
 
-PDB = Path(__file__).resolve().parent.parent / "tests" / "data" / "alanine-dipeptide-implicit.pdb"
+PDB = Path(__file__).resolve().parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"
 TEMPERATURE, FRICTION, HEAVY = 300.0, 5.0, 3.0
 KT = 0.00831446261815324 * TEMPERATURE
 #: Picoseconds between samples.

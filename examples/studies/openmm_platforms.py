@@ -29,7 +29,7 @@ from rich.console import Console
 from kcons.comparison import environment, processor_of
 from kcons.openmm import Isokinetic, Langevin, Precision, ProjectedIntegrator, RattleIntegrator, positions_of
 
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 TEMPERATURE, FRICTION, STEP = 300.0, 1.0, 0.002
 #: Integrators by name; those of OpenMM are given the tolerance that kcons takes by itself.
 INTEGRATORS: dict[str, Callable[[], openmm.Integrator]] = {

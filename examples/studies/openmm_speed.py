@@ -28,7 +28,7 @@ from rich.console import Console
 from kcons.comparison import environment, processor_of
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 TOLERANCE = 1e-10
 
 

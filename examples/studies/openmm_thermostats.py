@@ -29,7 +29,7 @@ from rich.console import Console
 from kcons.comparison import environment, json_files, processor_of
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
 
-DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 TOLERANCE = 1e-8
 TEMPERATURE, FRICTION, FREQUENCY = 300.0, 1.0, 20.0
 Make = Callable[[float], openmm.Integrator]
