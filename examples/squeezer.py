@@ -46,7 +46,7 @@ def force(q, v, t):
     return 0.033 * beta + (pull * slope.conj()).real - sum(m * (by.conj() * bent).real for m, by, bent in moved)
 
 
-def gaps(q, v=fixed, which=0):
+def gaps(q, v=fixed, which=0):  # of the three loops; which=1: their derivatives, which=2: their accelerations
     gap = np.array([end(joint, q, v)[which] - end(way, q, v)[which] for way in ways])
     return np.concatenate([gap.real, gap.imag])
 
