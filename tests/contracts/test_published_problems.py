@@ -64,8 +64,8 @@ def test_car_axis_by_extrapolation(car):
 
 
 def test_car_axis_by_no_more_evaluations_than_dop853():
-    """Of what the example measures."""
-    script = runpy.run_path(str(ROOT / "examples" / "26_own_constraints.py"))
+    """Of what the study measures."""
+    script = runpy.run_path(str(ROOT / "examples" / "studies" / "own_constraints.py"))
     found = {name: way() for name, way in script["CAR"].items() if name != "BlanesMoan6"}
     errors = {name: script["car_error"](each) for name, each in found.items()}
     assert max(errors.values()) < 1e-7 and errors["Extrapolation"] < errors["SciPy alone, DOP853"]

@@ -80,10 +80,22 @@ def test_example_runs(script, tmp_path, monkeypatch):
     assert said(script).strip()
 
 
+def test_examples_are_short_and_on_the_front_page():
+    """Fourteen scripts that a user reads and changes; each says what it shows and how it is run."""
+    scripts = sorted((ROOT / "examples").glob("*.py"))
+    listed = re.findall(r"\]\(\.\./examples/(\w+\.py)\)", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"))
+    assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 14
+    for script in scripts:
+        text = script.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 60 and not re.search(r"\d", script.name), script.name
+        assert text.startswith('"""') and f"python examples/{script.name}" in text.split('"""')[1], script.name
+        assert not re.search(r"^\s*(from|import) tests", text, re.MULTILINE), script.name
+
+
 def test_an_example_runs_by_itself(tmp_path):
     """Nothing but what it imports, and no warning of anybody."""
     result = subprocess.run(
-        [sys.executable, "-W", "error", str(EXAMPLES[0])],
+        [sys.executable, "-W", "error", str(ROOT / "examples" / "rigid_water_ase.py")],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,

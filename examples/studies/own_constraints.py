@@ -1,8 +1,8 @@
 """What a step costs with constraints of one's own, beside the families of kcons.
 
-    python examples/26_own_constraints.py           a few seconds
-    python examples/26_own_constraints.py --full    a minute: longer blocks, 100,000 particles
-    python examples/26_own_constraints.py --car     seconds: the car axis, beside SciPy's DOP853 on equations of index 1
+    python examples/studies/own_constraints.py           a few seconds
+    python examples/studies/own_constraints.py --full    a minute: longer blocks, 100,000 particles
+    python examples/studies/own_constraints.py --car     the car axis, beside SciPy's DOP853 on equations of index 1
 
 One particle or body, a step of RATTLE without forces; then many particles, the projection of positions and velocities,
 for each row.

@@ -1,7 +1,7 @@
 """Motions under constraints of one's own, each beside what theory says: a picture for docs/own_constraints.md.
 
-python examples/37_constraint_figures.py            prints how far each is from its closed form
-python examples/37_constraint_figures.py FOLDER     also writes own_constraints.png there
+python examples/studies/constraint_figures.py            prints how far each is from its closed form
+python examples/studies/constraint_figures.py FOLDER     also writes own_constraints.png there
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Rigid water in ASE: hold every molecule, run dynamics, read off what the constraints did.
 
-Run with ``python examples/01_rigid_water_ase.py``; about ten seconds.
+Run with ``python examples/rigid_water_ase.py``; about ten seconds.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from ase.build import molecule
 from ase.calculators.tip3p import TIP3P
 from ase.md.verlet import VelocityVerlet
 
-from kcons.ase import constrain, draw_velocities, rigid_water
+from kcons.ase import ConstrainedLangevin, constrain, draw_velocities, rigid_water
 
 
 def water_box(side: int = 3, spacing: float = 3.1) -> Atoms:
@@ -30,7 +30,8 @@ def main(steps: int = 200) -> None:
 
     # One object holds everything. project=True moves the atoms onto the TIP3P geometry.
     held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    draw_velocities(atoms, 300, rng=np.random.default_rng(2))
+    draw_velocities(atoms, 300, rng=2)
+    ConstrainedLangevin(atoms, 2 * units.fs, 300, 0.1 / units.fs, rng=3).run(steps)  # takes up the heat of the start
     print(held.report(atoms), "\n")
 
     dynamics = VelocityVerlet(atoms, 2 * units.fs)

@@ -1,7 +1,7 @@
 """The torsion of butane with GFN2-xTB at 300 K, from a plan, beside its relaxed scan.
 
-python examples/30_butane_torsion.py           four short windows, to see how it goes
-python examples/30_butane_torsion.py --full    the profile: some ten minutes on two cores; picture and numbers into docs
+python examples/studies/butane_torsion.py           four short windows, to see how it goes
+python examples/studies/butane_torsion.py --full    the profile, into docs: some ten minutes on two cores
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kcons.comparison import environment, json_files
 from kcons.constraints import Dihedral
 from kcons.free_energy import Windows, read_plan, scan
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 CARBONS = [0, 1, 2, 3]
 PLAN = """
 [structure]

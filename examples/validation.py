@@ -1,0 +1,60 @@
+"""kcons against closed forms and OpenMM: a particle on a sphere, a turning dumbbell, rigid water.
+
+Run with ``python examples/validation.py``; some ten seconds. Each line is an error, and what it must be below.
+"""
+
+import numpy as np
+import openmm.app
+
+from kcons import ConstraintSet, Motion, State, System, constraints, run, steppers
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator, hold, positions_of, take_constraints, velocities_of
+
+
+def check(what, error, bound):
+    print(f"{what:62s} {error:8.0e} < {bound:.0e}")
+    assert error < bound, what
+
+
+def path(held, x, v, masses, force=None):
+    system = System(Motion(ConstraintSet(held, x, masses), x), force)
+    state = State(np.array(x, float), np.array(v, float))
+    return run(system, state, 0.01, 1000, stepper=steppers.BlanesMoan6(), record=1)
+
+
+ball = constraints.Sphere([0], [0.0, 0.0, 0.0], 2.0)
+free = path(ball, [[2.0, 0.0, 0.0]], [[0.0, 3.0, 0.0]], [1.0])
+turn = np.stack([np.cos(1.5 * free.times), np.sin(1.5 * free.times), 0 * free.times], axis=1)
+check("particle on a sphere: off the great circle", abs(free.positions[:, 0] - 2 * turn).max(), 1e-12)
+check("particle on a sphere: speed off 3", abs(np.linalg.norm(free.velocities, axis=2) - 3).max(), 1e-13)
+swing = path(ball, [[2.0, 0.0, 0.0]], [[0.0, 1.5, 0.5]], [1.0], lambda x, t: np.array([[0.0, 0.0, -9.81]]))
+x, v = swing.positions[:, 0].T, swing.velocities[:, 0].T
+check("spherical pendulum: energy changes by", np.ptp(0.5 * (v**2).sum(axis=0) + 9.81 * x[2]), 1e-11)
+check("spherical pendulum: angular momentum J_z changes by", np.ptp(x[0] * v[1] - x[1] * v[0]), 1e-12)
+flight = path(constraints.Distance([[0, 1]]), [[2, 0, 0], [-1, 0, 0]], [[0.5, 3, 0], [0.5, -1.5, 0]], [1, 2])
+exact = 0.5 * free.times[:, None, None] * [1.0, 0.0, 0.0] + np.stack([2 * turn, -turn], axis=1)
+check("dumbbell that turns and flies: off its closed form", abs(flight.positions - exact).max(), 1e-12)
+field, box = openmm.app.ForceField("tip3p.xml"), openmm.app.Modeller(openmm.app.Topology(), [])
+box.addSolvent(field, boxSize=openmm.Vec3(1.6, 1.6, 1.6))  # nm
+system = field.createSystem(box.topology, nonbondedMethod=openmm.app.CutoffPeriodic, nonbondedCutoff=0.75)
+context = openmm.Context(system, RattleIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+context.setPositions(box.positions)
+openmm.LocalEnergyMinimizer.minimize(context, maxIterations=50)
+context.setVelocitiesToTemperature(300, 1)
+x, v = positions_of(context), velocities_of(context)
+
+
+def after(integrator, v, system=system, steps=20):
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(x)
+    context.setVelocities(v)
+    integrator.step(steps)
+    return positions_of(context)
+
+
+before = after(RattleIntegrator(0.001), -v, steps=1)
+verlet = after(openmm.VerletIntegrator(0.001), (x - before) / 0.001)  # has velocities half a step behind
+for each in RattleIntegrator(0.001), ProjectedIntegrator(0.001):
+    check(f"rigid water, {type(each).__name__}: nm off OpenMM's own", abs(after(each, v) - verlet).max(), 1e-12)
+rows = hold(system, take_constraints(system, keep_water=False), x)  # OpenMM rounds lengths of water to floats
+own = after(ProjectedIntegrator(0.001, parts=[rows]), v)
+check("rigid water, kcons' own solver: nm off OpenMM's own", abs(own - verlet).max(), 1e-7)
