@@ -629,6 +629,8 @@ def _surfaces(system: TestSystem) -> str | None:
 
 def _code_in_openmm(imported: str, made: Sequence[str], system: TestSystem, dt: str, steps: int) -> list[str]:
     ps = _step(system, float(dt) * system.units.time_unit * _engine(system).time)
+    if float(ps) > 0.02:  # which might be meant in fs
+        ps, imported = f"{ps} * unit.picoseconds", f"{imported}\nfrom openmm import unit"
     keep = str(not only_water(system)) if any("KEEP" in line for line in made) else ""
     lines = [line.replace("STEP", ps).replace("KEEP", keep) for line in made]
     return [

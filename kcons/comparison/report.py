@@ -130,6 +130,7 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
         lines.append(f"... and {len(found.table) - PLACES} more")
     same = f"{100 * found.scatter:.0f} %"
     how = ", to which times repeat" if found.cost == "seconds" and about.get("margin") is not None else ""
+    lines.append(f"Measured on {about['title']}.")
     lines.append(f"cost: {COSTS[found.cost]} a {about['long_time']}; =: equal within {same}{how}.")
     return "\n".join(lines)
 

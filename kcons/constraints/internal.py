@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANGLE, numbers
+from kcons.constraints.arguments import ANGLE, kept, numbers
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, dot, norm
@@ -169,7 +169,7 @@ class DistanceDifference(Constraint):
             raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
         if self.n_rows and {slot for pair in self.slots for slot in pair} != set(range(self.width)):
             raise InputError("DistanceDifference: slots and atoms do not belong together", item="slots")
-        self.links = np.array(_walk(self.slots)[1], dtype=np.int64)
+        self.links = kept(np.array(_walk(self.slots)[1], dtype=np.int64))
 
     @property
     def pairs(self) -> IntArray:
