@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Methods that a ranking shows, and curves of a figure.
-PLACES, CURVES = 6, 9
+PLACES, CURVES = 5, 9
 #: Bands behind the curves, one an engine.
 BANDS = {"arrays": "#bdbdbd", "ASE": "#e0c39a", "OpenMM": "#c6b8d9"}
 #: Color-blind safe; of a few methods always the same.
