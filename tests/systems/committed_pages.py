@@ -1,4 +1,4 @@
-"""Examples as commands, and what they print of their committed results, which pages of the documentation show."""
+"""Examples as commands, and where committed results are."""
 
 from __future__ import annotations
 
@@ -23,14 +23,3 @@ def said(script: Path, *arguments: str) -> str:
         except SystemExit as end:
             assert not end.code, end
     return out.getvalue()
-
-
-def printed(script: str, results: str, option: str = "--show") -> str:
-    """The output of an example for a file of results, without blanks at the ends of its lines."""
-    out = said(ROOT / "examples" / script, option, str(FOLDER / results))
-    assert out.strip()
-    return "\n".join(line.rstrip() for line in out.strip("\n").split("\n"))
-
-
-def page(name: str) -> str:
-    return (ROOT / "docs" / name).read_text(encoding="utf-8")
