@@ -29,6 +29,7 @@ def copied(folder: Path) -> Path:
     """The package with its compiled kernels, and its tests, where lines can be changed."""
     shutil.copytree(PACKAGE, folder / "kcons")
     shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "examples" / "studies", folder / "examples" / "studies")
     shutil.copy(ROOT / "pyproject.toml", folder)
     # Kernels of a tree in which functions that they took in were changed since.
     for path in (folder / "kcons" / "solvers").glob("*.py"):
