@@ -22,9 +22,9 @@ MUTANTS = [
     ),
     (
         "comparison/runs.py",
-        "self.context.setPositions(x * self.length)",
-        "self.context.setPositions(x)",
-        "tests/hard_cases/test_hard_cases.py::test_in_ase_and_openmm",
+        "return x / self.length, v / self.speed",
+        "return x, v",
+        "tests/comparison/test_methods.py::test_lines_of_python_end_where_the_run_ends",
     ),
     (
         "comparison/ranking.py",
