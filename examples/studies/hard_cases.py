@@ -28,7 +28,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parents[1] / "tests"), str(HERE)]
 
 import harness  # noqa: E402
-from hard_cases.case import OURS, SYSTEMS, Case, Cell, all_cases, run_cell  # noqa: E402
+from hard_cases.case import OURS, SYSTEMS, Case, Cell, all_cases, run_numbered  # noqa: E402
 
 #: Seconds after which a program that has not answered is given up: quick and full.
 LIMITS = (60.0, 3600.0)
@@ -46,7 +46,7 @@ class Child:
 
     def cell(self, case: Case, program: str, quick: bool) -> Cell:
         try:
-            return self.pool.submit(run_cell, case, program, quick).result(LIMITS[0 if quick else 1])
+            return self.pool.submit(run_numbered, case.number, program, quick).result(LIMITS[0 if quick else 1])
         except TimeoutError:
             words = f"no answer within {LIMITS[0 if quick else 1]:g} s"
         except BrokenProcessPool:

@@ -215,3 +215,8 @@ def run_cell(case: Case, program: str, quick: bool) -> Cell:
     except Exception as error:
         found = error
     return judge(case, found, warned, program)
+
+
+def run_numbered(number: str, program: str, quick: bool) -> Cell:
+    """A cell by the number of its case: cases do not travel to other processes."""
+    return run_cell(all_cases()[number], program, quick)
