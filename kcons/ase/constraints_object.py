@@ -403,12 +403,26 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
     @property
     def index(self) -> IntArray:  # type: ignore[override]
-        """The fixed atoms, in ascending order."""
-        return touched_atoms([item for item in self.constraints if item.family == "FixedAtoms"])
+        """The fixed atoms, in ascending order.
+
+        Warns
+        -----
+        UserWarning
+            Other rows are held, too, of which a program that asks for fixed atoms alone knows nothing.
+        """
+        others = sum(item.n_rows for item in self.constraints if item.family != "FixedAtoms")
+        if others:
+            warnings.warn(
+                f"the fixed atoms are told, of the other {others} rows nothing: a file does not have them, and a "
+                "program that asks (Sella) does not hold them; give it kcons.ase.to_ase_constraints(atoms)",
+                UserWarning,
+                stacklevel=2,
+            )
+        return self.get_indices()
 
     def get_indices(self) -> IntArray:
-        """The fixed atoms."""
-        return self.index
+        """The fixed atoms, in ascending order."""
+        return touched_atoms([item for item in self.constraints if item.family == "FixedAtoms"])
 
     def delete_atoms(self, indices: Any, natoms: int) -> Constraints | None:
         """Keep the rows whose atoms all stay, renumbered; None if there are none."""

@@ -64,7 +64,7 @@ def slab() -> Atoms:
 
 def fixed_in(atoms: Atoms) -> list[int]:
     """As all that reads `FixAtoms` finds them."""
-    return sorted(i for c in atoms.constraints if isinstance(c, FixAtoms) for i in c.index.tolist())
+    return sorted(i for c in atoms.constraints if isinstance(c, FixAtoms) for i in c.get_indices().tolist())
 
 
 HELD = {
@@ -112,6 +112,18 @@ def test_the_object_follows_what_it_holds():
     assert type(held) is Constraints and fixed_in(atoms) == []
     held.constraints = (FixedAtoms([5]),)
     assert fixed_in(atoms) == [5]
+
+
+def test_other_rows_are_told_to_what_asks_for_fixed_atoms_alone(tmp_path):
+    """Such as writers of files, and Sella, which held the fixed atoms and let go of the bond."""
+    atoms = slab()
+    held = constrain(atoms, HELD["with others"])
+    with pytest.warns(UserWarning, match="of the other 1 rows nothing: .*to_ase_constraints"):
+        assert held.index.tolist() == [0, 1, 2, 3]
+    with pytest.warns(UserWarning, match="a file does not have them"):
+        write(tmp_path / "POSCAR", atoms, format="vasp")
+    held.constraints = (FixedAtoms([5]),)
+    assert held.index.tolist() == [5]  # that is all
 
 
 def test_atoms_can_be_deleted_as_with_fix_atoms():
