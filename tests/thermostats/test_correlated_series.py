@@ -91,16 +91,19 @@ def test_errors_of_ratios():
 
 @pytest.mark.filterwarnings("ignore:temperature of")
 def test_errors_of_temperatures_by_kind_of_motion():
-    """Two atoms in a trap, which forget where they were in 4 samples."""
-    stiff, kT = np.array([[1.0, 2.0, 3.0], [2.0, 1.0, 0.5]]), 0.8
-    held = system([], np.zeros((2, 3)), [1.0, 2.0], lambda x, t: -stiff * x)
+    """Pairs of atoms in traps, which forget where they were in 4 samples: each pair is a run of its own."""
+    kT, pairs, samples = 0.8, 50, 640
+    stiff = np.tile([[1.0, 2.0, 3.0], [2.0, 1.0, 0.5]], (pairs, 1))
+    held = system([], np.zeros((2 * pairs, 3)), np.tile([1.0, 2.0], pairs), lambda x, t: -stiff * x)
+    groups = {f"pair {k}": [2 * k, 2 * k + 1] for k in range(pairs)}
     rng, found = np.random.default_rng(4), []
-    for _ in range(120):
-        split = TemperatureSplit(held, displacement=1e-3)
-        for x in fading(rng, 160, 4.0, 6).reshape(-1, 2, 3) * np.sqrt(kT / stiff):
+    for _ in range(20):
+        split = TemperatureSplit(held, displacement=1e-3, groups=groups)
+        for x in fading(rng, samples, 4.0, 6 * pairs).reshape(-1, 2 * pairs, 3) * np.sqrt(kT / stiff):
             split.add(x, -stiff * x)
-        found.append(split.result().shift)
-    assert 0.88 <= scatter(found, kT) <= 1.15
+        found += [split.result(pair).shift for pair in groups]
+    assert len(found) == 1000
+    assert 0.9 <= scatter(found, kT) <= 1.15
 
 
 @pytest.mark.parametrize("name", ["independent", "memory 10", "fast and slow", "smooth"])
