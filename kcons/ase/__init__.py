@@ -19,6 +19,7 @@ try:
     from kcons.ase.constraints_object import (
         Constraints,
         ConstraintsWithFixedAtoms,
+        attach,
         constrain,
         to_ase_constraints,
     )
@@ -51,6 +52,7 @@ __all__ = [
     "IsokineticDynamics",
     "MultipleTimeSteps",
     "PressureReporter",
+    "attach",
     "constrain",
     "constraints_of",
     "draw_velocities",

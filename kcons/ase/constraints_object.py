@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import wraps
 from typing import Any, Literal
 from weakref import ref
 
@@ -14,12 +13,12 @@ from ase import Atoms
 from ase.constraints import FixAtoms, FixConstraint
 
 import kcons.constraints as families
-from kcons.ase.binding import Binding, applied_forces, bind, check_company, shared, touched_atoms
+from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind, check_company, shared, touched_atoms
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, fulfilled, moves_far, warn_of_displacements
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
-from kcons.ase.translation import ase_form, ase_forms
+from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
@@ -30,7 +29,7 @@ from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.steppers.state import KICK_ROUNDING
 
-__all__ = ["Constraints", "ConstraintsWithFixedAtoms", "constrain", "to_ase_constraints"]
+__all__ = ["Constraints", "ConstraintsWithFixedAtoms", "attach", "constrain", "to_ase_constraints"]
 
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
@@ -340,8 +339,7 @@ class Constraints(FixConstraint):
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
         """``todict()`` gives {'name', 'kwargs'} for `ase.constraints.dict2constraint`, targets included.
 
-        Where ASE can hold the same by one object of its own, these name that object, so that ASE opens the file without
-        kcons; all that kcons needs stands beside them.
+        Where one object of ASE holds the same, these name that object, so that files open without kcons; see `attach`.
 
         Missing (with a warning) if a row holds a Python function: ASE then writes its files without this
         object instead of failing.
@@ -432,14 +430,17 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
 
 def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    repeated, bound = held._repeated, held._binding
+    # ASE counts rows as they are given, also those that depend on others.
+    independent = bound is None or bound.motion.rank == sum(item.n_rows for item in held.constraints)
+    if repeated is None and held.degenerate == "convert" and independent:
+        form = file_form(held.constraints)
+        if form is not None:
+            return form
     kwargs: dict[str, Any] = {"constraints": rows, "degenerate": held.degenerate}
-    repeated = held._repeated
     if repeated is not None:
         kwargs["repeated"] = [list(repeated[0]), repeated[1]]
-    native = ase_form(held.constraints) if repeated is None else None
-    if native is None:
-        return {"name": REGISTERED_NAME, "kwargs": kwargs}
-    return {**native, REGISTERED_NAME: kwargs}
+    return {"name": REGISTERED_NAME, "kwargs": kwargs}
 
 
 def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
@@ -602,18 +603,44 @@ def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] =
     return result
 
 
+def attach(atoms: Atoms) -> Constraints:
+    """Put one object of kcons in the place of all constraint objects on `atoms`, which holds what they hold.
+
+    For atoms that were read from a file: where one object of ASE holds what a `Constraints` held, the file names that
+    object, and ASE makes it. kcons' own dynamics classes take either.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+        Positions and momenta stay as they are. Objects that only add forces (Hookean, ExternalForce) stay, too.
+
+    Returns
+    -------
+    Constraints
+        The object that is now in ``atoms.constraints``. Targets that a file did not tell are taken from the positions
+        at its first use.
+
+    Raises
+    ------
+    UnsupportedError
+        An object that has no counterpart in kcons, named; nothing is changed.
+
+    See Also
+    --------
+    constrain : new constraints, with a look at the positions.
+    """
+    require_atoms(atoms)
+    others = [item for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+    rows = translated(atoms, [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)])
+    held = Constraints(rows)
+    atoms.set_constraint([held, *others])
+    return held
+
+
 def _register() -> None:
-    """Let ASE's readers make this object again, also where files name an object of ASE that holds the same."""
+    """Add the name to `ase.constraints`, so that ASE's readers make this object again."""
     if REGISTERED_NAME not in ase.constraints.__all__:
         ase.constraints.__all__.append(REGISTERED_NAME)
-        of_ase = ase.constraints.dict2constraint
-
-        @wraps(of_ase)
-        def dict2constraint(dct: dict[str, Any]) -> Any:
-            own = dct.get(REGISTERED_NAME)
-            return of_ase(dct) if own is None else of_ase({"name": REGISTERED_NAME, "kwargs": own})
-
-        ase.constraints.dict2constraint = dict2constraint
     setattr(ase.constraints, REGISTERED_NAME, Constraints)
 
 

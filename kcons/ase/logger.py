@@ -130,7 +130,8 @@ def _motion(dyn: Any, atoms: Atoms) -> Motion:
     found = [item for item in atoms.constraints if isinstance(item, Constraints)]
     if not found:
         raise InputError(
-            "the atoms carry no constraints of kcons, so that no coordinate is held; see kcons.ase.constrain",
+            "the atoms carry no constraints of kcons, so that no coordinate is held; see kcons.ase.constrain, and "
+            "kcons.ase.attach for atoms from a file",
             item="coordinates",
         )
     return found[0].engine(atoms)

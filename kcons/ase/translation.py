@@ -122,10 +122,20 @@ _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
 }
 
 
-def ase_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
-    """The one constraint of ASE that holds the same, as in `ase_forms`; None if there is none."""
+def file_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
+    """The one constraint of ASE that holds the same, as in `ase_forms`, for a file; None if there is none.
+
+    Distances are those of FixInternals, which ASE writes again with their lengths; FixBondLengths loses them.
+    """
     forms, left = ase_forms(rows)
-    return forms[0] if len(forms) == 1 and not left else None
+    if len(forms) != 1 or left:
+        return None
+    (form,) = forms
+    if form["name"] == "FixBondLengths":
+        kwargs = form["kwargs"]
+        bonds = [list(bond) for bond in zip(kwargs["bondlengths"], kwargs["pairs"], strict=True)]
+        return _named("FixInternals", bonds=bonds, angles_deg=[], dihedrals_deg=[], mic=True)
+    return form
 
 
 def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Constraint]]:
@@ -136,7 +146,7 @@ def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Co
     """
     kinds: dict[str, list[Constraint]] = {}
     for item in rows:
-        known = isinstance(item.target, np.ndarray) and item.n_rows
+        known = isinstance(item.target, np.ndarray) and item.n_rows and item.windings is None
         kinds.setdefault(_KINDS.get(item.family, "") if known else "", []).append(item)
     left = kinds.pop("", [])
     forms = []

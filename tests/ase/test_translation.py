@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import pickle
 import subprocess
@@ -39,7 +38,7 @@ from ase_systems import (
     rigid,
 )
 
-from kcons.ase import ConstrainedDynamics, Constraints, constrain, from_ase_constraints, rigid_water
+from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (
     Angle,
     CenterOfMass,
@@ -243,8 +242,8 @@ def test_constraint_object_round_trip():
 
 #: What is held, and the object of ASE that holds the same; None where no single one does.
 NATIVE = {
-    "FixBondLengths": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
-    "FixInternals": [
+    "FixInternals": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
+    "FixInternals of several kinds": [
         Distance([[0, 1]]),
         Angle([[0, 1, 2]]),
         Dihedral([[3, 2, 1, 0]]),
@@ -277,12 +276,9 @@ for path in sorted(Path(sys.argv[1]).glob("*.*")):
     try:
         atoms = read(path)
         (held,) = atoms.constraints
-        kwargs = held.todict()["kwargs"]
-        if hasattr(held, "bondlengths"):  # which ASE itself does not write
-            kwargs["bondlengths"] = held.bondlengths
-        print(path.name, type(held).__name__, atoms.get_number_of_degrees_of_freedom(), kwargs, sep=";")
+        print(path.name, type(held).__name__, atoms.get_number_of_degrees_of_freedom(), sep=";")
     except ValueError:
-        print(path.name, "refused", 0, {}, sep=";")
+        print(path.name, "refused", 0, sep=";")
 assert "kcons" not in sys.modules
 """
     run = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True)
@@ -293,32 +289,69 @@ assert "kcons" not in sys.modules
 @pytest.mark.parametrize("suffix", ["traj", "json"])
 def test_files_open_without_kcons_where_ase_can_hold_the_same(opened_by_ase, name, suffix):
     folder, found = opened_by_ase
-    kind, freedom, kwargs = found[f"{name}.{suffix}"]
+    kind, freedom = found[f"{name}.{suffix}"]
     ours = read(folder / f"{name}.{suffix}")
-    assert isinstance(ours.constraints[0], Constraints)
+    full, name = name, name.split()[0]
     if not name.startswith("Fix"):
-        assert kind == "refused"
+        assert kind == "refused" and isinstance(ours.constraints[0], Constraints)
         return
-    assert kind == name and int(freedom) == ours.get_number_of_degrees_of_freedom()
+    original = molecule("CH3CH2OH")
+    expected = constrain(original, NATIVE[full]).engine(original).constraint_set
+    assert kind == name and int(freedom) == original.get_number_of_degrees_of_freedom()
+    assert type(ours.constraints[0]).__name__ == kind
     # The rows of ASE's object are ours again, with the same targets; those of lengths and angles are in the file.
-    twin = ours.copy()
-    if name in ("FixBondLengths", "FixInternals"):
-        twin.positions *= 1.01
-    twin.set_constraint(dict2constraint({"name": kind, "kwargs": ast.literal_eval(kwargs)}))
-    rows = Constraints(from_ase_constraints(twin)).engine(ours).constraint_set
-    expected = ours.constraints[0].engine(ours).constraint_set
-    assert np.sort(rows.target()) == pytest.approx(np.sort(expected.target()), abs=1e-12)
+    if name == "FixInternals":
+        ours.positions *= 1.01
+    held = attach(ours)
+    assert ours.constraints == [held]
+    rows = held.engine(ours).constraint_set
+    assert np.sort(rows.target()) == pytest.approx(np.sort(expected.target()), rel=5e-16)
+    if full == "FixInternals":
+        assert np.array_equal(rows.target(), expected.target())
+    assert ours.get_number_of_degrees_of_freedom() == int(freedom)
+
+
+def test_what_no_file_of_ase_tells_is_written_under_the_name_of_kcons():
+    atoms = molecule("CH3CH2OH")
+    for held in (Constraints([Distance([0, 1], 1.5)], degenerate="raise"), Constraints([Distance([0, 1], [1.5])])):
+        atoms.set_constraint(held)
+        name = "FixInternals" if held.degenerate == "convert" else "KconsConstraints"
+        held.engine(molecule("CH3CH2OH"))
+        assert held.todict()["name"] == name
+        assert dict2constraint(held.todict()).todict()["name"] == name
+
+
+def test_rows_that_depend_on_others_are_counted_right_in_files(tmp_path):
+    """ASE would count each of them."""
+    atoms = molecule("CO2")
+    constrain(atoms, Distance([[0, 1], [0, 2], [1, 2]]))
+    again = _through(atoms, tmp_path / "a.traj")
+    assert again.get_number_of_degrees_of_freedom() == atoms.get_number_of_degrees_of_freedom() == 5
+
+
+def test_attach_keeps_objects_that_add_forces_and_refuses_unknown_ones():
+    atoms = molecule("CH3CH2OH")
+    spring = Hookean(a1=0, a2=5, rt=1.0, k=1.0)
+    atoms.set_constraint([FixAtoms([8]), spring, FixBondLengths([[0, 1]])])
+    held = attach(atoms)
+    assert atoms.constraints == [held, spring]
+    assert [row.family for row in held.constraints] == ["FixedAtoms", "Distance"]
+    before = [FixAtoms([8]), MirrorForce(0, 1)]
+    atoms.set_constraint(before)
+    with pytest.raises(UnsupportedError, match="MirrorForce"):
+        attach(atoms)
+    assert atoms.constraints == before
 
 
 def test_a_restart_from_a_file_that_ase_can_open_is_exact(tmp_path):
-    """The rows and targets of kcons stand beside those of ASE, to the last bit."""
+    """The object of ASE has the rows and the targets of kcons to the last bit."""
     atoms, held = rigid(2)
     path = tmp_path / "run.traj"
     dynamics = ConstrainedDynamics(atoms, units.fs, trajectory=str(path))
     dynamics.run(2)
     again = read(path)
-    assert again.constraints[0].todict() == held.todict()
-    assert again.constraints[0].todict()["name"] == "FixBondLengths"
+    assert isinstance(again.constraints[0], FixInternals)
+    assert attach(again).todict() == held.todict()
     forces = again.get_forces(apply_constraint=False)
     again.calc = TIP3P(rc=6.0)
     ConstrainedDynamics(again, units.fs, forces=forces, time=dynamics.get_time()).run(3)
@@ -342,6 +375,7 @@ def test_trajectory_written_during_dynamics(tmp_path):
         dyn.run(10)
     frames = read(tmp_path / "md.traj", index=":")
     assert len(frames) == 3
+    attach(frames[-1])
     assert np.array_equal(targets(frames[-1]), targets(atoms))
 
 
