@@ -60,9 +60,6 @@ class ConstrainedCalculator(Calculator):
     strain after which the constraints are restored. Per-atom properties are passed on.
     """
 
-    #: `Vibrations` and `Phonons` may displace held atoms.
-    respects_constraints = True
-
     def __init__(
         self, inner: Any, constraints: Constraints | Constraint | Iterable[Constraint], *, project: bool = True
     ) -> None:

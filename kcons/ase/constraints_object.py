@@ -16,7 +16,7 @@ import kcons.constraints as families
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind, check_company, shared, touched_atoms
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import Watch, fulfilled, moves_far, warn_of_displacements
+from kcons.ase.respect import Watch, fulfilled, moves_far
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
@@ -323,7 +323,6 @@ class Constraints(FixConstraint):
         """Independent copy with the same targets."""
         # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
-        warn_of_displacements(lambda: self.touched)
         twin = object.__new__(type(self))
         twin.__dict__.update(self.__dict__)
         twin._forget()

@@ -1,11 +1,6 @@
-"""Detection of what does not respect the constraints of its atoms: edits, dynamics classes, finite differences."""
+"""Detection of what does not respect the constraints of its atoms: edits and dynamics classes."""
 
 from __future__ import annotations
-
-import sys
-import warnings
-from collections.abc import Callable
-from weakref import WeakSet
 
 import numpy as np
 from ase import Atoms
@@ -34,10 +29,6 @@ FRAME = 0.3
 _SMALL = 0.1
 
 _FLOAT = np.dtype(np.float64)
-
-#: Modules of ASE that displace atoms one by one and never ask constraints.
-DISPLACING = ("ase.vibrations.vibrations", "ase.phonons")
-_warned: WeakSet[object] = WeakSet()
 
 ADVICE = (
     "use kcons.ase.ConstrainedDynamics for constant energy, ConstrainedLangevin, ConstrainedNoseHoover or "
@@ -279,35 +270,3 @@ def differ(a, b, much):  # type: ignore[no-untyped-def]
 
 def _near(a: FloatArray | None, b: FloatArray) -> bool:
     return a is not None and a.shape == b.shape and float(np.abs(a - b).max(initial=0.0)) <= START_TOLERANCE
-
-
-def warn_of_displacements(held: Callable[[], IntArray]) -> None:
-    """Warn, once for each of them, where `Vibrations` or `Phonons` of ASE displaces held atoms.
-
-    These classes ask constraints for nothing but copies, which they or their calculators make: to be called there.
-    """
-    if not any(name in sys.modules for name in DISPLACING):
-        return
-    frame, depth = sys._getframe(1), 1
-    while frame.f_globals.get("__name__") not in DISPLACING or "self" not in frame.f_locals:
-        if frame.f_back is None:
-            return
-        frame, depth = frame.f_back, depth + 1
-    finite = frame.f_locals["self"]
-    if finite in _warned or getattr(finite.calc, "respects_constraints", False):
-        return
-    _warned.add(finite)
-    moved = np.intersect1d(finite.indices, held())
-    if not len(moved):
-        return
-    while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("ase."):
-        frame, depth = frame.f_back, depth + 1
-    name = type(finite).__name__
-    warnings.warn(
-        f"{name} displaces atom {moved[0]} past its constraints, which it does not ask: what it prints belongs to "
-        "atoms that are free. Take the constraints off the atoms (atoms.set_constraint()) and give it a "
-        f"kcons.ase.ConstrainedCalculator(calculator, constraints), or leave the {len(moved)} held atoms out of its "
-        "indices",
-        UserWarning,
-        stacklevel=depth + 1,
-    )

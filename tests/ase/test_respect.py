@@ -7,15 +7,12 @@ import warnings
 import numpy as np
 import pytest
 from ase.build import molecule
-from ase.calculators.emt import EMT
 from ase.md.langevinbaoab import LangevinBAOAB
 from ase.md.melchionna import MelchionnaNPT
 from ase.md.nose_hoover_chain import NoseHooverChainNVT
 from ase.md.npt import NPT
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase.phonons import Phonons
-from ase.vibrations import Vibrations
 from ase_systems import (
     FS,
     TEMPERATURE,
@@ -25,7 +22,7 @@ from ase_systems import (
 )
 
 from kcons import ConstraintSet
-from kcons.ase import ConstrainedCalculator, constrain
+from kcons.ase import constrain
 from kcons.ase.respect import require_on_surface
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
@@ -99,47 +96,6 @@ def test_momenta_of_edited_atoms():
     assert np.array_equal(atoms.get_momenta(), before)
     held.restore(atoms)
     atoms.set_momenta(np.ones((4, 3)))
-
-
-# -- finite differences -----------------------------------------------------------------------------
-
-
-def held_ammonia():
-    atoms = molecule("NH3")
-    atoms.calc = EMT()
-    constrain(atoms, Distance([[0, 1], [0, 2]]))
-    return atoms
-
-
-@pytest.mark.parametrize("inplace", [True, False])
-def test_vibrations_of_held_atoms_warn_once(inplace, tmp_path):
-    vibrations = Vibrations(held_ammonia(), name=str(tmp_path / "vib"), indices=[0, 3])
-    with pytest.warns(UserWarning) as caught:
-        vibrations.run() if inplace else list(vibrations.iterdisplace())
-    (only,) = caught
-    assert only.filename == __file__
-    assert "Vibrations displaces atom 0" in str(only.message) and "ConstrainedCalculator" in str(only.message)
-    assert "leave the 1 held atoms out" in str(only.message)
-
-
-def test_phonons_of_held_atoms_warn(tmp_path):
-    atoms = held_ammonia()
-    atoms.set_cell([9, 9, 9])
-    atoms.pbc = True
-    with pytest.warns(UserWarning, match="Phonons displaces atom 0"):
-        Phonons(atoms, EMT(), name=str(tmp_path / "phonons")).run()
-
-
-def test_vibrations_that_are_right_do_not_warn(tmp_path):
-    atoms, loose = held_ammonia(), molecule("NH3")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        Vibrations(atoms, indices=[3], name=str(tmp_path / "partial")).run()
-        atoms.get_forces()  # outside of them nothing is looked at
-        loose.calc = EMT()
-        Vibrations(loose, name=str(tmp_path / "loose")).run()
-        atoms.calc = ConstrainedCalculator(EMT(), atoms.constraints[0])
-        Vibrations(atoms, name=str(tmp_path / "calculator")).run()
 
 
 def test_positions_that_are_not_finite_are_named():
