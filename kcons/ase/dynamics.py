@@ -439,7 +439,10 @@ def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def write_back(positions, velocities, masses, divisors, x, p, momenta, v):  # type: ignore[no-untyped-def]
-    """Put positions and momenta into `x` and `p`, the momenta also into `momenta`, and p/divisors into `v`."""
+    """Put positions and momenta into `x` and `p`, the momenta also into `momenta`, and p/divisors into `v`.
+
+    Of fixed atoms, which have no momenta, the velocities stay: those of targets that move.
+    """
     a, b, m, d = positions.ravel(), velocities.ravel(), masses.ravel(), divisors.ravel()
     c, e, f, g = x.ravel(), p.ravel(), momenta.ravel(), v.ravel()
     for i in range(a.size):
@@ -447,7 +450,7 @@ def write_back(positions, velocities, masses, divisors, x, p, momenta, v):  # ty
         c[i] = a[i]
         e[i] = momentum
         f[i] = momentum
-        g[i] = momentum / d[i]
+        g[i] = momentum / d[i] if m[i] != 0.0 else b[i]
 
 
 def put(
@@ -465,7 +468,7 @@ def put(
         write_back(positions, velocities, masses, divisors, x, p, momenta, v)
     else:
         np.multiply(velocities, masses, out=momenta)
-        np.divide(momenta, divisors, out=v)
+        v[...] = np.where(masses != 0.0, momenta / divisors, velocities)
         x[...], p[...] = positions, momenta
     return momenta, v
 
