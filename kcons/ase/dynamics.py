@@ -35,7 +35,7 @@ from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import finite_number, numbers
+from kcons.constraints.arguments import finite_number, numbers, refuse_other
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
@@ -160,6 +160,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if not atoms.has("momenta"):
             atoms.set_momenta(np.zeros((len(atoms), 3)), apply_constraint=False)
         if state is not None:
+            refuse_other(state, State, "state", "a kcons.State, such as State.load(file) or the state of another run")
             self._resume(state)
         self._answers.note()
         self._start(self._systems())

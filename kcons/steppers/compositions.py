@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from kcons.errors import InputError
 from kcons.steppers.operations import mirrored
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import Splitting, fractions_of
 
 _P = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 #: Suzuki's fractal, order 4.
@@ -67,11 +67,7 @@ class Composition(Splitting):
     """
 
     def __init__(self, fractions: Sequence[float], order: int, name: str = "") -> None:
-        g = tuple(float(x) for x in fractions)
-        if not g or any(abs(a - b) > 1e-15 for a, b in zip(g, reversed(g), strict=True)):
-            raise InputError(f"fractions {g} are no palindrome", item="fractions")
-        if abs(math.fsum(g) - 1.0) > 1e-14:
-            raise InputError(f"fractions {g} add up to {math.fsum(g):g}, not to 1", item="fractions")
+        g = fractions_of(fractions, "fractions")
         for power in range(3, order, 2):
             if abs(math.fsum(x**power for x in g)) > 1e-14:
                 raise InputError(

@@ -9,7 +9,7 @@ from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
-from kcons.steppers.stepper import Listed, Stepper, retold
+from kcons.steppers.stepper import Listed, Stepper, require_stepper, retold
 
 
 class ReversibilityCheck(Listed):
@@ -34,6 +34,7 @@ class ReversibilityCheck(Listed):
     """
 
     def __init__(self, stepper: Stepper, tolerance: float = 1e-9) -> None:
+        require_stepper(stepper)
         if not stepper.reversible:
             raise UnsupportedError(
                 f"{stepper!r} is not reversible, so there is nothing to check; use Rattle, Geodesic, a Composition "

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.executors.fused import fused_steps
 from kcons.steppers.executors.piecewise import SplittingStep
@@ -18,6 +19,21 @@ from kcons.steppers.operations import Operation, drifts_of, splitting
 from kcons.steppers.stages.fused_stages import Flights
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Listed, stays
+
+
+def fractions_of(values: Sequence[float], item: str) -> tuple[float, ...]:
+    """Fractions of a step: a palindrome with the sum 1.
+
+    Raises
+    ------
+    InputError
+    """
+    g = tuple(float(x) for x in values)
+    if not g or any(abs(a - b) > 1e-15 for a, b in zip(g, reversed(g), strict=True)):
+        raise InputError(f"{item} {g} are no palindrome; give them so that steps can be taken back", item=item)
+    if abs(math.fsum(g) - 1.0) > 1e-14:
+        raise InputError(f"{item} {g} add up to {math.fsum(g):g}, not to 1; divide them by their sum", item=item)
+    return g
 
 
 class Splitting(Listed):
@@ -32,6 +48,11 @@ class Splitting(Listed):
         Each drift is this symmetric composition of RATTLE drifts.
     exact_flight : bool
         Whether to fly along great circles instead where every row allows it.
+
+    Raises
+    ------
+    InputError
+        What is no palindrome with the sum 1; kicks and drifts that are not in turn.
     """
 
     order: int = 2
@@ -45,9 +66,14 @@ class Splitting(Listed):
         flight: Sequence[float] = (1.0,),
         exact_flight: bool = False,
     ) -> None:
-        self.kicks = tuple(kicks)
-        self.drifts = tuple(drifts)
-        self.flight = tuple(flight)
+        self.kicks = fractions_of(kicks, "kicks")
+        self.drifts = fractions_of(drifts, "drifts")
+        self.flight = fractions_of(flight, "flight")
+        if abs(len(self.kicks) - len(self.drifts)) != 1:
+            raise InputError(
+                f"{len(self.kicks)} kicks and {len(self.drifts)} drifts do not come in turn; give one more of one",
+                item="kicks",
+            )
         self.exact_flight = exact_flight
         self.kick_first = len(self.kicks) > len(self.drifts)
         self._stages = drifts_of(self.drifts, self.flight)

@@ -47,7 +47,7 @@ class Stepper(Protocol):
         ...
 
 
-def require_stepper(stepper: Any) -> None:
+def require_stepper(stepper: Any, item: str = "stepper") -> None:
     """Refuse a class, a name, and what chooses its own steps.
 
     Raises
@@ -58,7 +58,7 @@ def require_stepper(stepper: Any) -> None:
         remedy = "give an object, such as kcons.Rattle()"
         if hasattr(stepper, "states"):
             remedy = "it chooses its own steps: iterate over its states(system, state, until)"
-        raise InputError(f"stepper is {stepper!r}; {remedy}", item="stepper")
+        raise InputError(f"{item} is {stepper!r}; {remedy}", item=item)
 
 
 class Portable:

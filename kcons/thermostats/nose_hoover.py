@@ -16,7 +16,7 @@ from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.steppers.stepper import Listed, stays
+from kcons.steppers.stepper import Listed, require_stepper, stays
 from kcons.thermostats.freedom import (
     AT_REST,
     LOOK_AT,
@@ -121,6 +121,7 @@ class NoseHooverChain(Listed):
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
         self.period = positive(period, "period")
         self.stepper: Splitting = Rattle() if stepper is None else stepper
+        require_stepper(self.stepper)
         if self.stepper.order != 2:
             raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
         self.momentum: Momentum = momentum

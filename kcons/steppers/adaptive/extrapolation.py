@@ -17,7 +17,7 @@ from kcons.errors import UnsupportedError
 from kcons.steppers.adaptive.tolerated import EPS, FAILED, ToTolerance, landed, rms
 from kcons.steppers.geodesic import Geodesic
 from kcons.steppers.state import State, System
-from kcons.steppers.stepper import Stepper
+from kcons.steppers.stepper import Stepper, require_stepper
 
 #: Columns of the table: order 2 k - 1 of the estimate. Each one nearly doubles what rounding adds.
 FEWEST, MOST = 3, 9
@@ -81,6 +81,7 @@ class Extrapolation(ToTolerance):
     ) -> None:
         super().__init__(tolerance, length, speed)
         self.base: Stepper = Geodesic(4) if base is None else base
+        require_stepper(self.base, "base")
         if not (self.base.reversible and self.base.order == 2):
             raise UnsupportedError(
                 f"{self.base!r} is no reversible stepper of order 2, whose errors are a series in dt^2; use Rattle or "

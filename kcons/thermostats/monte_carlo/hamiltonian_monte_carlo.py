@@ -22,7 +22,7 @@ from kcons.errors import (
 )
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.executors.frame import Frame
-from kcons.steppers.stepper import Portable, stays
+from kcons.steppers.stepper import Portable, require_stepper, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
@@ -169,6 +169,7 @@ class HamiltonianMonteCarlo(Portable):
         self.seed = seed_number(seed)
         self.keep = kept_part(keep)
         self.stepper: Stepper = Rattle() if stepper is None else stepper
+        require_stepper(self.stepper)
         if not (getattr(self.stepper, "reversible", False) and getattr(self.stepper, "symplectic", False)):
             raise UnsupportedError(
                 f"{self.stepper!r} is not reversible and symplectic, and its proposals could not be corrected; use "

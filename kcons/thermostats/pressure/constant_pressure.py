@@ -9,7 +9,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.motion.certificate import checked_every
 from kcons.steppers import State, Stepper, System
 from kcons.steppers.operations import Operation
-from kcons.steppers.stepper import Listed
+from kcons.steppers.stepper import Listed, require_stepper
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
@@ -42,6 +42,7 @@ class ConstantPressure(Listed):
     symplectic = False
 
     def __init__(self, stepper: Stepper, barostat: Barostat) -> None:
+        require_stepper(stepper)
         self.stepper, self.barostat = stepper, require_barostat(barostat)
 
     def __repr__(self) -> str:
