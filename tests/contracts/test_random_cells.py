@@ -13,6 +13,8 @@ from cell_judge import judge
 from cell_molecules import KINDS
 from cell_oracle import Dense, Row, advance
 from cell_worlds import world
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kcons import Motion
 from kcons.errors import ConvergenceError
@@ -30,6 +32,13 @@ def test_a_share_of_the_cases():
     assert found["features"]["drifting"]["refused"] > 0
     assert found["features"]["places in other images"]["right"] > 8
     assert found["allowed"]["largest"] < 1e-7
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(10_000, 2**32 - 1))
+def test_cells_that_nobody_has_seen(seed):
+    case = judge(seed)
+    assert case.outcome in ("right", "refused"), [v for v in case.verdicts if v.outcome not in ("right", "refused")]
 
 
 @pytest.mark.validation
