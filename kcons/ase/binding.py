@@ -217,11 +217,12 @@ def alike(one: Any, other: Any) -> bool:
 
 def holding(item: Any) -> Any:
     """What a constraint of ASE or kcons holds; nothing for those that only add forces."""
-    if hasattr(item, "engine"):  # of kcons, whose rows are never changed
-        return item.constraints
+    own = item.__dict__
+    rows = own.get("constraints")
+    if rows is not None:  # of kcons, whose rows are never changed
+        return rows
     if isinstance(item, FORCES_ONLY):
         return None
-    own = vars(item)
     return [own.get(name) for name in _HELD]
 
 
@@ -235,10 +236,7 @@ def same_company(present: Sequence[Any], known: Company) -> bool:
     if len(present) != len(known):
         return False
     for item, (one, held) in zip(present, known, strict=True):
-        if item is not one:
-            return False
-        now = holding(item)
-        if now is not held and not alike(now, held):
+        if item is not one or ((now := holding(item)) is not held and not alike(now, held)):
             return False
     return True
 

@@ -118,7 +118,7 @@ class Constraints(FixConstraint):
             self._forget()
             self._last = ref(atoms)
         bound = self._binding
-        known = bound is not None and bound.given is self.constraints  # which can be given anew
+        known = bound is not None and bound.given is self.__dict__["constraints"]  # which can be given anew
         if bound is None or not (known and bound.fits(atoms) and bound.serves(self, atoms.cell.array)):
             bound = self._bind(atoms)
         else:

@@ -231,8 +231,8 @@ def finite_number(value: Any, item: str) -> float:
     InputError
         It has units, is no number, or is not finite.
     """
-    if isinstance(value, float) and math.isfinite(value):
-        return float(value)
+    if type(value) is float and math.isfinite(value):  # each call of the engine comes through here
+        return value
     refuse_units(value, item)
     found = _float(value)
     if not math.isfinite(found):

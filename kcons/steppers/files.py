@@ -309,6 +309,8 @@ def refuse_clock(time: Any, step: Any, time_remainder: Any) -> None:
     ------
     InputError
     """
+    if type(step) is int and step >= 0 and type(time) is float and math.isfinite(time) and time_remainder == 0.0:
+        return  # as in nearly all steps
     finite_number(time, "time")
     finite_number(time_remainder, "time_remainder")
     whole_number(step, "step", 0)
