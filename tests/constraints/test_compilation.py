@@ -93,8 +93,6 @@ x = np.array([[0, 0, 0], [2.4, 0, 0], [1.25, 2.2, 0], [1.25, 0.7, 2.0]])
 masses = np.array([63.5, 40.0, 12.0, 1.0])
 force = lambda q, t: -0.3 * (q - x) * (1 + q * q)
 for rows, stepper in (
-    ([Distance([[0, 1]])], None),
-    ([Distance([[0, 1], [1, 2], [0, 2]])], None),
     ([Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2]])], None),
     ([Sphere([3], [0.5, 0.5, 0.5], None)], Langevin(0.1, 0.1, seed=1)),
     ([Distance([[0, 1], [1, 2]])], Isokinetic()),
@@ -111,7 +109,7 @@ for rows, stepper in (
 
 def test_the_run_that_compiles_gives_the_bits_of_those_that_load(tmp_path):
     first, second = (ended(started(BITS, NUMBA_CACHE_DIR=str(tmp_path)))[0] for _ in range(2))
-    assert len(set(first.split())) == 5
+    assert len(set(first.split())) == 3
     assert first == second
 
 
@@ -224,8 +222,8 @@ import kcons.ase, kcons.openmm
     ],
     ids=["reload", "purge"],
 )
-def test_a_second_import_in_one_process(tmp_path, again):
-    out, err = ended(started(AGAIN.format(again=again), NUMBA_CACHE_DIR=str(tmp_path)))
+def test_a_second_import_in_one_process(again):
+    out, err = ended(started(AGAIN.format(again=again)))
     assert out.split() == ["True", "True"]
     assert err.count("kcons compiles the kernels") <= 1
 
