@@ -77,12 +77,17 @@ class EightAtATime(DistanceClusters):
         self.lengths = np.array(lengths, dtype=np.float64).reshape(-1)
         self._size, self._last = size, len(self.rows) - size
         self._rooms: tuple[FloatArray, ...] = ()
+        #: The last lattice, an array that nobody writes to, as the kernel takes it.
+        self._lattice: FloatArray | None = None
+        self._cell, self._kind = lattice_kind(None)
 
     def _project(
         self, request: Request, given: FloatArray, tangent: Literal[True] | None, multipliers: FloatArray | None
     ) -> Outcome:
         points, references, _, lattice, _, _, velocities, inv_dt, _, _ = request
-        cell, kind = lattice_kind(lattice)
+        if lattice is not self._lattice:
+            self._lattice = lattice
+            self._cell, self._kind = lattice_kind(lattice)
         ok, residual, iterations, row = self._kernel(
             points,
             references,
@@ -91,8 +96,8 @@ class EightAtATime(DistanceClusters):
             tangent,
             *self._tables,
             given,
-            cell,
-            kind,
+            self._cell,
+            self._kind,
             NO_NUMBERS if multipliers is None else multipliers,
             *(self._rooms or self._make_rooms()),
         )
