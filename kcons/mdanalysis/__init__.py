@@ -12,9 +12,7 @@ Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnaly
 from kcons.errors import with_extra
 
 try:
-    from kcons.mdanalysis.check.check_files import check_trajectory
-    from kcons.mdanalysis.check.constraint_check import ConstraintCheck
-    from kcons.mdanalysis.check.result import CheckResult
+    from kcons.mdanalysis.check import CheckResult, ConstraintCheck, check_trajectory
     from kcons.mdanalysis.conversions import (
         ase_to_openmm,
         from_ase,

@@ -4,7 +4,7 @@ import MDAnalysis
 import numpy as np
 import pytest
 
-from kcons.mdanalysis.check.atom_names import AtomNames
+from kcons.mdanalysis.check.targets import AtomNames
 
 
 @pytest.fixture

@@ -9,17 +9,41 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from MDAnalysis.lib.util import anyopen
 
-from kcons.mdanalysis.check.files.file_precision import XTC_MAGIC
-from kcons.mdanalysis.check.result import Break
+from kcons.mdanalysis.check.precision import XTC_MAGIC
 from kcons.mdanalysis.loading import format_of
+
+
+@dataclass(frozen=True)
+class Break:
+    """Where a trajectory cannot be read any further.
+
+    Attributes
+    ----------
+    frame : int
+        The first frame that cannot be used.
+    reason : str
+    ends : bool
+        Whether the file ends or is damaged there; else it can be read but its numbers are none.
+    """
+
+    frame: int
+    reason: str
+    ends: bool = True
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        if self.ends:
+            return f"the file ends too early, at frame {self.frame}: {self.reason}"
+        return f"frame {self.frame} cannot be used, nor what follows: {self.reason}"
 
 
 def ending_of(reader: Any) -> Break | None:
@@ -61,10 +85,10 @@ def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, la
     size = os.path.getsize(path)
     try:
         if file_format == "DCD":
-            end = _dcd_end(path, n_frames)
-            announced = _dcd_announced(path)
-            if end >= size and announced > n_frames:
-                return Break(n_frames, f"its header announces {announced} frames, and it has {n_frames}")
+            layout = _dcd_layout(path)
+            end = layout.second + (n_frames - 1) * layout.size
+            if end >= size and layout.announced > n_frames:
+                return Break(n_frames, f"its header announces {layout.announced} frames, and it has {n_frames}")
         elif file_format == "XTC" and last_offset is not None:
             end = last_offset + _xtc_frame_size(path, last_offset)
         elif file_format == "TRR" and last_offset is not None:
@@ -93,25 +117,21 @@ def damage(path: str | Path, file_format: str, n_frames: int, n_atoms: int) -> B
 
     The reader does not look: it takes what it finds for coordinates.
     """
-    if file_format != "DCD":
-        try:
-            return _text_break(path, file_format, n_atoms)
-        except (OSError, EOFError):
-            return None
     try:
-        order, ends, opening = _dcd_records(path, n_frames)
-    except struct.error:
+        if file_format != "DCD":
+            return _text_break(path, file_format, n_atoms)
+        layout = _dcd_layout(path)
+    except (OSError, EOFError, struct.error):
         return None
-    if len(ends) < 2:
+    n_later = min(n_frames - 1, (os.path.getsize(path) - layout.second) // layout.size)
+    if n_later < 1:
         return None
-    size = ends[1] - ends[0]
-    with open(path, "rb") as file:
-        for k in range(1, n_frames):
-            file.seek(ends[0] + (k - 1) * size)
-            word = file.read(4)
-            if len(word) < 4 or struct.unpack(order + "i", word)[0] != opening:
-                return Break(k, "its records are damaged")
-    return None
+    # Records are framed by their lengths.
+    begins = np.cumsum([0, *(n + 8 for n in layout.records)])[:-1]
+    words = np.memmap(path, layout.order + "i4", "r", layout.second, (n_later, layout.size // 4))
+    lengths = np.array(layout.records)
+    wrong = (words[:, begins // 4] != lengths) | (words[:, (begins + lengths) // 4 + 1] != lengths)
+    return Break(1 + int(np.argmax(wrong.any(axis=1))), "its records are damaged") if wrong.any() else None
 
 
 def _behind_the_only_frame(path: str | Path, file_format: str, n_atoms: int) -> str:
@@ -207,50 +227,37 @@ def _all_numbers(line: bytes, n: int) -> bool:
     return len(words) == n and all(b"." in word for word in words)
 
 
-def _dcd_announced(path: str | Path) -> int:
-    """How many frames the header says there are."""
+class _DcdLayout(NamedTuple):
+    """Order of bytes, frames that the header announces, where the second frame begins; of all but the first the bytes
+    of a frame and of its records (a cell, x, y, z and maybe a fourth): with fixed atoms, these are shorter."""
+
+    order: str
+    announced: int
+    second: int
+    size: int
+    records: list[int]
+
+
+def _dcd_layout(path: str | Path) -> _DcdLayout:
     with open(path, "rb") as file:
-        head = file.read(12)
-    order = "<" if struct.unpack("<i", head[:4])[0] in (84, 164) else ">"
-    return int(struct.unpack(order + "i", head[8:12])[0])
+        head = file.read(88)
+        order = "<" if struct.unpack("<i", head[:4])[0] in (84, 164) else ">"
+        words = struct.unpack(order + "21i", head[4:])
+        fixed, charmm = words[9], words[20] != 0
+        n_atoms = begin = 0
+        # Header, title, number of atoms; the free ones where others are fixed.
+        for record in range(3 + (fixed > 0)):
+            file.seek(begin)
+            length, n = struct.unpack(order + "2i", file.read(8))
+            n_atoms = n if record == 2 else n_atoms
+            begin += 8 + length
+    cell, fourth = charmm and words[11] != 0, charmm and words[12] == 1
 
+    def records(n: int) -> list[int]:
+        return [48] * cell + [4 * n] * (3 + fourth)
 
-def _dcd_end(path: str | Path, n_frames: int) -> int:
-    """End of the last whole frame."""
-    _, ends, _ = _dcd_records(path, n_frames)
-    if not ends:
-        return os.path.getsize(path)
-    # With fixed atoms, frames after the first are shorter.
-    later = ends[1] - ends[0] if len(ends) > 1 else 0
-    return ends[0] + (n_frames - 1) * later
-
-
-def _dcd_records(path: str | Path, n_frames: int) -> tuple[str, list[int], int]:
-    """Order of bytes, ends of the first two frames, and the word that the second begins with.
-
-    Records are framed by their lengths.
-    """
-    size = os.path.getsize(path)
-    ends: list[int] = []
-    opening = 0
-    with open(path, "rb") as file:
-        order = "<" if struct.unpack("<i", file.read(4))[0] in (84, 164) else ">"
-
-        def skip() -> int:
-            length = int(struct.unpack(order + "i", file.read(4))[0])
-            file.seek(length + 4, os.SEEK_CUR)
-            return length
-
-        file.seek(0)
-        for _ in range(3):
-            skip()
-        while len(ends) < min(n_frames, 2) and file.tell() < size:
-            # A unit cell of six doubles may come first; then x, y, z.
-            opening = skip()
-            for _ in range(3 if opening == 48 else 2):
-                skip()
-            ends.append(file.tell())
-    return order, ends, opening
+    first, later = (records(n) for n in (n_atoms, n_atoms - fixed))
+    return _DcdLayout(order, words[1], begin + sum(first) + 8 * len(first), sum(later) + 8 * len(later), later)
 
 
 def _xtc_frame_size(path: str | Path, offset: int) -> int:

@@ -70,36 +70,33 @@ class FilePrecision:
         return self.step if self.exact else 0.0
 
     @property
-    def reach(self) -> float:
-        """Coordinates from this one on, in angstrom, are not told by the step alone: single precision counts.
-
-        Integers of XTC are turned into nanometres, and these into angstrom, with four roundings; they can be had back
-        where these make less than half a step.
-        """
-        return self.step / (8 * HALF_UNIT) if self.exact else 0.0
-
-    def coefficients(self, farthest: float) -> tuple[float, float]:
-        """Error by rounding: at most base + factor 2^e, with 2^e <= |x| < 2^(e+1) for an atom's largest coordinate.
-
-        Parameters
-        ----------
-        farthest : float
-            No coordinate of the frame is larger, in angstrom.
+    def coefficients(self) -> tuple[float, float, float]:
+        """How far rounding moves coordinates: by base at most, and by base + factor 2^e of atoms from reach on.
 
         Returns
         -------
-        base, factor : float
+        base, factor, reach : float
+            2^e <= |x| < 2^(e+1) for an atom's largest coordinate; reach is a power of two, or 0.
+
+        Notes
+        -----
+        Integers of XTC are turned into nanometres, and these into angstrom, with four roundings; they can be had back
+        where these make less than half a step. Where they cannot, the one taken for it is off by twice the four.
         """
         if self.exact:
-            # Where a number of the grid cannot be had back, the one taken for it is off by twice the four roundings.
-            return 0.5 * self.step, 0.0 if farthest < self.reach else 16 * HALF_UNIT
+            return 0.5 * self.step, 16 * HALF_UNIT, 2.0 ** np.floor(np.log2(self.step / (8 * HALF_UNIT)))
         if self.digits:
             # The last digit is worth 10^(1 - digits) of the number, at most, and numbers are below 2 2^e.
             part = 10.0 ** (1 - self.digits)
-            return 0.5 * part * self.shift, part + 3 * HALF_UNIT
+            return 0.5 * part * self.shift, part + 3 * HALF_UNIT, 0.0
         # Rounded once, as stored; then, of decimals or nanometres, by the change to angstrom, where 2^e may be twice
         # that of the number stored.
-        return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT
+        return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT, 0.0
+
+    def stored(self, coordinates: ArrayLike) -> FloatArray:
+        """Coordinates in double precision, as the file holds them."""
+        exact = np.asarray(coordinates, dtype=np.float64)
+        return np.rint(exact * (1.0 / self.grid)) * self.grid if self.grid > 0 else exact
 
     def half_step(self, coordinates: ArrayLike) -> FloatArray:
         """Largest error by rounding of the coordinates of atoms; infinite where there are no numbers.
@@ -114,9 +111,10 @@ class FilePrecision:
         ndarray, shape (...)
         """
         size = np.abs(np.asarray(coordinates, dtype=np.float64)).max(axis=-1)
-        base, factor = self.coefficients(float(size.max(initial=0.0)))
+        base, factor, reach = self.coefficients
         with np.errstate(all="ignore"):
             below = np.where(size > 0, np.ldexp(1.0, np.frexp(size)[1] - 1), 0.0)
+            below = np.where(below < reach, 0.0, below)
         result: FloatArray = np.where(np.isfinite(size), base + factor * below, np.inf)
         return result
 
@@ -195,13 +193,12 @@ def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision
     return replace(found, exact=False) if changed else found
 
 
-def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:
-    """Precision of frames, whose largest coordinates are `reach` or NaN, in a sentence; that of a usual frame."""
+def described(precisions: Sequence[FilePrecision], largest: float) -> str:
+    """Precision of frames in a sentence; `largest` is the largest coordinate of a usual one."""
     steps = {one.step for one in precisions}
     if len(steps) > 1:
         return f"{precisions[0].format} stores coordinates in steps of {min(steps):.3g} to {max(steps):.3g} Å, by frame"
-    known = reach[np.isfinite(reach)]
-    return precisions[0].describe(float(np.median(known)) if len(known) else 0.0)
+    return precisions[0].describe(largest)
 
 
 def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:

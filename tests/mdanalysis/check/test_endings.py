@@ -130,6 +130,62 @@ def test_a_header_that_announces_more_frames(tmp_path, x):
     assert checked(path).status == "kept"
 
 
+def dcd(x, order="<", cell=(12.0, 90.0, 12.0, 90.0, 90.0, 12.0), fixed=0):
+    """The bytes of a DCD file: X-PLOR's kind without a cell, CHARMM's with one or with the first atoms fixed."""
+    words = [len(x), 0, 1, len(x), 0, 0, 0, 0, fixed]
+    head = struct.pack(order + "9i", *words)
+    head += (
+        struct.pack(order + "f10i", 1.0, int(cell is not None), *[0] * 8, 24)
+        if cell is not None or fixed
+        else struct.pack(order + "d36x", 1.0)
+    )
+    records = [b"CORD" + head, struct.pack(order + "i", 1) + b" " * 80, struct.pack(order + "i", x.shape[1])]
+    if fixed:
+        records.append(np.arange(fixed + 1, x.shape[1] + 1).astype(order + "i4").tobytes())
+    for k, frame in enumerate(x):
+        if cell is not None:
+            records.append(np.array(cell).astype(order + "f8").tobytes())
+        records += [column[fixed if k else 0 :].astype(order + "f4").tobytes() for column in frame.T]
+    return b"".join(struct.pack(order + "i", len(r)) + r + struct.pack(order + "i", len(r)) for r in records)
+
+
+KINDS = {
+    "CHARMM": {},
+    "other order of bytes": {"order": ">"},
+    "X-PLOR": {"cell": None},
+    "fixed atoms": {"fixed": 3},
+    "fixed atoms, no cell": {"fixed": 6, "cell": None},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_records_of_all_kinds_of_dcd(tmp_path, x, kind):
+    """Whole files have an end; a length of a record that is wrong, anywhere in a frame, ends what can be used."""
+    y, options = files.whole(x), KINDS[kind]
+    y[:, : options.get("fixed", 0)] = y[0, : options.get("fixed", 0)]
+    path, data = tmp_path / "w.dcd", bytearray(dcd(y, **options))
+    path.write_bytes(data)
+    assert checked(path).status == "kept" and len(checked(path).frames) == 8
+    size = 4 * 3 * (3 * N - options.get("fixed", 0)) + 8 * 3
+    size += 56 if options.get("cell", 1) else 0
+    for back in (3, 2):
+        path.write_bytes(data[: len(data) - back * size + 4])
+        result = checked(path)
+        assert result.broken.frame == 8 - back and result.status == "incomplete" and "4 bytes follow" in result.verdict
+    marks, place, begin = [], 0, len(data) - 3 * size
+    while place < size:
+        length = struct.unpack_from(options.get("order", "<") + "i", data, begin + place)[0]
+        marks += [place, place + 4 + length]
+        place += length + 8
+    assert place == size and len(marks) == (8 if options.get("cell", 1) else 6)
+    for mark in marks:
+        wrong = data.copy()
+        wrong[begin + mark : begin + mark + 4] = b"\x7f\x00\x00\x7f"
+        path.write_bytes(wrong)
+        result = checked(path)
+        assert result.broken.frame == 5 == len(result.frames) and result.status == "incomplete", mark
+
+
 @pytest.mark.parametrize("compressed", ["gz", "bz2"])
 def test_compressed_files(tmp_path, x, compressed):
     import bz2

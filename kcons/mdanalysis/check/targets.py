@@ -1,4 +1,4 @@
-"""Lengths and angles from a parameter file.
+"""Names of atoms, and lengths and angles that a parameter file gives rows of such names.
 
 A TOML (or JSON) file lists lengths by elements or atom names; the first entry that fits a row gives its target::
 
@@ -24,23 +24,70 @@ import json
 import math
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from MDAnalysis.exceptions import NoDataError
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
 from kcons.errors import InputError
-from kcons.mdanalysis.check.atom_names import AtomNames
+from kcons.mdanalysis.topology import topology_of
 
 _WIDTH = {"length": 2, "angle": 3}
 _FAMILY = {"Distance": "length", "Angle": "angle"}
 _UNITS = {"angstrom": 1.0, "Å": 1.0, "A": 1.0, "nm": 10.0, "nanometer": 10.0}
 _KEYS = {"atoms", "elements", "residue", "value"}
+
+
+class AtomNames:
+    """What all atoms of a Universe are called, as far as its topology has names.
+
+    Attributes
+    ----------
+    names, elements, residues : ndarray of str, shape (n_atoms,)
+        '' where the topology does not say; elements are then what names and masses tell, or first letters.
+    """
+
+    def __init__(self, universe: Any) -> None:
+        self.names, self.residues, self._numbers, elements = (
+            _column(universe.atoms, name) for name in ("names", "resnames", "resids", "elements")
+        )
+        if not np.all(elements != ""):
+            known = topology_of(universe).elements
+            first = np.char.lstrip(self.names, "0123456789'\"*").astype("U1")
+            elements = np.where(elements == "", np.where(known == "", first, known), elements)
+        self.elements: NDArray[np.str_] = elements
+
+    def atom(self, index: int) -> str:
+        """For example 'SOL12:OW', or 'atom 35' where there are no names."""
+        name = self.names[index]
+        if not name:
+            return f"atom {index}"
+        residue = f"{self.residues[index]}{self._numbers[index]}"
+        return f"{residue}:{name}" if residue else str(name)
+
+    def row(self, atoms: Iterable[int], most: int = 4) -> str:
+        """Atoms of a row; a residue is named once."""
+        numbers = [int(a) for a in atoms]
+        shown, previous = [], ""
+        for a in numbers[:most]:
+            label = self.atom(a)
+            head, colon, name = label.rpartition(":")
+            shown.append(name if colon and head == previous else label)
+            previous = head
+        return "–".join(shown) + ("–…" if len(numbers) > most else "")
+
+
+def _column(atoms: Any, name: str) -> NDArray[np.str_]:
+    try:
+        return np.asarray(getattr(atoms, name)).astype(str)
+    except (AttributeError, NoDataError):
+        return np.full(len(atoms), "", dtype="U1")
 
 
 @dataclass(frozen=True)

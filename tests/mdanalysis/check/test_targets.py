@@ -5,7 +5,7 @@ import water_files as files
 
 from kcons.errors import InputError
 from kcons.mdanalysis import check_trajectory
-from kcons.mdanalysis.check.files.target_file import TargetFile
+from kcons.mdanalysis.check.targets import TargetFile
 
 N = 30
 
