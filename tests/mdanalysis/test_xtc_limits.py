@@ -8,7 +8,7 @@ import pytest
 
 from kcons.errors import InputError
 from kcons.mdanalysis import TrajectoryWriter
-from kcons.mdanalysis.xtc_limits import refuse_beyond_xtc
+from kcons.mdanalysis.writing import _refuse_beyond_xtc as refuse_beyond_xtc
 
 
 def test_fine_grids_are_written_only_where_they_are_read_again(tmp_path):

@@ -24,7 +24,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.check.deviations import Found, RowTable
-from kcons.mdanalysis.check.endings import Break, damage_of, ending_of
+from kcons.mdanalysis.check.endings import broken_by, damage_of, ending_of
 from kcons.mdanalysis.check.precision import by_frame, described, grid_of, precision_of, precision_of_reader
 from kcons.mdanalysis.check.result import Asked, CheckResult, concluded
 from kcons.mdanalysis.check.targets import AtomNames, TargetFile
@@ -304,7 +304,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                         v = ts.velocities if ts.has_velocities and self._velocities else None
                         self._rows.look(found, k, ts, self._precision_at(number), self._masses, v)
                 except (*READ_ERRORS, KconsError) as error:
-                    found.broken = _break(error, trajectory, number)
+                    found.broken = broken_by(error, trajectory, number)
                 if found.broken is not None:
                     found.units, found.frames = found.units[:k], found.frames[:k]
                     break
@@ -322,22 +322,12 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             assert found.broken is not None
             raise self._nothing(found.broken.frame, found.broken.reason)
         if found.broken is None and self._to_the_end:
-            found.broken = self._end_of_file()
+            with quiet():
+                found.broken = self._damage or ending_of(self._trajectory)
         text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
         masses = self._rows.set.masses
         n_in_file = int(self._trajectory.n_frames)
         self.results.check = concluded(found, self._rows, self.asked, text, self._rank, masses, n_in_file)
-
-    def _end_of_file(self) -> Break | None:
-        """What lies behind the last frame, or keeps it from being read."""
-        last = self._trajectory.n_frames - 1
-        broken = self._damage or ending_of(self._trajectory)
-        try:
-            with quiet():
-                self._trajectory[last]
-        except READ_ERRORS as error:
-            broken = broken or _break(error, self._trajectory, last)
-        return broken
 
     @property
     def check(self) -> CheckResult:
@@ -352,17 +342,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             raise InputError("nothing was looked at yet; call run() first", item="check")
         result: CheckResult = self.results.check
         return result
-
-
-def _break(error: BaseException, trajectory: Any, frame: int) -> Break:
-    """Where and why a trajectory cannot be read further; what the reader says, which iteration hides."""
-    if isinstance(error, StopIteration):
-        try:
-            trajectory[frame]
-        except READ_ERRORS as hidden:
-            error = hidden
-    lines = str(error).strip().splitlines()
-    return Break(frame, lines[0].strip() if lines else "the file ends", not isinstance(error, NonFiniteError))
 
 
 def _masses(
@@ -495,8 +474,10 @@ def check_trajectory(
             f"{constraints.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
             "whose faces molecules may be cut, or a topology with bonds"
         )
+    if workers > 1:
+        chosen |= {"backend": "multiprocessing", "n_workers": workers}
     with quiet():
-        check.run(**chosen, **({"backend": "multiprocessing", "n_workers": workers} if workers > 1 else {}))
+        check.run(**chosen)
     return check.check
 
 

@@ -1,7 +1,7 @@
 """Where a trajectory ends: whole frames, and what lies behind them.
 
 MDAnalysis does not tell: it counts the whole frames of DCD and of text formats, and those of XTC and TRR up to the
-first that it does not recognise. Of formats of structures, such as GRO, it reads one frame.
+first that it does not recognize. Of formats of structures, such as GRO, it reads one frame.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.lib.util import anyopen
 
-from kcons.mdanalysis.check.precision import XTC_MAGIC
-from kcons.mdanalysis.loading import format_of
+from kcons.errors import NonFiniteError
+from kcons.mdanalysis.loading import READ_ERRORS, format_of
 
 
 @dataclass(frozen=True)
@@ -46,14 +47,30 @@ class Break:
         return f"frame {self.frame} cannot be used, nor what follows: {self.reason}"
 
 
+def broken_by(error: BaseException, reader: Any, frame: int) -> Break:
+    """Where and why a trajectory cannot be read further; what the reader says, which iteration hides."""
+    if isinstance(error, StopIteration):
+        try:
+            reader[frame]
+        except READ_ERRORS as hidden:
+            error = hidden
+    lines = str(error).strip().splitlines()
+    return Break(frame, lines[0].strip() if lines else "the file ends", not isinstance(error, NonFiniteError))
+
+
 def ending_of(reader: Any) -> Break | None:
-    """`leftover` of the file of a reader, or of the first file of a chain that has one."""
-    return _first(reader, lambda r, path: leftover(path, format_of(r), r.n_frames, r.n_atoms, _offset(r)))
+    """What keeps the last frame from being read, or lies behind it; None if nothing does."""
+    return _first(reader, _ending)
 
 
 def damage_of(reader: Any) -> Break | None:
-    """`damage` of the file of a reader, or of the first file of a chain that has one."""
-    return _first(reader, lambda r, path: damage(path, format_of(r), r.n_frames, r.n_atoms))
+    """The first frame of a DCD file whose records are not where they must be; of a text file the first whose lines are
+    not all there, to their ends, or that has another number of atoms. None where there is no such frame, and for other
+    formats.
+
+    The reader does not look: it takes what it finds for coordinates.
+    """
+    return _first(reader, _damage)
 
 
 def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:
@@ -69,69 +86,57 @@ def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | Non
     return None
 
 
-def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, last_offset: int | None) -> Break | None:
-    """What lies behind the last whole frame: a frame that was cut off, or that cannot be read; None if nothing does.
-
-    Parameters
-    ----------
-    path : path
-    file_format : str
-    n_frames : int
-        Frames that MDAnalysis counts.
-    n_atoms : int
-    last_offset : int or None
-        Where the last of them begins, for XTC and TRR.
-    """
-    size = os.path.getsize(path)
+def _ending(reader: Any, path: str) -> Break | None:
+    name, n, size = format_of(reader), reader.n_frames, os.path.getsize(path)
     try:
-        if file_format == "DCD":
-            layout = _dcd_layout(path)
-            end = layout.second + (n_frames - 1) * layout.size
-            if end >= size and layout.announced > n_frames:
-                return Break(n_frames, f"its header announces {layout.announced} frames, and it has {n_frames}")
-        elif file_format == "XTC" and last_offset is not None:
-            end = last_offset + _xtc_frame_size(path, last_offset)
-        elif file_format == "TRR" and last_offset is not None:
-            end = last_offset + _trr_frame_size(path, last_offset)
-        elif more := _behind_the_only_frame(path, file_format, n_atoms):
-            return Break(
-                1,
-                f"MDAnalysis reads one frame of {file_format} files, and {more}; write the frames as XTC, DCD or PDB",
-                ends=False,
-            )
-        else:
+        reader[n - 1]
+    except READ_ERRORS as error:
+        return broken_by(error, reader, n - 1)
+    if isinstance(reader, DCDReader):
+        file = reader._file
+        end = file._header_size + file._firstframesize + (n - 1) * file._framesize
+        with open(path, "rb") as opened:
+            announced = np.frombuffer(opened.read(12), _order(path) + "i4")[2]
+        if end >= size and announced > n:
+            return Break(n, f"its header announces {announced} frames, and it has {n}")
+    elif name in ("XTC", "TRR"):
+        end = reader._xdr._bytes_tell()
+    elif more := _behind_the_only_frame(path, name, reader.n_atoms):
+        return Break(
+            1,
+            f"MDAnalysis reads one frame of {name} files, and {more}; write the frames as XTC, DCD or PDB",
+            ends=False,
+        )
+    else:
+        return None
+    return Break(n, f"{size - end} bytes follow the last whole frame") if end < size else None
+
+
+def _damage(reader: Any, path: str) -> Break | None:
+    if not isinstance(reader, DCDReader):
+        try:
+            return _text_break(path, format_of(reader), reader.n_atoms)
+        except (OSError, EOFError):
             return None
-    except (OSError, EOFError, struct.error) as error:
-        return Break(n_frames, f"its frames cannot be followed ({error})")
-    if end < size:
-        return Break(n_frames, f"{size - end} bytes follow the last whole frame")
-    if end > size:
-        return Break(n_frames - 1, f"its last frame lacks {end - size} bytes")
-    return None
-
-
-def damage(path: str | Path, file_format: str, n_frames: int, n_atoms: int) -> Break | None:
-    """The first frame of a DCD file whose records are not where they must be; of a text file the first whose lines are
-    not all there, to their ends, or that has another number of atoms. None where there is no such frame, and for other
-    formats.
-
-    The reader does not look: it takes what it finds for coordinates.
-    """
-    try:
-        if file_format != "DCD":
-            return _text_break(path, file_format, n_atoms)
-        layout = _dcd_layout(path)
-    except (OSError, EOFError, struct.error):
+    # Of all frames but the first, which has coordinates of fixed atoms too.
+    file = reader._file
+    cell = [48] * file.is_periodic
+    records = np.array(cell + [(file._framesize - 56 * len(cell)) // file.ndims - 8] * file.ndims)
+    begin = file._header_size + file._firstframesize
+    n_frames = min(reader.n_frames - 1, (os.path.getsize(path) - begin) // file._framesize)
+    if n_frames < 1 or (records + 8).sum() != file._framesize:
         return None
-    n_later = min(n_frames - 1, (os.path.getsize(path) - layout.second) // layout.size)
-    if n_later < 1:
-        return None
+    words = np.memmap(path, _order(path) + "i4", "r", begin, (n_frames, file._framesize // 4))
     # Records are framed by their lengths.
-    begins = np.cumsum([0, *(n + 8 for n in layout.records)])[:-1]
-    words = np.memmap(path, layout.order + "i4", "r", layout.second, (n_later, layout.size // 4))
-    lengths = np.array(layout.records)
-    wrong = (words[:, begins // 4] != lengths) | (words[:, (begins + lengths) // 4 + 1] != lengths)
+    ends = np.cumsum(records + 8)
+    wrong = (words[:, (ends - records - 8) // 4] != records) | (words[:, ends // 4 - 1] != records)
     return Break(1 + int(np.argmax(wrong.any(axis=1))), "its records are damaged") if wrong.any() else None
+
+
+def _order(path: str) -> str:
+    """Of the bytes of a DCD file."""
+    with open(path, "rb") as file:
+        return "<" if struct.unpack("<i", file.read(4))[0] in (84, 164) else ">"
 
 
 def _behind_the_only_frame(path: str | Path, file_format: str, n_atoms: int) -> str:
@@ -225,73 +230,3 @@ def _all_numbers(line: bytes, n: int) -> bool:
     """Whether a line consists of n numbers with points."""
     words = line.split()
     return len(words) == n and all(b"." in word for word in words)
-
-
-class _DcdLayout(NamedTuple):
-    """Order of bytes, frames that the header announces, where the second frame begins; of all but the first the bytes
-    of a frame and of its records (a cell, x, y, z and maybe a fourth): with fixed atoms, these are shorter."""
-
-    order: str
-    announced: int
-    second: int
-    size: int
-    records: list[int]
-
-
-def _dcd_layout(path: str | Path) -> _DcdLayout:
-    with open(path, "rb") as file:
-        head = file.read(88)
-        order = "<" if struct.unpack("<i", head[:4])[0] in (84, 164) else ">"
-        words = struct.unpack(order + "21i", head[4:])
-        fixed, charmm = words[9], words[20] != 0
-        n_atoms = begin = 0
-        # Header, title, number of atoms; the free ones where others are fixed.
-        for record in range(3 + (fixed > 0)):
-            file.seek(begin)
-            length, n = struct.unpack(order + "2i", file.read(8))
-            n_atoms = n if record == 2 else n_atoms
-            begin += 8 + length
-    cell, fourth = charmm and words[11] != 0, charmm and words[12] == 1
-
-    def records(n: int) -> list[int]:
-        return [48] * cell + [4 * n] * (3 + fourth)
-
-    first, later = (records(n) for n in (n_atoms, n_atoms - fixed))
-    return _DcdLayout(order, words[1], begin + sum(first) + 8 * len(first), sum(later) + 8 * len(later), later)
-
-
-def _xtc_frame_size(path: str | Path, offset: int) -> int:
-    with open(path, "rb") as file:
-        file.seek(offset)
-        head = file.read(104)
-    magic, n_atoms = struct.unpack(">2i", head[:8])
-    if magic not in XTC_MAGIC:
-        return 0
-    if n_atoms <= 9:
-        return 56 + 12 * n_atoms
-    # magic, atoms, step, time, box (9), atoms, precision, 3 + 3 bounds, small index: then the number of bytes.
-    if magic == XTC_MAGIC[0]:
-        n_bytes, begin = struct.unpack(">i", head[88:92])[0], 92
-    else:
-        n_bytes, begin = struct.unpack(">q", head[88:96])[0], 96
-    return int(begin + 4 * ((n_bytes + 3) // 4))
-
-
-def _trr_frame_size(path: str | Path, offset: int) -> int:
-    with open(path, "rb") as file:
-        file.seek(offset)
-        head = file.read(84)
-    length = struct.unpack(">i", head[8:12])[0]
-    begin = 12 + 4 * ((length + 3) // 4)
-    numbers = struct.unpack(">13i", head[begin : begin + 52])
-    blocks, n_atoms = numbers[:10], numbers[10]
-    # Time and lambda come last, in the precision of the coordinates.
-    box, per_atom = blocks[2], [block for block in blocks[7:10] if block]
-    double = box == 72 or (n_atoms and per_atom and per_atom[0] == 24 * n_atoms)
-    return int(begin + 52 + (16 if double else 8) + sum(blocks))
-
-
-def _offset(reader: Any) -> int | None:
-    """Where the last frame of an XTC or TRR file begins."""
-    offsets = getattr(getattr(reader, "_xdr", None), "offsets", None)
-    return int(offsets[-1]) if offsets is not None and len(np.atleast_1d(offsets)) else None

@@ -27,7 +27,7 @@ _NO_TIMES = "frame"
 _NOTHING = 1e-6
 
 
-def page(result: CheckResult) -> list[str | Table | Text]:
+def page(result: CheckResult) -> tuple[str, Table, Table, Text]:
     """What a person reads: what was looked at and what the file can show, units, worst rows, the verdict."""
     frames = f"{len(result.frames)} of {result.n_frames_in_file} frames"
     lines = [
@@ -42,7 +42,7 @@ def page(result: CheckResult) -> list[str | Table | Text]:
         if t["slope"] == t["slope"]:
             lines[-1] += f", drift {1000 * t['slope']:.2g} ± {1000 * t['slope_error']:.1g} K/ns"
     summary = "\n".join(lines + result.remarks + result.gaps)
-    return [summary, _units(result), _rows(result), Text(result.verdict, style=f"bold {COLORS[result.status]}")]
+    return summary, _units(result), _rows(result), Text(result.verdict, style=f"bold {COLORS[result.status]}")
 
 
 def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **options: Any) -> Table:

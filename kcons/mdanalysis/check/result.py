@@ -338,7 +338,7 @@ def _first_alone(table: RowTable, found: Found) -> str:
     Where targets come from it, all others are off; they agree if they differ among themselves by no more than rounding
     and the tolerance, in the root mean square.
     """
-    off = (found.units["excess"] > 0).any(axis=1)
+    off = np.asarray((found.units["excess"] > 0).any(axis=1))
     if len(off) < 3 or off[0] == off[1] or (off[1:] != off[1]).any():
         return ""
     spreads = []
