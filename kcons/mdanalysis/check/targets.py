@@ -25,21 +25,19 @@ import math
 import sys
 import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from MDAnalysis.exceptions import NoDataError
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
 from kcons.errors import InputError
-from kcons.mdanalysis.topology import topology_of
+from kcons.mdanalysis.topology import texts, topology_of
 
-_WIDTH = {"length": 2, "angle": 3}
-_FAMILY = {"Distance": "length", "Angle": "angle"}
+#: Entries by the family of rows that they are for, and how many atoms these have.
+_KINDS = {"Distance": ("length", 2), "Angle": ("angle", 3)}
 _UNITS = {"angstrom": 1.0, "Å": 1.0, "A": 1.0, "nm": 10.0, "nanometer": 10.0}
 _KEYS = {"atoms", "elements", "residue", "value"}
 
@@ -55,7 +53,7 @@ class AtomNames:
 
     def __init__(self, universe: Any) -> None:
         self.names, self.residues, self._numbers, elements = (
-            _column(universe.atoms, name) for name in ("names", "resnames", "resids", "elements")
+            texts(universe.atoms, name, len(universe.atoms)) for name in ("names", "resnames", "resids", "elements")
         )
         if not np.all(elements != ""):
             known = topology_of(universe).elements
@@ -83,42 +81,30 @@ class AtomNames:
         return "–".join(shown) + ("–…" if len(numbers) > most else "")
 
 
-def _column(atoms: Any, name: str) -> NDArray[np.str_]:
-    try:
-        return np.asarray(getattr(atoms, name)).astype(str)
-    except (AttributeError, NoDataError):
-        return np.full(len(atoms), "", dtype="U1")
+class Rule(NamedTuple):
+    """One entry: 'atoms' or 'elements' and their patterns, that of the residue, the target in angstrom or radian."""
 
-
-@dataclass(frozen=True)
-class Rule:
-    """One entry: what it fits, and the target in angstrom or radian."""
-
-    kind: str
     by: str
-    patterns: tuple[str, ...]
+    patterns: list[str]
     residue: str
-    value: float
+    target: float
 
     def fits(self, names: AtomNames, atoms: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which rows it fits, in either direction; `atoms` of shape (n_rows, width)."""
-        labels = names.names if self.by == "atoms" else names.elements
         if self.by == "elements":
-            labels = np.char.capitalize(labels)
-        wanted = [p.capitalize() if self.by == "elements" else p for p in self.patterns]
-        forth = _all_match(labels, atoms, wanted)
-        back = _all_match(labels, atoms, wanted[::-1])
-        residues = _all_match(names.residues, atoms, [self.residue] * atoms.shape[1])
-        return (forth | back) & residues
+            labels, wanted = np.char.capitalize(names.elements), [pattern.capitalize() for pattern in self.patterns]
+        else:
+            labels, wanted = names.names, self.patterns
+        forth, back = (_all_match(labels, atoms, patterns) for patterns in (wanted, wanted[::-1]))
+        return (forth | back) & _all_match(names.residues, atoms, [self.residue] * len(wanted))
 
 
 def _all_match(labels: NDArray[np.str_], atoms: NDArray[np.int64], patterns: Sequence[str]) -> NDArray[np.bool_]:
     found = np.ones(len(atoms), dtype=bool)
     for slot, pattern in enumerate(patterns):
-        if pattern == "*":
-            continue
-        distinct, place = np.unique(labels[atoms[:, slot]], return_inverse=True)
-        found &= np.array([fnmatchcase(str(label), pattern) for label in distinct], dtype=bool)[place]
+        if pattern != "*":
+            distinct, place = np.unique(labels[atoms[:, slot]], return_inverse=True)
+            found &= np.array([fnmatchcase(str(label), pattern) for label in distinct], dtype=bool)[place]
     return found
 
 
@@ -148,41 +134,38 @@ class TargetFile:
             data = json.loads(text) if self.path.suffix.lower() == ".json" else tomllib.loads(text)
         except (ValueError, OSError, RecursionError) as error:
             raise InputError(f"{path}: no readable TOML or JSON ({error})", item="targets") from None
-        self.rules = self._rules(data)
-
-    def _rules(self, data: Any) -> list[Rule]:
-        if not isinstance(data, dict) or not set(data) <= {"unit", *_WIDTH}:
-            wrong = sorted(set(data) - {"unit", *_WIDTH}) if isinstance(data, dict) else ["a list"]
-            raise InputError(
-                f"{self.path}: {wrong[0]!r} is unknown; there are unit, [[length]] and [[angle]]", item="targets"
-            )
+        known = {"unit", *(kind for kind, _ in _KINDS.values())}
+        for wrong in sorted(set(data) - known) if isinstance(data, dict) else ["a list"]:
+            raise InputError(f"{path}: {wrong!r} is unknown; there are unit, [[length]] and [[angle]]", item="targets")
         unit = data.get("unit", "angstrom")
         if unit not in _UNITS:
-            raise InputError(f"{self.path}: unit {unit!r} is unknown; give 'angstrom' or 'nm'", item="unit")
-        rules = []
-        for kind in _WIDTH:
-            for number, entry in enumerate(data.get(kind, []), 1):
-                rules.append(self._rule(kind, f"{self.path}: [[{kind}]] number {number}", entry, _UNITS[unit]))
-        if not rules:
-            raise InputError(f"{self.path} has no [[length]] and no [[angle]]", item="targets")
-        return rules
+            raise InputError(f"{path}: unit {unit!r} is unknown; give 'angstrom' or 'nm'", item="unit")
+        self.rules = {
+            family: [
+                self._rule(kind, width, f"{path}: [[{kind}]] number {number}", entry, _UNITS[unit])
+                for number, entry in enumerate(data.get(kind, []), 1)
+            ]
+            for family, (kind, width) in _KINDS.items()
+        }
+        if not any(self.rules.values()):
+            raise InputError(f"{path} has no [[length]] and no [[angle]]", item="targets")
 
-    def _rule(self, kind: str, where: str, entry: Any, scale: float) -> Rule:
+    @staticmethod
+    def _rule(kind: str, width: int, where: str, entry: Any, scale: float) -> Rule:
         if not isinstance(entry, dict) or not set(entry) <= _KEYS or "value" not in entry:
             raise InputError(f"{where} needs value, and atoms or elements; residue is optional", item="targets")
         by = [key for key in ("atoms", "elements") if key in entry]
         if len(by) != 1:
             raise InputError(f"{where}: give either atoms or elements", item="targets")
-        patterns, width = entry[by[0]], _WIDTH[kind]
+        patterns, value = entry[by[0]], entry["value"]
         if not isinstance(patterns, list) or len(patterns) != width or not all(isinstance(p, str) for p in patterns):
             raise InputError(f"{where}: {by[0]} must be {width} names, not {patterns!r}", item=by[0])
-        value = entry["value"]
         top = 180.0 if kind == "angle" else sys.float_info.max
         if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < top:
             what = "an angle between 0 and 180 degrees" if kind == "angle" else "a positive length"
             raise InputError(f"{where}: value is {value!r}; give {what}", item="value")
         target = math.radians(value) if kind == "angle" else float(value) * scale
-        return Rule(kind, by[0], tuple(patterns), str(entry.get("residue", "*")), target)
+        return Rule(by[0], patterns, str(entry.get("residue", "*")), target)
 
     def apply(self, constraints: Sequence[Constraint], names: AtomNames) -> list[Constraint]:
         """Constraints with the targets that the file gives; families other than distances and angles keep theirs.
@@ -192,25 +175,20 @@ class TargetFile:
         InputError
             A row that no entry fits.
         """
-        result = []
-        for item in constraints:
-            kind = _FAMILY.get(item.family)
-            if kind is None:
-                result.append(item)
-                continue
-            targets = np.full(item.n_rows, np.nan)
-            for rule in self.rules:
-                open_rows = np.flatnonzero(np.isnan(targets))
-                if rule.kind == kind and len(open_rows):
-                    targets[open_rows[rule.fits(names, item.atoms[open_rows])]] = rule.value
-            missing = np.flatnonzero(np.isnan(targets))
-            if len(missing):
-                atoms = item.atoms[missing[0]]
-                raise InputError(
-                    f"{self.path} has no {kind} for {names.row(atoms)} ({'-'.join(names.elements[atoms])}; "
-                    f"{len(missing)} rows in all); add a [[{kind}]] with atoms or elements that fit",
-                    item="targets",
-                    atoms=atoms.tolist(),
-                )
-            result.append(item.with_target(targets))
-        return result
+        return [self._held(item, names) if item.family in _KINDS else item for item in constraints]
+
+    def _held(self, item: Constraint, names: AtomNames) -> Constraint:
+        targets = np.full(item.n_rows, np.nan)
+        for rule in self.rules[item.family]:
+            open_rows = np.flatnonzero(np.isnan(targets))
+            targets[open_rows[rule.fits(names, item.atoms[open_rows])]] = rule.target
+        missing = np.flatnonzero(np.isnan(targets))
+        if len(missing):
+            atoms, kind = item.atoms[missing[0]], _KINDS[item.family][0]
+            raise InputError(
+                f"{self.path} has no {kind} for {names.row(atoms)} ({'-'.join(names.elements[atoms])}; "
+                f"{len(missing)} rows in all); add a [[{kind}]] with atoms or elements that fit",
+                item="targets",
+                atoms=atoms.tolist(),
+            )
+        return item.with_target(targets)
