@@ -29,6 +29,7 @@ MADE_BY = {
     "precision": "solvers_alone",
     "scaling": "solvers_alone",
     "stability": "stability",
+    "trajectory_check": "check_speed",
     "whole_comparison": "whole_comparison",
 }
 BLOCK = re.compile(r"<!-- table: (\w+) (\w+) -->\n.*?<!-- end -->", re.DOTALL)

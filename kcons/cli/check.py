@@ -49,7 +49,7 @@ def add(commands: Any) -> None:
     check.add_argument("--tolerance", type=float, default=1e-4, help="relative, of the engine (default 1e-4)")
     check.add_argument("--precision", type=float, help="step of the coordinates in the file, Å, where not known")
     check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
-    check.add_argument("--workers", type=int, default=1, help="threads (DCD files) or processes (default 1)")
+    check.add_argument("--workers", type=int, default=1, help="processes (default 1)")
     check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
     check.add_argument(
         "--forces",
@@ -65,7 +65,7 @@ def add(commands: Any) -> None:
 
 def _check(chosen: argparse.Namespace) -> int:
     try:
-        from kcons.mdanalysis.check.check_files import check_trajectory
+        from kcons.mdanalysis.check.constraint_check import check_trajectory
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "MDAnalysis":
             raise
@@ -98,14 +98,14 @@ def _check(chosen: argparse.Namespace) -> int:
             reason = " ".join(str(error).split())
             result.remarks.append(f"no temperatures of the configurations: {reason}")
             print(f"kcons: {reason}", file=sys.stderr)
+    summary, units, rows, verdict = report.page(result)
     terminal = console()
-    tables = (report.unit_table(result), report.row_table(result))
-    terminal.print(report.summary(result), highlight=False, markup=False)
-    for table in tables:
-        terminal.print(table)
-    terminal.print(report.verdict(result), soft_wrap=True)
-    text = [report.summary(result), *map(rendered, tables), result.verdict]
-    say_written(_put(chosen, lambda folder: report.write(result, folder, tables=text)))
+    terminal.print(summary, highlight=False, markup=False)
+    terminal.print(units)
+    terminal.print(rows)
+    terminal.print(verdict, soft_wrap=True)
+    text = "\n".join([summary, rendered(units), rendered(rows), result.verdict])
+    say_written(_put(chosen, lambda folder: report.write(result, folder, text=text)))
     return 2 if failed else EXIT[result.status]
 
 

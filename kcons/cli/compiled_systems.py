@@ -114,7 +114,7 @@ def check() -> None:
     """kcons check: rigid water and bond lengths in DCD and XTC files"""
     import MDAnalysis
 
-    from kcons.mdanalysis.check.check_files import check_trajectory
+    from kcons.mdanalysis import check_trajectory
 
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what a made-up molecule lacks

@@ -4,18 +4,17 @@ Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnaly
 
 - `loading`: files opened, with errors that name the remedy
 - `topology`: constraints by its selection language
-- `conversions`, `converter`: Universe, `Atoms` and System, one into the other; `ag.convert_to("ASE")`
-- `run_units`, `xtc_limits`, `writing`: runs written to files
+- `conversions`: Universe, `Atoms` and System, one into the other; `ag.convert_to("ASE")`
+- `writing`: runs written to files
 - `check`: how well a trajectory kept its constraints
 """
 
 from kcons.errors import with_extra
 
 try:
-    from kcons.mdanalysis.check.check_files import check_trajectory
-    from kcons.mdanalysis.check.constraint_check import ConstraintCheck
-    from kcons.mdanalysis.check.result import CheckResult
+    from kcons.mdanalysis.check import CheckResult, ConstraintCheck, check_trajectory
     from kcons.mdanalysis.conversions import (
+        ASEConverter,
         ase_to_openmm,
         from_ase,
         from_openmm,
@@ -24,11 +23,16 @@ try:
         to_openmm,
         universe_of,
     )
-    from kcons.mdanalysis.converter import ASEConverter
     from kcons.mdanalysis.loading import load_trajectory, open_universe
-    from kcons.mdanalysis.run_units import ASE_UNITS, OPENMM_UNITS, RunUnits
     from kcons.mdanalysis.topology import constraints_of, selected, snapshot_of
-    from kcons.mdanalysis.writing import OpenMMReporter, TrajectoryWriter, write_ase
+    from kcons.mdanalysis.writing import (
+        ASE_UNITS,
+        OPENMM_UNITS,
+        OpenMMReporter,
+        RunUnits,
+        TrajectoryWriter,
+        write_ase,
+    )
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.mdanalysis") from error
 

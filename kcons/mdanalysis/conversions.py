@@ -1,5 +1,7 @@
 """Universe, ASE `Atoms` and OpenMM Topology with System: one into the other, with what is held.
 
+An import registers `ASEConverter` with MDAnalysis, so that ``ag.convert_to("ASE")`` gives what `to_ase` gives.
+
 Positions pass in double precision; only a Universe keeps them in single precision. Units are those of each side:
 MDAnalysis angstrom, ps, dalton, elementary charges; ASE angstrom, eV, its own time; OpenMM nm, ps.
 """
@@ -13,13 +15,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import MDAnalysis
 import numpy as np
+from MDAnalysis.converters.base import ConverterBase
 
 from kcons.constraints import Constraint, Distance
+from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis.loading import format_of
-from kcons.mdanalysis.topology import check_box, dimensions_of, snapshot_of, velocities_known
+from kcons.mdanalysis.topology import check_box, constraints_of, dimensions_of, snapshot_of, velocities_known
 from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows
@@ -31,18 +35,6 @@ if TYPE_CHECKING:
     import ase
     import openmm
     from openmm import unit
-
-__all__ = [
-    "FromMDEngine",
-    "ToOpenMM",
-    "ase_to_openmm",
-    "from_ase",
-    "from_openmm",
-    "openmm_to_ase",
-    "to_ase",
-    "to_openmm",
-    "universe_of",
-]
 
 NM = 0.1
 
@@ -114,6 +106,45 @@ def _held_atoms(snapshot: Snapshot, rows: Sequence[Constraint]) -> ase.Atoms:
     if rows:
         constrain(atoms, rows, project=True)
     return atoms
+
+
+class ASEConverter(ConverterBase):  # type: ignore[misc]
+    """ASE `Atoms` by MDAnalysis' own mechanism of converters: ``ag.convert_to("ASE", constrain="hbonds")``."""
+
+    lib = "ASE"
+    units = {"time": None, "length": "Angstrom"}
+
+    def convert(
+        self,
+        obj: Any,
+        constrain: str | None = None,
+        constraints: Constraint | Iterable[Constraint] = (),
+        **options: Any,
+    ) -> ase.Atoms:
+        """ASE `Atoms` of the present frame.
+
+        Parameters
+        ----------
+        obj : AtomGroup
+        constrain : str, optional
+            What is held by name: 'hbonds', 'allbonds', 'hangles', 'allangles', 'none' (and rigid water).
+        constraints : iterable of Constraint
+            Or what is held, in angstrom, its atoms counted in the group.
+        **options
+            Of `constraints_of`, such as `rigid_water=False`.
+
+        Raises
+        ------
+        InputError
+            Both `constrain` and `constraints`, or options without a name.
+        """
+        # Rows by name know their atoms; a plain list of them would not.
+        given = constraints if isinstance(constraints, HeldRows) else constraints_in(constraints, "constraints")
+        if given and constrain is not None:
+            raise InputError("give constrain, a name, or constraints, a list; not both", item="constraints")
+        if options and constrain is None:
+            raise InputError(f"{next(iter(options))} is an option of constrain, which is missing", item="constrain")
+        return to_ase(obj, given if constrain is None else constraints_of(obj, constrain, **options))
 
 
 def from_ase(atoms: ase.Atoms) -> FromMDEngine:
@@ -246,20 +277,21 @@ def universe_of(snapshot: Snapshot) -> Any:
     """
     snapshot = snapshot.in_unit(1.0)
     topology = snapshot.topology
-    chains, first, segment = np.unique(topology.chains, return_index=True, return_inverse=True)
+    box = None
+    if snapshot.cell is not None and snapshot.pbc.any():
+        check_box(snapshot.cell, snapshot.pbc, stacklevel=4)
+        box = dimensions_of(snapshot.cell)
     # Chains keep their order.
-    order = np.argsort(np.argsort(first))
-    dimensions = _dimensions(snapshot)
+    chains = {chain: k for k, chain in enumerate(dict.fromkeys(topology.chains.tolist()))}
     universe = MDAnalysis.Universe.empty(
         topology.n_atoms,
         n_residues=topology.n_residues,
         n_segments=len(chains),
         atom_resindex=topology.residues,
-        residue_segindex=order[segment],
+        residue_segindex=[chains[chain] for chain in topology.chains.tolist()],
         trajectory=True,
         velocities=snapshot.velocities is not None,
     )
-    names = chains[np.argsort(first)]
     ids = whole_numbers(topology.residue_ids)
     attributes: dict[str, Any] = {
         "names": topology.names.astype(object),
@@ -268,29 +300,20 @@ def universe_of(snapshot: Snapshot) -> Any:
         "masses": topology.masses,
         "resids": ids,
         "resnums": ids,
-        "segids": names.astype(object),
+        "segids": np.array(list(chains), dtype=object),
         "chainIDs": topology.chains[topology.residues].astype(object),
+        "resnames": topology.residue_names.astype(object) if topology.residues_known else None,
+        "charges": topology.charges,
+        "bonds": topology.bonds if len(topology.bonds) else None,
     }
-    if topology.residues_known:
-        attributes["resnames"] = topology.residue_names.astype(object)
-    if topology.charges is not None:
-        attributes["charges"] = topology.charges
     for name, values in attributes.items():
-        universe.add_TopologyAttr(name, values)
-    if len(topology.bonds):
-        universe.add_TopologyAttr("bonds", topology.bonds)
+        if values is not None:
+            universe.add_TopologyAttr(name, values)
     universe.atoms.positions = snapshot.positions
     if snapshot.velocities is not None:
         universe.atoms.velocities = snapshot.velocities
-    universe.dimensions = dimensions
+    universe.dimensions = box
     return universe
-
-
-def _dimensions(snapshot: Snapshot) -> Any:
-    if snapshot.cell is None or not snapshot.pbc.any():
-        return None
-    check_box(snapshot.cell, snapshot.pbc, stacklevel=5)
-    return dimensions_of(snapshot.cell)
 
 
 def _rows(constraints: Iterable[Constraint]) -> list[Constraint]:
@@ -398,16 +421,11 @@ def _system(
     if topology.getPeriodicBoxVectors() is not None:
         system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors())
     if sites is not None and len(sites):
-        for site, parents, (a, b, c) in zip(
-            sites.sites.tolist(), sites.parents.tolist(), sites.coefficients.tolist(), strict=True
-        ):
+        columns = sites.sites.tolist(), sites.parents.tolist(), sites.coefficients.tolist()
+        for site, parents, (a, b, c) in zip(*columns, strict=True):
+            flat = openmm.ThreeParticleAverageSite(*parents, 1 - a - b, a, b)
             system.setParticleMass(site, 0.0)
-            system.setVirtualSite(
-                site,
-                openmm.OutOfPlaneSite(*parents, a, b, c)
-                if c
-                else openmm.ThreeParticleAverageSite(*parents, 1 - a - b, a, b),
-            )
+            system.setVirtualSite(site, openmm.OutOfPlaneSite(*parents, a, b, c) if c else flat)
     return system
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import re
 import struct
 import sys
@@ -51,19 +50,14 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def _failing_quietly() -> Iterator[list[str]]:
-    """A reader that could not open its file also fails when it is deleted; once is enough.
-
-    The list takes what failed. Only then is there such a reader, and it is looked for.
-    """
+def _opening() -> Iterator[None]:
+    """`quiet`; a reader that could not open its file also fails when it is deleted, and once is enough."""
     hook = sys.unraisablehook
-    failures: list[str] = []
     sys.unraisablehook = lambda unraisable: None
     try:
-        yield failures
+        with quiet():
+            yield
     finally:
-        if failures:
-            gc.collect()
         sys.unraisablehook = hook
 
 
@@ -101,14 +95,15 @@ def open_universe(
     # Without a format, MDAnalysis asks every package it can convert from whether a path is an object of its own, which
     # imports OpenMM with all its platforms: 80 MB, 70 of them the compiler of an OpenCL platform.
     kind = _format(topology, topology_format, "topology_format")
-    with quiet(), _failing_quietly() as failures:
+    failure = ""
+    with _opening():
         try:
             universe = MDAnalysis.Universe(str(topology), topology_format=kind, **options)
         except _OPEN_ERRORS as error:
-            failures.append(_first_line(error))
-    if failures:
-        advice = _advice_on_packages(failures[0]) or "give a file such as PSF, PRMTOP, TPR, GRO, PDB or mmCIF"
-        raise InputError(f"{topology}: MDAnalysis cannot read this topology ({failures[0]}); {advice}", item="topology")
+            failure = _first_line(error)
+    if failure:
+        advice = _advice_on_packages(failure) or "give a file such as PSF, PRMTOP, TPR, GRO, PDB or mmCIF"
+        raise InputError(f"{topology}: MDAnalysis cannot read this topology ({failure}); {advice}", item="topology")
     if not (hasattr(universe.atoms, "names") or hasattr(universe.atoms, "types")):
         raise InputError(
             f"{topology} says nothing of its atoms, as trajectories do; give a topology such as PSF, PRMTOP, TPR, GRO, "
@@ -143,24 +138,25 @@ def load_trajectory(
     """
     _look_at(Path(trajectory), "trajectory")
     named = _format(trajectory, format, "format")
-    with quiet(), _failing_quietly() as failures:
+    failure, n_frames = "", 0
+    with _opening():
         try:
             universe.load_new(str(trajectory), format=named)
             # Some readers look at the file only now, and some take the number of atoms of the topology for theirs.
-            n_frames, n_read = universe.trajectory.n_frames, len(universe.trajectory.ts.positions)
+            n_frames, n_atoms = universe.trajectory.n_frames, len(universe.trajectory.ts.positions)
         except _OPEN_ERRORS as error:
-            failures.append(_first_line(error))
-            text = str(error)
-    if not failures and not n_frames:
+            failure = _first_line(error) if str(error) else "no message"
+    if failure:
+        n_atoms = _stored_atoms(Path(trajectory), named)
+    elif not n_frames:
         raise UnreadableError(f"{trajectory} has no whole frame; was it cut off?", item="trajectory")
-    n_atoms = _stored_atoms(Path(trajectory), named) if failures else n_read
     if n_atoms is not None and n_atoms != len(universe.atoms):
         raise InputError(
             f"{trajectory} has {n_atoms} atoms, {topology} has {len(universe.atoms)}; give the topology of the atoms "
             "that were written (engines often leave out water or virtual sites)",
             item="topology",
         )
-    if not failures:
+    if not failure:
         return
     # A file that begins as it should was cut off, or damaged later.
     kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
@@ -169,12 +165,9 @@ def load_trajectory(
         advice = (
             "files of this format cannot be read at all when they were cut off; write DCD, XTC or TRR if that happens"
         )
-    if packages := _advice_on_packages(failures[0]):
+    if packages := _advice_on_packages(failure):
         kind, advice = InputError, packages
-    raise kind(
-        f"{trajectory}: MDAnalysis cannot read this trajectory ({failures[0] if text else 'no message'}); {advice}",
-        item="trajectory",
-    )
+    raise kind(f"{trajectory}: MDAnalysis cannot read this trajectory ({failure}); {advice}", item="trajectory")
 
 
 def _format(path: str | Path, given: str | None, item: str) -> str:
@@ -262,13 +255,12 @@ def _first_line(error: BaseException) -> str:
 
 def _stored_atoms(path: Path, named: str) -> int | None:
     """Number of atoms that a trajectory says it has."""
-    with quiet(), _failing_quietly() as failures:
+    with _opening():
         try:
             reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=named)
             try:
                 return int(reader.parse_n_atoms(str(path)))
             except NotImplementedError:  # of formats that say it frame by frame
                 return int(reader(str(path)).n_atoms)
-        except _OPEN_ERRORS as error:
-            failures.append(_first_line(error))
+        except _OPEN_ERRORS:
             return None

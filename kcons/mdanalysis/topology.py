@@ -153,7 +153,7 @@ def snapshot_of(universe: Any) -> Snapshot:
 
 def _refuse_alternates(group: Any, topology: Topology) -> None:
     """An atom at two places is two atoms in MDAnalysis, and no molecule."""
-    places = np.char.strip(_texts(group, "altLocs", len(group)))
+    places = np.char.strip(texts(group, "altLocs", len(group)))
     if not (places != places[0]).any():
         return
     there: dict[tuple[int, str], int] = {}
@@ -169,7 +169,7 @@ def _refuse_alternates(group: Any, topology: Topology) -> None:
 
 
 def require_angstrom(reader: Any) -> None:
-    """Refuse coordinates that MDAnalysis was told to leave in nanometres.
+    """Refuse coordinates that MDAnalysis was told to leave in nanometers.
 
     Raises
     ------
@@ -198,12 +198,12 @@ def topology_of(universe: Any) -> Topology:
     old, first, residues = np.unique(resindex, return_index=True, return_inverse=True)
     order = np.argsort(first)  # of their first atoms in the group, which need not be that of the Universe
     old, residues = old[order], np.argsort(order)[residues]
-    names = _texts(group, "names", n) if hasattr(group, "names") else _texts(group, "types", n)
-    residue_names = _texts(whole.residues[old], "resnames", len(old))
+    names = texts(group, "names", n) if hasattr(group, "names") else texts(group, "types", n)
+    residue_names = texts(whole.residues[old], "resnames", len(old))
     known = hasattr(group, "resnames") and bool((np.char.strip(residue_names) != "").any())
     masses = np.asarray(group.masses, dtype=np.float64) if hasattr(group, "masses") else np.zeros(n)
     measured = hasattr(group, "masses") and not masses_guessed(whole)
-    elements = _texts(group, "elements", n) if hasattr(group, "elements") else np.full(n, "")
+    elements = texts(group, "elements", n) if hasattr(group, "elements") else np.full(n, "")
     elements = np.char.capitalize(np.char.strip(elements))
     heavy = elements == "D"
     elements = np.where(heavy, "H", elements)
@@ -215,13 +215,13 @@ def topology_of(universe: Any) -> Topology:
         # Masses that somebody set later are theirs.
         mended = guessed_masses(masses, names, np.where(heavy, "D", elements))
         masses = np.where(masses == _first_guess(group), mended, masses)
-    ids = _texts(whole.residues[old], "resids", len(old)) if hasattr(whole.residues, "resids") else old.astype(str)
+    ids = texts(whole.residues[old], "resids", len(old)) if hasattr(whole.residues, "resids") else old.astype(str)
     chain = next((a for a in ("chainIDs", "segids") if hasattr(group, a)), None)
     if chain == "chainIDs":
         first = np.unique(residues, return_index=True)[1]
-        chains = _texts(group[first], "chainIDs", len(old))
+        chains = texts(group[first], "chainIDs", len(old))
     else:
-        chains = _texts(whole.residues[old], "segids", len(old)) if chain else np.full(len(old), "")
+        chains = texts(whole.residues[old], "segids", len(old)) if chain else np.full(len(old), "")
     charges = np.asarray(group.charges, dtype=np.float64) if hasattr(group, "charges") else None
     bonds = _bonds(whole)
     if n != len(whole.atoms) or not np.array_equal(group.indices, np.arange(n)):
@@ -268,13 +268,14 @@ def masses_guessed(whole: Any) -> bool:
 def _first_guess(group: Any) -> FloatArray:
     """Masses that MDAnalysis gives by elements or types, whatever the atoms are."""
     kinds, kind = np.unique(
-        _texts(group, "elements" if hasattr(group, "elements") else "types", len(group)), return_inverse=True
+        texts(group, "elements" if hasattr(group, "elements") else "types", len(group)), return_inverse=True
     )
     table = [tables.masses.get(k, tables.masses.get(k.upper(), 0.0)) for k in kinds.tolist()]
     return np.asarray(np.array(table)[kind.ravel()], dtype=np.float64)
 
 
-def _texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
+def texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
+    """An attribute as text; '' for each of the n where there is none."""
     if not hasattr(holder, name):
         return np.full(n, "")
     values = np.asarray(getattr(holder, name))

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import sys
+import tempfile
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
@@ -16,15 +18,14 @@ from typing import Any, Self, TextIO
 
 import MDAnalysis
 import numpy as np
+from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import finite_number, whole_number
+from kcons.constraints.arguments import finite_number, positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
-from kcons.mdanalysis.run_units import ASE_UNITS, OPENMM_UNITS, RunUnits
 from kcons.mdanalysis.topology import cell_of, check_box, dimensions_of
-from kcons.mdanalysis.xtc_limits import refuse_beyond_xtc
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 
@@ -32,12 +33,50 @@ from kcons.steppers import State
 _SINGLE = float(np.finfo(np.float32).max)
 #: Rows up to which an XVG file has a column for each multiplier.
 MOST_COLUMNS = 64
+#: Of XTC: steps from the origin that an integer counts; range of steps from which on some frames are packed wrongly, by
+#: what lies between neighboring atoms; atoms up to which there is no packing.
+_MOST, _SAFE, _FLOATS = 2**31 - 3, 2**23, 9
 _H5MD_UNITS = {
     "timeunit": "ps",
     "lengthunit": "Angstrom",
     "velocityunit": "Angstrom/ps",
     "forceunit": "kJ/(mol*Angstrom)",
 }
+
+
+@dataclass(frozen=True)
+class RunUnits:
+    """What 1 is in a run, in the units of MDAnalysis.
+
+    Attributes
+    ----------
+    length, time, energy : float
+        In angstrom, ps, kJ/mol.
+    name : str
+        For headers.
+    """
+
+    length: float = 1.0
+    time: float = 1.0
+    energy: float = 1.0
+    name: str = "Å, ps, kJ/mol"
+
+    def __post_init__(self) -> None:
+        for name in ("length", "time", "energy"):
+            positive(getattr(self, name), name)
+
+    @property
+    def velocity(self) -> float:
+        return self.length / self.time
+
+    @property
+    def force(self) -> float:
+        return self.energy / self.length
+
+
+#: ASE: Å, Å √(u/eV), eV. OpenMM: nm, ps, kJ/mol.
+ASE_UNITS = RunUnits(1.0, 0.010180505717, 96.4853321233, "Å, Å √(u/eV), eV")
+OPENMM_UNITS = RunUnits(10.0, 1.0, 1.0, "nm, ps, kJ/mol")
 
 
 class TrajectoryWriter:
@@ -90,17 +129,13 @@ class TrajectoryWriter:
         forces: bool = False,
         **options: Any,
     ) -> None:
-        self.path = Path(path)
-        self.units = units or RunUnits()
-        self.motion = motion
+        self.path, self.units, self.motion = Path(path), units or RunUnits(), motion
         self.n_frames = 0
         self.side_file: Path | None = None
         self._side: TextIO | None = None
         self._expects_forces = False
         self._format = self.path.suffix[1:].upper()
         n_atoms = whole_number(n_atoms, "n_atoms")
-        if interval is not None:
-            interval = abs(finite_number(interval, "interval"))
         self._decimals = options.get("precision", 3) if self._format == "XTC" else None
         if not self.path.parent.is_dir():
             raise InputError(f"there is no folder {self.path.parent} to write {self.path.name} into", item="path")
@@ -110,19 +145,17 @@ class TrajectoryWriter:
                 raise UnsupportedError(f"{self._format} has no {what}; write TRR or H5MD")
         if motion is not None and self._format != "H5MD":
             self._refuse_others()
-        self._with_velocities = able if velocities is None else velocities
-        self._with_forces = forces
-        self._universe = MDAnalysis.Universe.empty(
-            n_atoms, trajectory=True, velocities=self._with_velocities, forces=forces
-        )
+        kept = {"velocities": able if velocities is None else velocities, "forces": forces}
+        self._kept = [name for name, stays in kept.items() if stays]
+        self._universe = MDAnalysis.Universe.empty(n_atoms, trajectory=True, **kept)
         if self._format == "H5MD":
-            options = {**_H5MD_UNITS, **options, "velocities": self._with_velocities, "forces": forces}
+            options = {**_H5MD_UNITS, **options, **kept}
         elif self._format in ("NC", "NCDF"):
-            options = {"velocities": self._with_velocities, "forces": forces, **options}
+            options = {**kept, **options}
         if interval is not None:
-            self._universe.trajectory.ts.dt = interval * self.units.time
+            dt = self._universe.trajectory.ts.dt = abs(finite_number(interval, "interval")) * self.units.time
             if self._format == "DCD":
-                options.setdefault("dt", interval * self.units.time)
+                options.setdefault("dt", dt)
         try:
             with quiet():
                 self._writer = MDAnalysis.Writer(str(self.path), n_atoms, multiframe=True, **options)
@@ -141,34 +174,24 @@ class TrajectoryWriter:
     def _refuse_others(self) -> None:
         """The file beside the trajectory takes the place of its own older self only."""
         side = self.path.with_suffix(".xvg")
-        if side.is_symlink():
-            mine = False
-        elif side.is_file():
-            with side.open(encoding="utf-8", errors="replace") as file:
-                mine = file.readline().startswith(self._side_title)
-        else:
-            mine = not side.exists()
-        if not mine:
-            raise InputError(
-                f"{side} is not of {self.path.name}: residuals are not written over it; move it away, or give the "
-                "trajectory another name",
-                item="path",
-            )
-
-    # -- writing --------------------------------------------------------------------------------
+        if not side.is_symlink():
+            if not side.exists():
+                return
+            if side.is_file():
+                with side.open(encoding="utf-8", errors="replace") as file:
+                    if file.readline().startswith(self._side_title):
+                        return
+        raise InputError(
+            f"{side} is not of {self.path.name}: residuals are not written over it; move it away, or give the "
+            "trajectory another name",
+            item="path",
+        )
 
     def __call__(self, state: State) -> None:
         """Write a state; for `kcons.steppers.run(..., observers=[writer])`."""
         cell = cell_of(state, self.motion)
         self._expects_forces = True  # at the latest after the first step
-        self.write(
-            state.positions,
-            state.velocities,
-            time=state.time,
-            cell=cell,
-            forces=state.forces,
-            step=state.step,
-        )
+        self.write(state.positions, state.velocities, time=state.time, cell=cell, forces=state.forces, step=state.step)
 
     def write(
         self,
@@ -200,29 +223,33 @@ class TrajectoryWriter:
         """
         if self._writer is None:
             raise InputError(f"{self.path} is closed", item="path")
-        x = self._array(positions, "positions", self.units.length)
+        units = {"positions": self.units.length, "velocities": self.units.velocity, "forces": self.units.force}
+        given = {"positions": positions, "velocities": velocities, "forces": forces}
+        arrays = {name: self._array(a, name, units[name]) for name, a in given.items() if a is not None}
         if self._decimals is not None:
-            refuse_beyond_xtc(x * self.units.length, self._decimals, self.path.name)
-        v = None if velocities is None else self._array(velocities, "velocities", self.units.velocity)
-        f = None if forces is None else self._array(forces, "forces", self.units.force)
-        box = None if cell is None else _dimensions(np.asarray(cell, dtype=np.float64) * self.units.length)
+            _refuse_beyond_xtc(arrays["positions"] * self.units.length, self._decimals, self.path.name)
+        box = None
+        if cell is not None:
+            matrix = np.asarray(cell, dtype=np.float64) * self.units.length
+            matrix = np.diag(matrix) if matrix.shape == (3,) else matrix
+            check_box(matrix)
+            box = dimensions_of(matrix)
         time = finite_number(time, "time")
-        extras = self._extras(x, v, f, time)
+        extras = self._extras(arrays, time)
         ts = self._universe.trajectory.ts
-        ts.positions = x * self.units.length
-        if self._with_velocities:
-            ts.velocities = (np.zeros_like(x) if v is None else v) * self.units.velocity
-        if self._with_forces:
-            ts.forces = (np.zeros_like(x) if f is None else f) * self.units.force
-        ts.time, ts.frame = time * self.units.time, self.n_frames
+        for name in ("positions", *self._kept):
+            setattr(ts, name, arrays.get(name, np.zeros_like(arrays["positions"])) * units[name])
+        ts.time, ts.frame, ts.dimensions = time * self.units.time, self.n_frames, box
         ts.data["step"] = self.n_frames if step is None else step
-        ts.dimensions = box
         if self._format == "H5MD":
             ts.data.update(extras)
         with quiet():
             self._writer.write(self._universe.atoms)
         if self._format == "H5MD":
-            self._label_observables(extras)
+            group = self._writer.h5md_file
+            for place in (f"observables/{name}" for name in extras):
+                if place in group and "run_units" not in group[place].attrs:
+                    group[place].attrs["run_units"] = self.units.name
         elif extras:
             self._write_side(ts.time, extras)
         self._flush()
@@ -244,11 +271,12 @@ class TrajectoryWriter:
             )
         return array
 
-    def _extras(self, x: FloatArray, v: FloatArray | None, f: FloatArray | None, time: float) -> dict[str, FloatArray]:
+    def _extras(self, arrays: dict[str, FloatArray], time: float) -> dict[str, FloatArray]:
         """What belongs to the constraints, in the units of the run."""
         if self.motion is None:
             return {}
-        held = self.motion.constraint_set
+        held, x = self.motion.constraint_set, arrays["positions"]
+        v, f = arrays.get("velocities"), arrays.get("forces")
         extras = {"residuals": held.value(x, time)}
         if v is not None:
             extras["velocity_residuals"] = held.jacobian(x, time) @ v.ravel() - held.velocity_target(x, time)
@@ -258,34 +286,27 @@ class TrajectoryWriter:
                 extras["multipliers"] = np.full(held.n_rows, np.nan)
         return extras
 
-    def _label_observables(self, extras: dict[str, FloatArray]) -> None:
-        group = self._writer.h5md_file
-        for name in extras:
-            place = f"observables/{name}"
-            if place in group and "run_units" not in group[place].attrs:
-                group[place].attrs["run_units"] = self.units.name
-
     def _write_side(self, time: float, extras: dict[str, FloatArray]) -> None:
-        multipliers = extras.get("multipliers")
-        if multipliers is not None and len(multipliers) > MOST_COLUMNS:
-            multipliers = None
+        sigma, rates = extras["residuals"], extras.get("velocity_residuals")
+        multipliers = extras.get("multipliers", np.zeros(0))
+        if len(multipliers) > MOST_COLUMNS:
+            multipliers = np.zeros(0)
         if self._side is None:
             self.side_file = self.path.with_suffix(".xvg")
             self._side = self.side_file.open("w", encoding="utf-8")
             columns = ["largest residual", "rms residual", "largest velocity residual"]
-            held = None if self.motion is None else self.motion.constraint_set
-            if multipliers is not None and held is not None:
-                columns += [f"multiplier {held.row_name(k)}" for k in range(len(multipliers))]
+            if self.motion is not None:
+                name = self.motion.constraint_set.row_name
+                columns += [f"multiplier {name(k)}" for k in range(len(multipliers))]
             self._width = len(columns)
             print(f"{self._side_title}{self.units.name}; time in ps", file=self._side)
             for k, column in enumerate(columns):
                 print(f'@ s{k} legend "{column}"', file=self._side)
-        sigma, rates = extras["residuals"], extras.get("velocity_residuals")
         numbers = [
             float(np.abs(sigma).max(initial=0.0)),
             float(np.sqrt(np.mean(sigma**2))) if len(sigma) else 0.0,
             float("nan") if rates is None else float(np.abs(rates).max(initial=0.0)),
-            *([] if multipliers is None else multipliers.tolist()),
+            *multipliers.tolist(),
         ]
         # A state whose forces are not known yet has no multipliers; columns stay the same.
         numbers = (numbers + [float("nan")] * self._width)[: self._width]
@@ -302,9 +323,9 @@ class TrajectoryWriter:
             # A file of netCDF4, or of SciPy where that is not installed.
             self._writer.trjfile.sync()
         else:
-            _flush_c_streams()
-
-    # -- end ------------------------------------------------------------------------------------
+            # What libraries in C have buffered; their files do not say how.
+            library = ctypes.cdll.msvcrt if sys.platform == "win32" else ctypes.CDLL(None)
+            library.fflush(None)
 
     def close(self) -> None:
         """Close the files; more than once does no harm."""
@@ -325,18 +346,30 @@ class TrajectoryWriter:
         self.close()
 
 
-def _dimensions(matrix: FloatArray) -> Any:
-    """Lengths and angles, of a cell whose orientation they tell."""
-    if matrix.shape == (3,):
-        matrix = np.diag(matrix)
-    check_box(matrix)
-    return dimensions_of(matrix)
+def _refuse_beyond_xtc(x: FloatArray, decimals: int, name: str) -> None:
+    """Refuse coordinates, in angstrom, that XTC cannot hold: the library packs something else, and goes on."""
+    if len(x) <= _FLOATS:
+        return
+    in_nm = x / 10
+    steps, spread = (float(reach.max()) * 10.0**decimals for reach in (np.abs(in_nm), np.ptp(in_nm, axis=0)))
+    if max(steps, spread) > _MOST or (spread >= _SAFE and not _read_as_written(in_nm, decimals)):
+        raise InputError(
+            f"{name} cannot hold coordinates up to {np.abs(x).max():.4g} angstrom in steps of "
+            f"{10.0 ** (1 - decimals):g}: nothing was written; give a smaller precision, or another format",
+            item="positions",
+        )
 
 
-def _flush_c_streams() -> None:
-    """Flush what libraries in C have buffered; their files do not say how."""
-    library = ctypes.cdll.msvcrt if sys.platform == "win32" else ctypes.CDLL(None)
-    library.fflush(None)
+def _read_as_written(in_nm: FloatArray, decimals: int) -> bool:
+    single = in_nm.astype(np.float32)
+    with tempfile.TemporaryDirectory() as folder:
+        place = str(Path(folder) / "frame.xtc")
+        with XTCFile(place, "w") as file:
+            file.write(single, np.eye(3, dtype=np.float32), 0, 0.0, 10.0**decimals)
+        with XTCFile(place) as file:
+            found = file.read().x
+    rounding = 10.0**-decimals + 4 * np.spacing(np.abs(single).max())
+    return bool((np.abs(found - single) <= rounding).all())
 
 
 # -- MD engines ------------------------------------------------------------------------------------------
@@ -374,8 +407,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     from kcons.ase.topology import velocities_of
 
     atoms = dynamics.atoms
-    if interval < 1:
-        raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
+    _require_interval(interval)
 
     def box() -> FloatArray | None:
         cell: FloatArray = atoms.cell.array
@@ -401,17 +433,16 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
         forces = None
         if writer.motion is not None or with_forces:
             forces = dynamics.applied_forces() if hasattr(dynamics, "applied_forces") else applied_forces(atoms)
-        writer.write(
-            atoms.positions,
-            velocities_of(atoms),
-            time=float(dynamics.get_time()),
-            cell=box(),
-            forces=forces,
-            step=dynamics.nsteps,
-        )
+        time, v = float(dynamics.get_time()), velocities_of(atoms)
+        writer.write(atoms.positions, v, time=time, cell=box(), forces=forces, step=dynamics.nsteps)
 
     dynamics.attach(report, interval=interval)
     return writer
+
+
+def _require_interval(interval: int) -> None:
+    if interval < 1:
+        raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
 
 
 def _followed(writer: TrajectoryWriter, now: Motion | None) -> Motion | None:
@@ -443,11 +474,9 @@ class OpenMMReporter:
     """
 
     def __init__(self, path: str | Path, interval: int, *, motion: Motion | None = None, **options: Any) -> None:
-        if interval < 1:
-            raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
+        _require_interval(interval)
         self.path, self.interval, self.motion = Path(path), int(interval), motion
-        self._options = options
-        self._forces = bool(options.get("forces"))
+        self._options, self._forces = options, bool(options.get("forces"))
         self.writer: TrajectoryWriter | None = None
 
     def describeNextReport(self, simulation: Any) -> tuple[int, bool, bool, bool, bool, bool]:
@@ -457,21 +486,20 @@ class OpenMMReporter:
 
     def report(self, simulation: Any, state: Any) -> None:
         """Write a frame."""
-        from openmm import unit
+        from openmm.unit import md_unit_system
 
-        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
-        f = None
-        if self._forces:
-            f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        def plain(quantity: Any) -> Any:
+            return quantity.value_in_unit_system(md_unit_system)
+
+        x, v = (plain(get(asNumpy=True)) for get in (state.getPositions, state.getVelocities))
+        f = plain(state.getForces(asNumpy=True)) if self._forces else None
         periodic = simulation.system.usesPeriodicBoundaryConditions()
-        cell = state.getPeriodicBoxVectors(asNumpy=True).value_in_unit(unit.nanometer) if periodic else None
+        cell = plain(state.getPeriodicBoxVectors(asNumpy=True)) if periodic else None
         if self.writer is None:
-            dt = simulation.integrator.getStepSize().value_in_unit(unit.picosecond)
-            options = {"units": OPENMM_UNITS, "motion": self.motion, "interval": self.interval * dt, **self._options}
+            interval = self.interval * plain(simulation.integrator.getStepSize())
+            options = {"units": OPENMM_UNITS, "motion": self.motion, "interval": interval, **self._options}
             self.writer = TrajectoryWriter(self.path, len(x), **options)
-        time = state.getTime().value_in_unit(unit.picosecond)
-        self.writer.write(x, v, time=time, cell=cell, forces=f, step=simulation.currentStep)
+        self.writer.write(x, v, time=plain(state.getTime()), cell=cell, forces=f, step=simulation.currentStep)
 
     def close(self) -> None:
         """Close the file."""

@@ -9,6 +9,7 @@ import numpy as np
 import openmm
 import pytest
 from ase import Atoms, units
+from ase.build import molecule
 from host_systems import ALANINE, DHFR, VILLIN, quietly, read_universe
 from MDAnalysis.lib.mdamath import triclinic_vectors
 from openmm import app, unit
@@ -293,3 +294,42 @@ def test_rows_of_another_group_are_refused(villin):
     assert held.get_removed_dof(to_ase(ten)) == 30
     # Another file of the same atoms may number them otherwise.
     assert len(to_ase(mda.Merge(ten), rows).constraints) == 1
+
+
+# -- ag.convert_to("ASE") ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ethane():
+    universe, _ = from_ase(molecule("C2H6"))
+    universe.add_TopologyAttr("bonds", [(0, 1), (0, 2), (0, 3), (0, 4), (1, 5), (1, 6), (1, 7)])
+    return universe
+
+
+def test_converted_atoms_are_those_of_to_ase(ethane):
+    atoms = ethane.atoms.convert_to("ASE")
+    assert np.array_equal(atoms.positions, to_ase(ethane).positions) and list(atoms.symbols) == ["C"] * 2 + ["H"] * 6
+    assert not atoms.constraints
+    assert np.array_equal(ethane.atoms.convert_to.ase().positions, atoms.positions)
+
+
+def test_converted_atoms_carry_constraints(ethane):
+    by_name = ethane.atoms.convert_to("ASE", constrain="hbonds")
+    (held,) = by_name.constraints
+    assert held.get_removed_dof(by_name) == 6
+    rows = constraints_of(ethane, "hbonds")
+    (same,) = ethane.atoms.convert_to("ASE", constraints=rows).constraints
+    assert same.get_removed_dof(by_name) == 6
+    one = ethane.select_atoms("element C").convert_to("ASE", constraints=[Distance([[0, 1]])])
+    assert len(one) == 2 and one.constraints[0].get_removed_dof(one) == 1
+    alone = ethane.atoms.convert_to("ASE", constraints=Distance([[0, 1]]))
+    assert alone.constraints[0].get_removed_dof(alone) == 1
+    with pytest.raises(InputError, match="constraints has 3"):
+        ethane.atoms.convert_to("ASE", constraints=3)
+
+
+def test_converters_take_a_name_or_a_list(ethane):
+    with pytest.raises(InputError, match="not both"):
+        ethane.atoms.convert_to("ASE", constrain="hbonds", constraints=[Distance([[0, 1]])])
+    with pytest.raises(InputError, match="rigid_water is an option of constrain"):
+        ethane.atoms.convert_to("ASE", rigid_water=False)

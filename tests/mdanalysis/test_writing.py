@@ -18,8 +18,10 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis import (
     ASE_UNITS,
+    OPENMM_UNITS,
     ConstraintCheck,
     OpenMMReporter,
+    RunUnits,
     TrajectoryWriter,
     load_trajectory,
     write_ase,
@@ -284,8 +286,6 @@ def test_bad_input(tmp_path):
     writer.close()
     with pytest.raises(InputError, match="is closed"):
         writer.write(x)
-    with pytest.raises(InputError, match="interval is 0"):
-        OpenMMReporter(tmp_path / "o.dcd", 0)
 
 
 def test_multipliers_count_hookean_objects_and_friction(tmp_path):
@@ -395,6 +395,32 @@ def test_what_a_file_cannot_hold_is_not_written(tmp_path, away):
         writer.write(x * 1e38)
 
 
+def test_fine_grids_are_written_only_where_they_are_read_again(tmp_path):
+    """Beyond 2^23 steps it depends on the distances of neighbours whether XTC's packing is right."""
+    rng = np.random.default_rng(1)
+    far = rng.uniform(0, 60, size=(200, 3))
+    near = np.repeat(rng.uniform(0, 60, size=(70, 3)), 3, axis=0)[:200] + rng.normal(size=(200, 3)) * 0.5
+    with TrajectoryWriter(tmp_path / "a.xtc", 200, precision=7) as writer:
+        with pytest.raises(InputError, match="in steps of 1e-06: nothing was written; give a smaller precision"):
+            writer.write(far)
+        writer.write(near)
+    universe = mda.Universe.empty(200, trajectory=True).load_new(str(tmp_path / "a.xtc"))
+    assert len(universe.trajectory) == 1
+    np.testing.assert_allclose(universe.atoms.positions, near, atol=2e-5)
+
+
+def test_few_atoms_have_no_grid(tmp_path):
+    for atoms in (9, 10):
+        with TrajectoryWriter(tmp_path / f"{atoms}.xtc", atoms) as writer:
+            if atoms == 9:
+                writer.write(np.full((9, 3), 1e9))
+                continue
+            with pytest.raises(
+                InputError, match=r"10.xtc cannot hold coordinates up to 1e\+09 angstrom in steps of 0.01"
+            ):
+                writer.write(np.full((10, 3), 1e9))
+
+
 def test_cells_that_are_none_are_not_left_out(tmp_path):
     x = np.zeros((2, 3))
     with TrajectoryWriter(tmp_path / "a.trr", 2) as writer:
@@ -413,10 +439,19 @@ def test_cells_that_are_none_are_not_left_out(tmp_path):
     [
         (lambda path: TrajectoryWriter(path, -1), "n_atoms"),
         (lambda path: TrajectoryWriter(path, 2, interval=np.nan), "interval"),
+        (lambda path: OpenMMReporter(path, 0), "interval"),
+        *[
+            (lambda path, n=name, v=value: RunUnits(**{n: v}), name)
+            for name in ("length", "time", "energy")
+            for value in (0.0, -1.0, np.nan, np.inf)
+        ],
     ],
-    ids=["atoms", "interval"],
 )
 def test_settings_of_no_use_are_refused(tmp_path, call, item):
     with pytest.raises(InputError) as caught:
         call(tmp_path / "a.trr")
     assert caught.value.item == item and not list(tmp_path.iterdir())
+
+
+def test_units_of_velocities_and_forces_follow():
+    assert OPENMM_UNITS.velocity == 10.0 and OPENMM_UNITS.force == 0.1

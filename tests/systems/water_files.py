@@ -60,6 +60,24 @@ def universe(n: int, masses: bool = True):
     return made
 
 
+def loaded(path, n: int, masses: bool = True):
+    """The universe with a trajectory."""
+    from kcons.mdanalysis import load_trajectory
+
+    made = universe(n, masses)
+    load_trajectory(made, path)
+    return made
+
+
+def checked(path, n: int, constraints=None, *, run=None, masses: bool = True, **options):
+    """The result of a check of all distances of all molecules, or of other rows."""
+    from kcons.constraints import Distance
+    from kcons.mdanalysis import ConstraintCheck
+
+    rows = Distance(pairs(n), targets(n)) if constraints is None else constraints
+    return ConstraintCheck(loaded(path, n, masses), rows, **options).run(**(run or {})).check
+
+
 def write(
     path: Path, x: np.ndarray, side: float | None = 12.0, velocities: np.ndarray | None = None, **options
 ) -> Path:

@@ -1,13 +1,13 @@
 """How well a trajectory, of whatever MD engine, kept its constraints.
 
-- `atom_names`, `files`: names, and what files say
-- `frames`: what is found in one frame after another
-- `rank_by_pieces`, `compiling`, `workers`: large files in little time and memory
-- `findings`, `result`, `temperature`: what was found, and what it says
-- `bound_rows`, `reading`, `conclusions`: before the first frame, along the frames, after the last
-- `constraint_check`, `check_files`, `report`: the check, from Python and from the command line
+- `precision`, `endings`: what files can hold, and where they end
+- `targets`: names of atoms, and what a parameter file says
+- `deviations`: rows in one frame after another
+- `result`, `report`: what was found, as data, text, picture and files
+- `constraint_check`: the check, from Python and from files
 """
 
-from kcons.mdanalysis.check.constraint_check import ConstraintCheck
+from kcons.mdanalysis.check.constraint_check import ConstraintCheck, check_trajectory
+from kcons.mdanalysis.check.result import CheckResult
 
-__all__ = ["ConstraintCheck"]
+__all__ = ["CheckResult", "ConstraintCheck", "check_trajectory"]

@@ -1,17 +1,19 @@
-"""How well a trajectory, of whatever engine, kept its constraints."""
+"""How well a trajectory, of whatever MD engine, kept its constraints: from Python, and from files in one call."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
+from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
@@ -20,40 +22,30 @@ from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, UnreadableError
-from kcons.mdanalysis.check.atom_names import AtomNames
-from kcons.mdanalysis.check.bound_rows import BoundRows
-from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
-from kcons.mdanalysis.check.conclusions import Asked, concluded
-from kcons.mdanalysis.check.files.endings import damage_of, ending_of
-from kcons.mdanalysis.check.files.file_precision import by_frame, grid_of, precision_of_reader
-from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
-from kcons.mdanalysis.check.files.target_file import TargetFile
-from kcons.mdanalysis.check.findings import (
-    Part,
-    joined,
+from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
+from kcons.mdanalysis.check.deviations import Found, RowTable
+from kcons.mdanalysis.check.endings import broken_by, damage_of, ending_of
+from kcons.mdanalysis.check.precision import by_frame, described, grid_of, precision_of, precision_of_reader
+from kcons.mdanalysis.check.result import Asked, CheckResult, concluded
+from kcons.mdanalysis.check.targets import AtomNames, TargetFile
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
+from kcons.mdanalysis.topology import (
+    constraints_of,
+    host_of,
+    masses_guessed,
+    require_angstrom,
+    topology_of,
+    velocities_known,
 )
-from kcons.mdanalysis.check.rank_by_pieces import rank_of
-from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by, remarks_on
-from kcons.mdanalysis.check.result import Break, CheckResult
-from kcons.mdanalysis.check.temperature import masses_of
-from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
-from kcons.mdanalysis.loading import READ_ERRORS, quiet
-from kcons.mdanalysis.topology import host_of, require_angstrom, velocities_known
+from kcons.motion.motion import Motion
+from kcons.topology.holding import Options
 from kcons.topology.rows_by_name import HeldRows
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
 GRID_FRAMES, GRID_ATOMS = 5, 1000
 
 
-class _Remote:
-    """What a worker sends back: no trajectory, no tables."""
-
-    def __init__(self, part: Part) -> None:
-        self.frames, self.times, self.results = part.frames, part.times, Results(part=part)
-
-
-class ConstraintCheck(AnalysisBase):
+class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     """Deviations of all constraints along a trajectory, judged by the precision of its file.
 
     Parameters
@@ -65,7 +57,7 @@ class ConstraintCheck(AnalysisBase):
     targets : {'given', 'first', 'mean'}, path or TargetFile
         Where the lengths come from. 'given': what the constraints say, and the first frame for those that do not
         say. 'first': the first frame looked at. 'mean': the mean over the frames, which are read twice. A path: a
-        parameter file, see `kcons.mdanalysis.check.files.target_file`.
+        parameter file, see `kcons.mdanalysis.check.targets`.
     tolerance : float
         Relative violation that counts as the engine's tolerance and not as a violation, in parts of the length (of
         1 rad for angles).
@@ -75,7 +67,7 @@ class ConstraintCheck(AnalysisBase):
         Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
         measured in another file.
     removed : int, optional
-        Degrees of freedom that the engine took away besides: 3 where it stops the centre of mass. Found from the
+        Degrees of freedom that the engine took away besides: 3 where it stops the center of mass. Found from the
         total momentum by default.
     rank : bool
         Whether to find the rank, which takes longer than the frames of a short trajectory.
@@ -96,8 +88,7 @@ class ConstraintCheck(AnalysisBase):
     Targets that were read from a frame are rounded themselves, which about doubles the bound. Velocities of leapfrog
     integrators belong to the middle of a step and are not tangent at the positions they are stored with.
 
-    Backends: serial, multiprocessing, dask, and threads for DCD files and rows that are all lengths
-    (`run(backend=..., n_workers=...)`); of several workers, threads where they can be had, processes otherwise.
+    Backends are those of MDAnalysis, serial, multiprocessing and dask: `run(backend=..., n_workers=...)`.
     """
 
     _analysis_algorithm_is_parallelizable = True
@@ -118,14 +109,13 @@ class ConstraintCheck(AnalysisBase):
         **options: Any,
     ) -> None:
         universe = atoms.universe
+        n_atoms = len(universe.atoms)
         require_angstrom(universe.trajectory)
         super().__init__(universe.trajectory, **options)
         if isinstance(constraints, HeldRows):
-            constraints.require_atoms(len(universe.atoms), universe.atoms.indices, host_of(universe))
-        if isinstance(constraints, ConstraintSet):
-            given: tuple[Constraint, ...] = constraints.constraints
-        else:
-            given = tuple(constraints_in(constraints, "constraints"))
+            constraints.require_atoms(n_atoms, universe.atoms.indices, host_of(universe))
+        held = constraints.constraints if isinstance(constraints, ConstraintSet) else constraints
+        given = tuple(constraints_in(held, "constraints"))
         if not sum(item.n_rows for item in given):
             raise InputError(
                 "there are no constraints to check; select others, or look at the bonds of the topology",
@@ -134,7 +124,7 @@ class ConstraintCheck(AnalysisBase):
         if not (np.isfinite(tolerance) and tolerance >= 0):
             raise InputError(f"the tolerance is {tolerance}; give a number such as 1e-4, or 0", item="tolerance")
         errors = np.asarray(target_error, dtype=np.float64)
-        if errors.shape not in ((), (len(universe.atoms),)) or not (errors >= 0).all() or not np.isfinite(errors).all():
+        if errors.shape not in ((), (n_atoms,)) or not (errors >= 0).all() or not np.isfinite(errors).all():
             raise InputError(
                 f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
             )
@@ -143,32 +133,29 @@ class ConstraintCheck(AnalysisBase):
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         labels = AtomNames(universe)
-        remarks: list[str] = []
-        self._unit_masses = np.ones(len(universe.atoms))
-        self._masses, reason = masses_of(universe, given, labels)
-        if reason:
-            remarks.append(f"no temperature: {reason}")
+        self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
+        self._masses, reason = _masses(universe, given, self._used, labels)
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
             given, mode, text = tuple(file.apply(given, labels)), "given", str(file.path)
         else:
             mode = str(targets)
             text = {"first": "the first frame", "mean": "the mean of the frames"}.get(mode, "as given")
-        self._given = given
-        self._tolerance, self._target_error = float(tolerance), np.broadcast_to(errors, len(universe.atoms))
-        self._wants_rank = rank
+        if mode != "given":
+            given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
-        called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
-        in_file = precision_of_reader(reader, precision)
-        remarks += remarks_on(reader)
-        of_frames = None
-        if in_file.exact and precision is None:
-            of_frames = by_frame(self._path, reader._xdr.offsets, in_file)
-        self._may_be_on_grid = precision is None and not (in_file.step or in_file.digits)
-        self._reading = Reading(in_file, of_frames, self._masses, velocities_known(reader))
-        self.asked = Asked(called, labels, mode, text, removed, int(worst), remarks)
-        self._pass_of_means = False
+        names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
+        remarks = [f"no temperature: {reason}"] if reason else []
+        self.asked = Asked(names, labels, mode, text, removed, int(worst), remarks + _remarks_on(reader))
+        self._given, self._tolerance, self._wants_rank = given, float(tolerance), rank
+        self._target_error = np.broadcast_to(errors, n_atoms)
+        self._precision = precision_of_reader(reader, precision)
+        self._by_frame = None
+        if self._precision.exact and precision is None:
+            self._by_frame = by_frame(self._path, reader._xdr.offsets, self._precision)
+        self._may_be_on_grid = precision is None and not (self._precision.step or self._precision.digits)
+        self._velocities = velocities_known(reader)
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
@@ -189,7 +176,7 @@ class ConstraintCheck(AnalysisBase):
         Raises
         ------
         InputError
-            There are no such frames; threads where the file cannot be read by them.
+            There are no such frames.
         UnreadableError
             The first frame cannot be read.
         KconsError
@@ -197,39 +184,34 @@ class ConstraintCheck(AnalysisBase):
         """
         chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
         # Whether frames that were cut off would have been looked at.
-        n_frames = self._trajectory.n_frames
-        self._to_the_end = (
-            Path(self._path).is_file() and chosen["frames"] is None and _open_ended(start, stop, step, n_frames)
-        )
-        frames_asked = self._numbers(chosen)
+        first, end = (stop, start) if step is not None and step < 0 else (start, stop)
+        open_ended = end is None or end < 0 or end > self._trajectory.n_frames or (first or 0) < 0
+        self._to_the_end = Path(self._path).is_file() and frames is None and open_ended
+        numbers = self._numbers(chosen)
+        remarks = list(self.asked.remarks)
         if self._may_be_on_grid:
-            self._look_for_grid(frames_asked)
-        self._bind(int(frames_asked[0]))
-        in_blocks = blocks_of(self._trajectory, self._rows.table) is not None
-        # The compiled look at a block sees damage by itself.
-        self._reading.damage = None if in_blocks else damage_of(self._trajectory)
-        options = with_backend(options, in_blocks)
-        self._pass_of_means = self.asked.mode == "mean"
-        with inherited(self, options["backend"]):
-            if self._pass_of_means:
-                super().run(**chosen, **options)
-                self._rows.hold_means(self.results.part, self._trajectory.ts)
-                self._pass_of_means = False
+            self._look_for_grid(numbers)
+        self._bind(int(numbers[0]))
+        self._damage = damage_of(self._trajectory)
+        self._first_pass = self.asked.mode == "mean"
+        if self._first_pass:
             super().run(**chosen, **options)
+            self._rows.take_means(self.results.found)
+            self._first_pass = False
+        super().run(**chosen, **options)
+        self.asked.remarks = remarks
         return self
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        return short_pickle(self) or super().__reduce_ex__(protocol)
 
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
         """Frames to look at, at least one."""
         numbers: Sequence[int]
+        count, name = self._trajectory.n_frames, self.asked.names[0]
         if chosen["frames"] is None:
             if chosen["step"] == 0:
                 raise InputError("step is 0; give another whole number", item="step")
             numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
         else:
-            asked, count = np.asarray(chosen["frames"]), self._trajectory.n_frames
+            asked = np.asarray(chosen["frames"])
             if asked.dtype == bool and asked.shape == (count,):
                 asked = np.flatnonzero(asked)
             if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
@@ -239,59 +221,54 @@ class ConstraintCheck(AnalysisBase):
                     item="frames",
                 )
             for frame in asked[(asked < -count) | (asked >= count)]:
-                raise InputError(f"{self.asked.names[0]}: there is no frame {frame}; it has {count}", item="frames")
+                raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
             numbers = asked.tolist()
         if not len(numbers):
-            raise InputError(
-                f"{self.asked.names[0]}: no frames are left by start, stop and step; it has "
-                f"{self._trajectory.n_frames}",
-                item="frames",
-            )
+            raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
 
     def _look_for_grid(self, numbers: Sequence[int]) -> None:
         """Take the grid that coordinates lie on, in frames from first to last, for the precision of the file."""
-        used = np.unique(np.concatenate([item.atoms.ravel() for item in self._given]))
-        used = used[:: -(-len(used) // GRID_ATOMS)]
+        used = self._used[:: -(-len(self._used) // GRID_ATOMS)]
         seen = []
         for k in np.unique(np.linspace(0, len(numbers) - 1, GRID_FRAMES).astype(int)).tolist():
             # A frame that cannot be read, or has no numbers, is told of where it is looked at.
             with quiet(), suppress(*READ_ERRORS):
                 seen.append(np.array(self._trajectory[numbers[k]].positions[used]))
         step = grid_of(seen) if seen and np.isfinite(seen).all() else 0.0
-        self._reading.precision = replace(self._reading.precision, step=step)
-        remark = (
-            f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for their "
-            "precision, unless one is given"
-        )
-        if step and remark not in self.asked.remarks:
-            self.asked.remarks.append(remark)
+        self._precision = replace(self._precision, step=step)
+        if step:
+            self.asked.remarks.append(
+                f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for "
+                "their precision, unless one is given"
+            )
 
     def _bind(self, frame: int) -> None:
-        """Rows and their targets at one frame."""
+        """Rows and their targets at one frame, which must be finite."""
         try:
             with quiet():
                 ts = self._trajectory[frame]
-                time = float(ts.time)
-        except READ_ERRORS as error:
+            bad = self._used[~np.isfinite(ts.positions[self._used]).all(axis=1)]
+            if len(bad):
+                raise NonFiniteError(f"position of atom {bad[0]} is {ts.positions[bad[0]]}")
+            if ts.dimensions is not None and not np.isfinite(ts.dimensions).all():
+                raise NonFiniteError(f"the cell is {ts.dimensions}")
+        except (*READ_ERRORS, NonFiniteError) as error:
             raise self._nothing(frame, str(error)) from None
-        given = self._given
-        if self.asked.mode != "given":
-            given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
-        self._refuse_numbers(ts, frame, given)
-        masses = self._unit_masses if self._masses is None else self._masses
-        precision = self._reading.precision_at(frame)
-        rows = self._rows = BoundRows(given, masses, ts, time, precision, self._target_error, self._tolerance)
-        held = rows.table.set
-        shot = frame_of(ts, time, plain_dcd(self._trajectory) is not None)
-        first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, precision, self._wants_rank))
+        self._largest = float(np.abs(ts.positions[self._used]).max())
+        masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
+        precision = self._precision_at(frame)
+        with quiet():
+            self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
         self._rank: int | None = None
         if self._wants_rank:
             try:
-                self._rank = first_use(lambda: rank_of(held, rows.positions))
+                self._rank = Motion(self._rows.set, self._rows.positions).rank
             except KconsError as error:
                 self.asked.remarks.append(f"no rank: {error}")
-        first_use(lambda: look_once(rows.table, shot))
+
+    def _precision_at(self, frame: int) -> Any:
+        return self._precision if self._by_frame is None else self._by_frame[frame]
 
     def _nothing(self, frame: int, reason: str) -> UnreadableError:
         """Of a trajectory of which nothing can be told."""
@@ -301,15 +278,6 @@ class ConstraintCheck(AnalysisBase):
             item="trajectory",
         )
 
-    def _refuse_numbers(self, ts: Any, frame: int, given: Sequence[Constraint]) -> None:
-        """A frame that gives targets, or scales, must be finite."""
-        used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        bad = used[~np.isfinite(ts.positions[used]).all(axis=1)]
-        if len(bad):
-            raise self._nothing(frame, f"position of atom {bad[0]} is {ts.positions[bad[0]]}")
-        if ts.dimensions is not None and not np.isfinite(ts.dimensions).all():
-            raise self._nothing(frame, f"the cell is {ts.dimensions}")
-
     def _prepare_sliced_trajectory(self, slicer: Any) -> None:
         with quiet():
             super()._prepare_sliced_trajectory(slicer)
@@ -317,48 +285,49 @@ class ConstraintCheck(AnalysisBase):
     def _compute(
         self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
     ) -> Any:
-        """Read one worker's frames, in order and without seeking where they follow each other; stop at a break."""
-        verbose = getattr(self, "_verbose", False) if verbose is None else verbose
-        with ProgressBar(total=len(indexed_frames), verbose=verbose, **(progressbar_kwargs or {})) as bar:
-            table = self._rows.table.fresh()
-            part = self._reading.read(self._trajectory, indexed_frames[:, 1], table, self._pass_of_means, bar)
-        return _Remote(part)
+        """Look at one worker's frames, in order, up to the first that cannot be used.
+
+        MDAnalysis' own loop ends in an error there, and sends the whole analysis back.
+        """
+        numbers, trajectory, previous = indexed_frames[:, 1], self._trajectory, -1
+        found = Found.nothing(self._rows.set.n_rows, numbers)
+        shown = getattr(self, "_verbose", False) if verbose is None else verbose
+        with quiet(), ProgressBar(total=len(numbers), verbose=shown, **(progressbar_kwargs or {})) as bar:
+            for k, number in enumerate(numbers.tolist()):
+                try:
+                    if self._damage is not None and number >= self._damage.frame:
+                        found.broken = self._damage
+                    else:
+                        # Seeking reads compressed files from their beginning.
+                        ts = trajectory.next() if 0 <= previous == number - 1 else trajectory[number]
+                        previous = number
+                        v = ts.velocities if ts.has_velocities and self._velocities else None
+                        self._rows.look(found, k, ts, self._precision_at(number), self._masses, v)
+                except (*READ_ERRORS, KconsError) as error:
+                    found.broken = broken_by(error, trajectory, number)
+                if found.broken is not None:
+                    found.units, found.frames = found.units[:k], found.frames[:k]
+                    break
+                bar.update()
+        return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
 
     def _get_aggregator(self) -> ResultsGroup:
-        return ResultsGroup(lookup={"part": joined})
-
-    # -- conclusions ----------------------------------------------------------------------------
+        return ResultsGroup(lookup={"found": Found.joined})
 
     def _conclude(self) -> None:
-        part: Part = self.results.part
-        self.frames, self.times = part.frames, part.times
-        if self._pass_of_means:
+        found: Found = self.results.found
+        if self._first_pass:
             return
-        if not len(part.frames):
-            assert part.broken is not None
-            raise self._nothing(part.broken.frame, part.broken.reason)
-        if part.broken is None and self._to_the_end:
-            part.broken = self._end_of_file()
-        masses = self._unit_masses if self._masses is None else self._masses
-        n_in_file = int(self._trajectory.n_frames)
-        self.results.check = concluded(part, self._rows, self.asked, self._reading, self._rank, masses, n_in_file)
-
-    def _end_of_file(self) -> Break | None:
-        """What lies behind the last frame, or keeps it from being read."""
-        trajectory = self._trajectory
-        n = trajectory.n_frames
-        broken = self._reading.damage or ending_of(trajectory)
-        try:
+        if not len(found.frames):
+            assert found.broken is not None
+            raise self._nothing(found.broken.frame, found.broken.reason)
+        if found.broken is None and self._to_the_end:
             with quiet():
-                trajectory[n - 1]
-        except READ_ERRORS as error:
-            broken = broken or broken_by(error, trajectory, n - 1)
-        return broken
-
-    @property
-    def remarks(self) -> list[str]:
-        """What there is to say besides."""
-        return self.asked.remarks
+                found.broken = self._damage or ending_of(self._trajectory)
+        text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
+        masses = self._rows.set.masses
+        n_in_file = int(self._trajectory.n_frames)
+        self.results.check = concluded(found, self._rows, self.asked, text, self._rank, masses, n_in_file)
 
     @property
     def check(self) -> CheckResult:
@@ -375,8 +344,167 @@ class ConstraintCheck(AnalysisBase):
         return result
 
 
-def _open_ended(start: int | None, stop: int | None, step: int | None, n_frames: int) -> bool:
-    """Whether a slice means the end of a trajectory, wherever it is."""
-    if step is not None and step < 0:
-        start, stop = stop, start
-    return stop is None or stop < 0 or stop > n_frames or (start or 0) < 0
+def _masses(
+    universe: Any, given: Sequence[Constraint], used: NDArray[np.int64], labels: AtomNames
+) -> tuple[FloatArray | None, str]:
+    """Masses; or None where they cannot be used, and why.
+
+    Raises
+    ------
+    InputError
+        Constraints on atoms that do not exist, or that need masses.
+    """
+    if used[-1] >= len(universe.atoms):
+        raise InputError(
+            f"there is no atom {used[-1]}; the topology has atoms 0 to {len(universe.atoms) - 1}",
+            item="constraints",
+            atoms=[int(used[-1])],
+        )
+    try:
+        masses: FloatArray = np.asarray(universe.atoms.masses, dtype=np.float64)
+        if masses_guessed(universe):
+            masses = topology_of(universe).masses
+    except (NoDataError, AttributeError):
+        reason = "the topology has no masses"
+    else:
+        bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
+        if not len(bad):
+            return masses, ""
+        reason = f"{labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}"
+    reason += "; give a topology with masses, such as PSF, PRMTOP or TPR"
+    needing = next((item for item in given if item.uses_masses), None)
+    if needing is not None:
+        raise InputError(f"{needing!r} needs masses, but {reason}", item="masses")
+    return None, reason
+
+
+def _remarks_on(reader: Any) -> list[str]:
+    """What a reader of MDAnalysis does not know, or was told to do."""
+    remarks, name = [], format_of(reader)
+    if getattr(reader, "transformations", ()):
+        remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+    if reader.ts.has_velocities and not velocities_known(reader):
+        remarks.append(f"no temperature: velocities of {name} files have no unit")
+    # Dumps of LAMMPS have numbers of steps.
+    timed = name in ("MEMORY", "CHAIN") or hasattr(reader, "_get_dt") or "dt" in getattr(reader, "_ts_kwargs", {})
+    if not timed and (name == "LAMMPSDUMP" or "time" not in reader.ts.data) and reader.n_frames > 1:
+        apart = "steps" if name == "LAMMPSDUMP" else "frames"
+        remarks.append(f"{name} files have no times: {apart} are taken to be 1 ps apart, in drifts too")
+    return remarks
+
+
+# -- files ------------------------------------------------------------------------------------------
+
+
+def check_trajectory(
+    trajectory: str | Path,
+    topology: str | Path,
+    constrain: str | None = "hbonds",
+    *,
+    targets: str | Path = "first",
+    frames: str | None = None,
+    format: str | None = None,
+    topology_format: str | None = None,
+    workers: int = 1,
+    **options: Any,
+) -> CheckResult:
+    """How well a trajectory kept its constraints.
+
+    Parameters
+    ----------
+    trajectory, topology : path
+        Files that MDAnalysis reads.
+    constrain
+        What is held; see `kcons.mdanalysis.constraints_of`.
+    targets : {'first', 'mean', 'topology'} or path
+        'topology': the coordinates in the topology's file; else as for `ConstraintCheck`.
+    frames : str, optional
+        'A:B:STEP' as in a slice; all by default.
+    format, topology_format : str, optional
+        Formats of the files, as MDAnalysis names them; by default what their names tell.
+    workers : int
+        How many processes read at the same time.
+    **options
+        What is held besides, such as select, rigid_water and rigid_residues, for `kcons.mdanalysis.constraints_of`;
+        all others for `ConstraintCheck`.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read, selections that match nothing, unknown names, atom counts that differ.
+    UnreadableError
+        A trajectory of which nothing can be told: cut off, or not finite, in its first frame.
+    """
+    chosen = _slice(frames)
+    if workers < 1:
+        raise InputError(f"{workers} workers; give 1 or more", item="workers")
+    of_topology = str(targets) == "topology"
+    # Complain about the parameter file before anything long.
+    given = "given" if of_topology else targets if str(targets) in ("first", "mean") else TargetFile(targets)
+    held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
+    if of_topology:
+        universe = open_universe(topology, topology_format=topology_format)
+        if not hasattr(universe, "trajectory"):
+            raise InputError(
+                f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file",
+                item="targets",
+            )
+        with quiet():
+            precision = precision_of(topology, format_of(universe.trajectory))
+            options["target_error"] = precision.half_step(universe.atoms.positions)
+        constraints = _held(universe, constrain, held)
+        load_trajectory(universe, trajectory, topology, format=format)
+    else:
+        universe = open_universe(topology, trajectory, format=format, topology_format=topology_format)
+        # Bonds are looked for in the first frame that is looked at; one that is not there is for the check to refuse.
+        with quiet(), suppress(*READ_ERRORS):
+            _ = universe.trajectory[chosen.get("start") or 0]
+        constraints = _held(universe, constrain, held)
+    check = ConstraintCheck(universe, constraints, targets=given, names=(str(trajectory), str(topology)), **options)
+    if of_topology:
+        check.asked.targets = f"coordinates of {topology}"
+    if guessed := constraints.bonds_guessed:
+        check.asked.remarks.append(
+            f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
+            "topology with bonds, such as PSF, PRMTOP or TPR"
+        )
+    if len(loose := constraints.loose_hydrogens):
+        check.asked.gaps.append(
+            f"no bond was found for {len(loose)} hydrogens, the first of which is "
+            f"{constraints.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
+            "whose faces molecules may be cut, or a topology with bonds"
+        )
+    if workers > 1:
+        chosen |= {"backend": "multiprocessing", "n_workers": workers}
+    with quiet():
+        check.run(**chosen)
+    return check.check
+
+
+def _held(universe: Any, constrain: str | None, held: dict[str, Any]) -> HeldRows:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
+        warnings.filterwarnings("ignore", message="no bond was guessed", category=UserWarning)  # a gap
+        try:
+            return constraints_of(universe, constrain, **held)
+        except InputError as error:
+            if error.item == "positions" and not np.isfinite(universe.atoms.positions).all():
+                reader = universe.trajectory
+                raise UnreadableError(
+                    f"{reader.filename}: {error}, in frame {reader.frame}, the first to be looked at; begin at a later "
+                    "one (--frames A:), or write the file again",
+                    item="trajectory",
+                ) from None
+            raise
+
+
+def _slice(frames: str | None) -> dict[str, Any]:
+    if frames is None:
+        return {}
+    try:
+        numbers = [int(word) if word.strip() else None for word in frames.split(":")]
+    except ValueError:
+        numbers = []
+    if not 2 <= len(numbers) <= 3 or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
+        raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
+    return dict(zip(("start", "stop", "step"), numbers, strict=False))

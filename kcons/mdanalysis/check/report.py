@@ -18,7 +18,7 @@ from kcons.steppers.files import text as as_json
 if TYPE_CHECKING:
     from kcons.mdanalysis.check.result import CheckResult
 
-COLOURS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete": "yellow"}
+COLORS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete": "yellow"}
 #: What `write` writes.
 FILES = ("check.json", "check.png", "check.txt")
 #: Ticks on the axis of frames are numbers of frames where times say nothing.
@@ -27,8 +27,8 @@ _NO_TIMES = "frame"
 _NOTHING = 1e-6
 
 
-def summary(result: CheckResult) -> str:
-    """What was looked at, and what the file can show."""
+def page(result: CheckResult) -> tuple[str, Table, Table, Text]:
+    """What a person reads: what was looked at and what the file can show, units, worst rows, the verdict."""
     frames = f"{len(result.frames)} of {result.n_frames_in_file} frames"
     lines = [
         f"{result.trajectory}: {frames}, {result.n_atoms} atoms; {result.n_rows} rows on {result.n_constrained} atoms",
@@ -41,13 +41,8 @@ def summary(result: CheckResult) -> str:
         lines[-1] += f", {t['mean']:.2f} ± {t['deviation']:.2f} K (mean and standard deviation of frames)"
         if t["slope"] == t["slope"]:
             lines[-1] += f", drift {1000 * t['slope']:.2g} ± {1000 * t['slope_error']:.1g} K/ns"
-    lines += result.remarks + result.gaps
-    return "\n".join(lines)
-
-
-def verdict(result: CheckResult) -> Text:
-    """The verdict, in colour."""
-    return Text(result.verdict, style=f"bold {COLOURS[result.status]}")
+    summary = "\n".join(lines + result.remarks + result.gaps)
+    return summary, _units(result), _rows(result), Text(result.verdict, style=f"bold {COLORS[result.status]}")
 
 
 def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **options: Any) -> Table:
@@ -60,7 +55,7 @@ def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **optio
     return shown
 
 
-def unit_table(result: CheckResult) -> Table:
+def _units(result: CheckResult) -> Table:
     """One line for lengths, one for angles."""
     headers = ["unit", "rows", "largest", "rms", "rms of\nrounding", "mean", "largest mean\nof a row"]
     headers.append("drift of rms\na ns")
@@ -80,7 +75,7 @@ def unit_table(result: CheckResult) -> Table:
     return _table(headers, rows)
 
 
-def row_table(result: CheckResult) -> Table:
+def _rows(result: CheckResult) -> Table:
     """The worst rows."""
     rows: list[list[str | Text]] = [
         [
@@ -90,7 +85,7 @@ def row_table(result: CheckResult) -> Table:
             Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else ""),
             f"{row.allowed:.2e}",
             f"{row.mean:.1e}",
-            "" if row.frame is None else str(row.frame),
+            str(row.frame),
         ]
         for row in result.worst
     ]
@@ -126,12 +121,12 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
         lines = [("black", ":", 0.0, "rounding of the file, at most")]
         if unit.tolerance > 0:
             lines.append(("#555555", "--", unit.tolerance, f"rounding and tolerance of {result.tolerance:g}"))
-        for colour, style, more, label in lines:
+        for color, style, more, label in lines:
             level = [value + of_targets + more for value in rounding]
             if len(x) < 2:
-                axes.axhline(level[0], color=colour, linestyle=style, linewidth=1.0, label=label)
+                axes.axhline(level[0], color=color, linestyle=style, linewidth=1.0, label=label)
             else:
-                axes.plot(x, level, color=colour, linestyle=style, linewidth=1.0, label=label)
+                axes.plot(x, level, color=color, linestyle=style, linewidth=1.0, label=label)
         axes.set_ylabel(f"deviation / {unit.unit}")
         axes.legend(fontsize=8, loc="best")
     if result.temperature is not None:
@@ -145,8 +140,8 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     figure.savefig(path, dpi=150, format="png")
 
 
-def write(result: CheckResult, folder: Path, *, tables: Sequence[str] = ()) -> list[Path]:
-    """Put check.json, check.png and, if given, the tables as text into `folder`; the paths written.
+def write(result: CheckResult, folder: Path, *, text: str = "") -> list[Path]:
+    """Put check.json, check.png and, if given, the page as text into `folder`; the paths written.
 
     Raises
     ------
@@ -155,7 +150,7 @@ def write(result: CheckResult, folder: Path, *, tables: Sequence[str] = ()) -> l
     """
     picture = io.BytesIO()
     plot(result, picture)
-    return _put(folder, result.trajectory, result.to_dict(), picture.getvalue(), "\n".join(tables))
+    return _put(folder, result.trajectory, result.to_dict(), picture.getvalue(), text)
 
 
 def write_failure(trajectory: str | Path, reason: str, folder: Path) -> list[Path]:

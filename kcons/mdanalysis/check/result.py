@@ -1,4 +1,4 @@
-"""What a check of a trajectory found: plain data for tables, plots and files."""
+"""What a check of a trajectory says: plain data for tables, plots and files, from what was found in its frames."""
 
 from __future__ import annotations
 
@@ -6,9 +6,18 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraints.target import FloatArray
+from kcons.mdanalysis.check.deviations import UNITS, Found, RowTable
+from kcons.mdanalysis.check.endings import Break
+from kcons.mdanalysis.check.targets import AtomNames
 from kcons.thermostats.correlated_series import slope
+
+#: Boltzmann's constant in amu Å²/(ps² K).
+BOLTZMANN = 0.831446261815324
+#: Part of the kinetic energy that the center of mass may have where its motion is removed.
+STILL = 1e-2
 
 
 @dataclass(frozen=True)
@@ -88,8 +97,8 @@ class RowResult:
         Absolute deviation and what was allowed, in the frame where the first exceeds the second most.
     mean : float
         Over the frames.
-    frame : int or None
-        That frame, where this row exceeded more than the others; None where another did.
+    frame : int
+        That frame.
     """
 
     row: int
@@ -100,32 +109,7 @@ class RowResult:
     largest: float
     mean: float
     allowed: float
-    frame: int | None
-
-
-@dataclass(frozen=True)
-class Break:
-    """Where a trajectory cannot be read any further.
-
-    Attributes
-    ----------
-    frame : int
-        The first frame that cannot be used.
-    reason : str
-    ends : bool
-        Whether the file ends or is damaged there; else it can be read but its numbers are none.
-    """
-
     frame: int
-    reason: str
-    ends: bool = True
-
-    @property
-    def text(self) -> str:
-        """For a person."""
-        if self.ends:
-            return f"the file ends too early, at frame {self.frame}: {self.reason}"
-        return f"frame {self.frame} cannot be used, nor what follows: {self.reason}"
 
 
 @dataclass
@@ -190,3 +174,265 @@ class CheckResult:
     def to_dict(self) -> dict[str, Any]:
         """Plain data; NaN where a number does not exist."""
         return asdict(self)
+
+
+@dataclass
+class Asked:
+    """What a check was asked for.
+
+    Attributes
+    ----------
+    names : (str, str)
+        What to call trajectory and topology.
+    labels : AtomNames
+    mode : {'given', 'first', 'mean'}
+        Where targets come from.
+    targets : str
+        The same in words.
+    removed : int or None
+        Degrees of freedom that the MD engine took away; None to find them.
+    worst : int
+        Number of rows to name.
+    remarks, gaps : list of str
+        What there is to say besides, and what is known beforehand to be missing.
+    """
+
+    names: tuple[str, str]
+    labels: AtomNames
+    mode: str
+    targets: str
+    removed: int | None
+    worst: int
+    remarks: list[str] = field(default_factory=list)
+    gaps: list[str] = field(default_factory=list)
+
+
+def concluded(
+    found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, masses: FloatArray, n_in_file: int
+) -> CheckResult:
+    """All that there is to say of what was found.
+
+    Parameters
+    ----------
+    precision : str
+        What is said of the file's.
+    rank : int or None
+        Of the rows.
+    masses : ndarray, shape (n_atoms,)
+    n_in_file : int
+        Frames in the file.
+    """
+    margins, held, numbers = found.rows["margin"], table.set, found.frames["frame"]
+    times, remarks = np.array(found.frames["time"]), list(asked.remarks)
+    violated = margins > 0
+    order = np.lexsort((-np.where(violated, margins, found.rows["largest"]), ~violated))
+    worst = [_row(table, asked.labels, found, int(row)) for row in order[: max(asked.worst, 1)]]
+    # Targets that are nothing but rounding.
+    untold = table.measured & (table.of_targets > table.sizes)
+    gaps = asked.gaps + _gaps(found, table, untold, asked.targets)
+    units = [_unit(table, found, unit, untold, asked.mode) for unit in range(len(UNITS)) if (table.units == unit).any()]
+    bare = int(found.frames["bare"].sum())
+    if bare and (violated & (table.units == 0) & (found.rows["largest"] > table.sizes)).any():
+        some = "" if bare == len(numbers) else f"{bare} of {len(numbers)} "
+        remarks.append(
+            f"lengths are off by more than themselves, and {some}frames of {asked.names[0]} have no cell: molecules "
+            "cut by a face of one look like this. Give a format that has the cell (not XYZ), or whole molecules"
+        )
+    if alone := _first_alone(table, found):
+        remarks.append(alone)
+    frames = numbers[(found.units["excess"] > 0).any(axis=1)]
+    status = "tolerated" if (margins + table.tolerance * table.sizes > 0).any() else "kept"
+    status = "violated" if violated.any() else "incomplete" if gaps else status
+    columns = {"largest": found.units["largest"], "rms": found.rms, "rounding": found.units["rounding"]}
+    series = {
+        f"{name} {unit.unit}": values[:, UNITS.index(unit.unit)].tolist()
+        for unit in units
+        for name, values in columns.items()
+    }
+    freedom, temperature = None, None
+    if rank is not None:
+        freedom, kelvin = _temperatures(found, rank, masses, asked.removed, remarks)
+        if kelvin is not None:
+            series["temperature K"] = kelvin.tolist()
+            line = fitted(times, kelvin)
+            temperature = {
+                "mean": float(np.nanmean(kelvin)),
+                "deviation": float(np.nanstd(kelvin)),
+                "frames": float(np.isfinite(kelvin).sum()),
+                "slope": line.slope if line else float("nan"),
+                "slope_error": line.error if line else float("nan"),
+            }
+    return CheckResult(
+        trajectory=asked.names[0],
+        topology=asked.names[1],
+        n_atoms=held.n_atoms,
+        n_rows=held.n_rows,
+        n_constrained=len(held.touched),
+        status=status,
+        verdict=_verdict(status, table.tolerance, worst[0], units, int(violated.sum()), frames, len(numbers), gaps),
+        precision=precision,
+        tolerance=table.tolerance,
+        targets=asked.targets,
+        frames=numbers.tolist(),
+        times=times.tolist(),
+        n_frames_in_file=n_in_file,
+        units=units,
+        worst=worst[: asked.worst],
+        violated_rows=int(violated.sum()),
+        violated_frames=len(frames),
+        first_violated_frame=int(frames[0]) if len(frames) else None,
+        rank=rank,
+        degrees_of_freedom=freedom,
+        temperature=temperature,
+        broken=found.broken,
+        series=series,
+        gaps=gaps,
+        remarks=remarks,
+    )
+
+
+def _unit(table: RowTable, found: Found, unit: int, untold: NDArray[np.bool_], mode: str) -> UnitResult:
+    """All rows of a unit together."""
+    mine, seen = table.units == unit, found.units[:, unit]
+    n, n_seen = int(mine.sum()), max(float(seen["seen"].sum()), 1.0)
+    # The rounding of a mean averages out.
+    of_targets = table.of_targets if mode != "mean" else np.where(table.measured, 0.0, table.of_targets)
+    rounding = (table.spread * np.hypot(found.mean("rounded"), of_targets))[mine]
+    rates = seen[np.isfinite(seen["rate_squares"])]
+    return UnitResult(
+        unit=UNITS[unit],
+        n_rows=n,
+        largest=float(seen["largest"].max()),
+        rms=float(np.sqrt(seen["squares"].sum() / n_seen)),
+        mean=float(seen["sum"].sum() / n_seen),
+        bound=float(seen["rounding"].max() + np.where(untold, 0.0, table.of_targets)[mine].max()),
+        tolerance=float(table.tolerance * table.sizes[mine].min()),
+        rounding_rms=float(np.sqrt(np.mean(rounding**2))),
+        largest_mean=float(np.abs(found.mean("total"))[mine].max()),
+        drift=fitted(np.array(found.frames["time"]), found.rms[:, unit]),
+        rate_largest=float(rates["rate"].max()) if len(rates) else None,
+        rate_rms=float(np.sqrt(rates["rate_squares"].mean() / n)) if len(rates) else None,
+    )
+
+
+def _row(table: RowTable, labels: AtomNames, found: Found, row: int) -> RowResult:
+    """One row, by name."""
+    item, k = table.set.locate(row)
+    mine, atoms = found.rows[row], item.atoms[k]
+    return RowResult(
+        row=row,
+        name=f"{item.family} {labels.row(atoms)}",
+        atoms=[int(a) for a in atoms],
+        unit=UNITS[table.units[row]],
+        target=float(item.target_at(float(found.frames["time"][0]))[k] + table.means[row]),
+        largest=float(mine["largest"]),
+        mean=float(found.mean("total")[row]),
+        allowed=float(mine["largest"] - mine["margin"]),
+        frame=int(mine["frame"]),
+    )
+
+
+def _first_alone(table: RowTable, found: Found) -> str:
+    """What to say where the first frame alone differs; '' where it does not, or there are fewer than three.
+
+    Where targets come from it, all others are off; they agree if they differ among themselves by no more than rounding
+    and the tolerance, in the root mean square.
+    """
+    off = np.asarray((found.units["excess"] > 0).any(axis=1))
+    if len(off) < 3 or off[0] == off[1] or (off[1:] != off[1]).any():
+        return ""
+    spreads = []
+    for unit, name in enumerate(UNITS):
+        mine = table.units == unit
+        if off[1] and mine.any():
+            means = found.rows["total"][mine] / np.maximum(found.rows["counted"][mine] - 1, 1)
+            rms = float(np.sqrt(max(found.units["squares"][1:, unit].mean() - means @ means, 0.0) / mine.sum()))
+            if rms > found.units["rounding"][:, unit].max() + table.tolerance * table.sizes[mine].min():
+                return ""
+            spreads.append(f"{rms:.1e} {name}")
+    among = f": the others agree to {' and '.join(spreads)} (root mean square)" if spreads else ""
+    second = found.frames["frame"][1]
+    return (
+        f"the first frame alone differs{among}. Programs such as LAMMPS write it before they hold the constraints; "
+        f"begin at frame {second} (--frames {second}:)"
+    )
+
+
+def _verdict(
+    status: str,
+    tolerance: float,
+    row: RowResult,
+    units: list[UnitResult],
+    violated: int,
+    frames: NDArray[np.int64],
+    n_frames: int,
+    gaps: list[str],
+) -> str:
+    """The result in a sentence; `violated` rows, in `frames` of `n_frames`; `gaps`: what could not be told."""
+    most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in units)
+    if status == "incomplete":
+        return f"incomplete: {'; '.join(gaps)}; no violation otherwise in {n_frames} frames: largest deviation {most}"
+    if status == "kept":
+        return f"kept to the precision of the file: largest deviation {most}"
+    if status == "tolerated":
+        return f"kept to the tolerance of {tolerance:g}: largest deviation {most}"
+    return (
+        f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): {row.name} in "
+        f"frame {row.frame}; {violated} of {sum(unit.n_rows for unit in units)} rows; {len(frames)} of {n_frames} "
+        f"frames, from frame {frames[0]}"
+    )
+
+
+def _gaps(found: Found, table: RowTable, untold: NDArray[np.bool_], targets: str) -> list[str]:
+    """Why a check is no verdict on all that was asked; empty where it is."""
+    gaps = [] if found.broken is None else [found.broken.text]
+    n_rows, n_frames, measured = len(found.rows), len(found.frames), int(table.measured.sum())
+    if n_frames == 1 and measured:
+        which = "targets" if measured == n_rows else f"targets of {measured} of {n_rows} rows"
+        gaps.append(
+            f"{which} come from the only frame that was looked at, so that it cannot be off; look at more frames, or "
+            "take targets from the topology or a parameter file"
+        )
+    if untold.any():
+        gaps.append(
+            f"coordinates in {targets} are so large that their rounding exceeds the lengths of {untold.sum()} of "
+            f"{n_rows} rows: these have no targets; begin at another frame, or take targets from the topology or a "
+            "parameter file"
+        )
+    unseen = n_rows - found.units["seen"].sum(axis=1)
+    frames = np.flatnonzero(unseen > 0)
+    if len(frames):
+        gaps.append(
+            f"nothing can be told of up to {unseen.max():.0f} of {n_rows} rows in {len(frames)} of {n_frames} "
+            f"frames, from frame {found.frames['frame'][frames[0]]}: coordinates are so large that their rounding "
+            "exceeds the lengths, or atoms coincide"
+        )
+    return gaps
+
+
+def _temperatures(
+    found: Found, rank: int, masses: FloatArray, removed: int | None, remarks: list[str]
+) -> tuple[int, FloatArray | None]:
+    """Degrees of freedom, and temperatures in K by frame where there are velocities and masses; remarks are added.
+
+    Parameters
+    ----------
+    removed : int, optional
+        Degrees of freedom that the engine took away; found from the total momentum by default.
+    """
+    freedom = 3 * int(np.count_nonzero(masses > 0)) - rank
+    twice = np.array(found.frames["kinetic"])
+    has = np.isfinite(twice)
+    if not has.any():
+        return max(freedom - (removed or 0), 0), None
+    if removed is None:
+        center = (found.frames["momentum"][has] ** 2).sum(axis=1) / masses.sum()
+        still = float(center.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
+        removed = 3 if still and freedom > 3 else 0
+        what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
+        remarks.append(f"the center of mass is {what}")
+    freedom -= removed
+    if freedom <= 0:
+        remarks.append("no temperature: the constraints leave no degree of freedom")
+        return 0, None
+    return freedom, twice / (BOLTZMANN * freedom)

@@ -21,8 +21,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.mdanalysis.loading import format_named, format_of
 
-#: Formats whose numbers are floats in nanometres, which MDAnalysis turns into angstrom, in single precision again.
-_NANOMETRES = {"TRR", "H5MD", "TNG"}
+#: Formats whose numbers are floats in nanometers, which MDAnalysis turns into angstrom, in single precision again.
+_NANOMETERS = {"TRR", "H5MD", "TNG"}
 #: Decimals in angstrom of text formats that fix them.
 _DECIMALS = {"PDB": 3, "ENT": 3, "PDBQT": 3, "XPDB": 3, "PQR": 3, "TRJ": 3, "MDCRD": 3, "CRDBOX": 3, "CRD": 5}
 #: Magic numbers of XTC; files of the second hold more than 2^31 bytes a frame.
@@ -33,7 +33,7 @@ MOST_READ = 1000
 GRIDS = (0.1, 0.01, 0.001, 0.0001)
 #: Logarithm of the chance, at most, that numbers which were not rounded lie on such a grid.
 BY_CHANCE = -30.0
-#: Half the distance of neighbouring single precision numbers is at most this part of the power of two below them.
+#: Half the distance of neighboring single precision numbers is at most this part of the power of two below them.
 HALF_UNIT = 2.0**-24
 
 
@@ -46,7 +46,7 @@ class FilePrecision:
     format : str
         As MDAnalysis names it.
     step : float
-        Distance of neighbouring numbers that the file can hold; 0 if they are floats.
+        Distance of neighboring numbers that the file can hold; 0 if they are floats.
     unit : float
         Unit of the floats in angstrom.
     exact : bool
@@ -70,36 +70,33 @@ class FilePrecision:
         return self.step if self.exact else 0.0
 
     @property
-    def reach(self) -> float:
-        """Coordinates from this one on, in angstrom, are not told by the step alone: single precision counts.
-
-        Integers of XTC are turned into nanometres, and these into angstrom, with four roundings; they can be had back
-        where these make less than half a step.
-        """
-        return self.step / (8 * HALF_UNIT) if self.exact else 0.0
-
-    def coefficients(self, farthest: float) -> tuple[float, float]:
-        """Error by rounding: at most base + factor 2^e, with 2^e <= |x| < 2^(e+1) for an atom's largest coordinate.
-
-        Parameters
-        ----------
-        farthest : float
-            No coordinate of the frame is larger, in angstrom.
+    def coefficients(self) -> tuple[float, float, float]:
+        """How far rounding moves coordinates: by base at most, and by base + factor 2^e of atoms from reach on.
 
         Returns
         -------
-        base, factor : float
+        base, factor, reach : float
+            2^e <= |x| < 2^(e+1) for an atom's largest coordinate; reach is a power of two, or 0.
+
+        Notes
+        -----
+        Integers of XTC are turned into nanometers, and these into angstrom, with four roundings; they can be had back
+        where these make less than half a step. Where they cannot, the one taken for it is off by twice the four.
         """
         if self.exact:
-            # Where a number of the grid cannot be had back, the one taken for it is off by twice the four roundings.
-            return 0.5 * self.step, 0.0 if farthest < self.reach else 16 * HALF_UNIT
+            return 0.5 * self.step, 16 * HALF_UNIT, 2.0 ** np.floor(np.log2(self.step / (8 * HALF_UNIT)))
         if self.digits:
             # The last digit is worth 10^(1 - digits) of the number, at most, and numbers are below 2 2^e.
             part = 10.0 ** (1 - self.digits)
-            return 0.5 * part * self.shift, part + 3 * HALF_UNIT
-        # Rounded once, as stored; then, of decimals or nanometres, by the change to angstrom, where 2^e may be twice
+            return 0.5 * part * self.shift, part + 3 * HALF_UNIT, 0.0
+        # Rounded once, as stored; then, of decimals or nanometers, by the change to angstrom, where 2^e may be twice
         # that of the number stored.
-        return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT
+        return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT, 0.0
+
+    def stored(self, coordinates: ArrayLike) -> FloatArray:
+        """Coordinates in double precision, as the file holds them."""
+        exact = np.asarray(coordinates, dtype=np.float64)
+        return np.rint(exact * (1.0 / self.grid)) * self.grid if self.grid > 0 else exact
 
     def half_step(self, coordinates: ArrayLike) -> FloatArray:
         """Largest error by rounding of the coordinates of atoms; infinite where there are no numbers.
@@ -114,26 +111,12 @@ class FilePrecision:
         ndarray, shape (...)
         """
         size = np.abs(np.asarray(coordinates, dtype=np.float64)).max(axis=-1)
-        base, factor = self.coefficients(float(size.max(initial=0.0)))
+        base, factor, reach = self.coefficients
         with np.errstate(all="ignore"):
             below = np.where(size > 0, np.ldexp(1.0, np.frexp(size)[1] - 1), 0.0)
+            below = np.where(below < reach, 0.0, below)
         result: FloatArray = np.where(np.isfinite(size), base + factor * below, np.inf)
         return result
-
-    def describe(self, largest: float) -> str:
-        """One sentence for a person, for a frame whose largest coordinate is `largest`."""
-        if self.step > 0:
-            return f"{self.format} stores coordinates in steps of {self.step:.3g} Å ({self.step / 10:.3g} nm)"
-        step = 2 * float(self.half_step([largest]))
-        if self.digits:
-            return (
-                f"{self.format} stores {self.digits} digits of coordinates: steps of up to {step:.1e} Å where "
-                f"coordinates reach {largest:.0f} Å"
-            )
-        return (
-            f"{self.format} stores coordinates in single precision: steps of {step:.1e} Å where coordinates reach "
-            f"{largest:.0f} Å"
-        )
 
 
 def precision_of(path: str | Path, file_format: str, step: float | None = None) -> FilePrecision:
@@ -159,17 +142,15 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
         return FilePrecision(name, float(step))
     if name == "XTC":
         with open(path, "rb") as file:
-            per_nanometre = _xtc_precision(file)
-        return (
-            FilePrecision(name, 10.0 / per_nanometre, exact=True) if per_nanometre else FilePrecision(name, unit=10.0)
-        )
+            steps = _xtc_precision(file)
+        return FilePrecision(name, 10.0 / steps, exact=True) if steps else FilePrecision(name, unit=10.0)
     if name == "GRO":
         return FilePrecision(name, 10.0 * 10.0 ** -_gro_decimals(path))
     if name in _DECIMALS:
         return FilePrecision(name, 10.0 ** -_DECIMALS[name])
     if name in ("XYZ", "LAMMPSDUMP"):
         return _of_xyz(path) if name == "XYZ" else _of_dump(path)
-    return FilePrecision(name, unit=10.0 if name in _NANOMETRES else 1.0)
+    return FilePrecision(name, unit=10.0 if name in _NANOMETERS else 1.0)
 
 
 def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision:
@@ -195,26 +176,21 @@ def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision
     return replace(found, exact=False) if changed else found
 
 
-def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:
-    """Precision of frames, whose largest coordinates are `reach` or NaN, in a sentence; that of a usual frame."""
-    steps = {one.step for one in precisions}
+def described(precisions: Sequence[FilePrecision], largest: float) -> str:
+    """Precision of frames in a sentence for a person; `largest` is the largest coordinate of a usual one."""
+    usual, steps = precisions[0], {one.step for one in precisions}
     if len(steps) > 1:
-        return f"{precisions[0].format} stores coordinates in steps of {min(steps):.3g} to {max(steps):.3g} Å, by frame"
-    known = reach[np.isfinite(reach)]
-    return precisions[0].describe(float(np.median(known)) if len(known) else 0.0)
+        return f"{usual.format} stores coordinates in steps of {min(steps):.3g} to {max(steps):.3g} Å, by frame"
+    if usual.step > 0:
+        return f"{usual.format} stores coordinates in steps of {usual.step:.3g} Å ({usual.step / 10:.3g} nm)"
+    step = f"{2 * float(usual.half_step([largest])):.1e} Å where coordinates reach {largest:.0f} Å"
+    if usual.digits:
+        return f"{usual.format} stores {usual.digits} digits of coordinates: steps of up to {step}"
+    return f"{usual.format} stores coordinates in single precision: steps of {step}"
 
 
 def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:
-    """Precision of each frame of an XTC file that was put together from several; None where all have the usual one.
-
-    Parameters
-    ----------
-    path : path
-    offsets : sequence of int
-        Where frames begin.
-    usual : FilePrecision
-        Of the first one.
-    """
+    """Precision of each frame, by where it begins, of an XTC file put together from several; None if all are alike."""
     with open(path, "rb") as file:
         found = [_xtc_precision(file, int(offset)) for offset in offsets]
     if len(set(found)) < 2:
@@ -224,18 +200,13 @@ def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> 
 
 
 def _xtc_precision(file: BinaryIO, offset: int = 0) -> float:
-    """Steps in a nanometre, from a frame; 1000 is usual. 0 for floats, as which up to 9 atoms are stored."""
+    """Steps in a nanometer, from a frame; 1000 is usual. 0 for floats, as which up to 9 atoms are stored."""
     file.seek(offset)
     head = file.read(60)
-    if len(head) < 60:
-        return 1000.0
-    magic, n_atoms = struct.unpack(">2i", head[:8])
-    precision = struct.unpack(">f", head[56:60])[0]
+    magic, n_atoms, precision = struct.unpack(">2i48xf", head) if len(head) == 60 else (0, 10, 0.0)
     if n_atoms <= 9:
         return 0.0
-    if magic not in XTC_MAGIC or not 1 <= precision < 1e8:
-        return 1000.0
-    return float(precision)
+    return float(precision) if magic in XTC_MAGIC and 1 <= precision < 1e8 else 1000.0
 
 
 def grid_of(coordinates: ArrayLike) -> float:
@@ -246,7 +217,7 @@ def grid_of(coordinates: ArrayLike) -> float:
     """
     x = np.abs(np.asarray(coordinates, dtype=np.float64).ravel())
     x = x[x > 0]
-    # Of integers of XTC through nanometres to angstrom, and of one format to the next: a rounding each.
+    # Of integers of XTC through nanometers to angstrom, and of one format to the next: a rounding each.
     error = 8 * HALF_UNIT * np.ldexp(1.0, np.frexp(x)[1] - 1)
     for step in GRIDS:
         if (_off_grid(x, step) <= error).all():
@@ -260,16 +231,11 @@ def _off_grid(x: FloatArray, step: float) -> FloatArray:
     return result
 
 
-def _third_line(path: str | Path) -> str:
-    """Of a text file, compressed or not."""
-    with anyopen(str(path), "rb") as file:
-        lines: list[bytes] = [file.readline() for _ in range(3)]
-    return lines[2].decode("ascii", "replace")
-
-
 def _gro_decimals(path: str | Path) -> int:
-    """Columns are n + 5 wide for n decimals, so that two points are n + 5 apart."""
-    points = [k for k, c in enumerate(_third_line(path)) if c == "."]
+    """Columns are n + 5 wide for n decimals, so that two points of the third line are n + 5 apart."""
+    with anyopen(str(path), "rb") as file:
+        line: bytes = [file.readline() for _ in range(3)][2]
+    points = [k for k, c in enumerate(line) if c == ord(".")]
     return points[1] - points[0] - 5 if len(points) > 1 else 3
 
 

@@ -1,5 +1,6 @@
 """Every file that can be wrong: what was readable is analysed, and messages name file, item and remedy."""
 
+import importlib
 import struct
 import warnings
 
@@ -10,7 +11,7 @@ from water_files import mda
 
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnreadableError
-from kcons.mdanalysis import ConstraintCheck, load_trajectory
+from kcons.mdanalysis import ConstraintCheck
 
 N = 30
 
@@ -21,14 +22,13 @@ def x():
 
 
 def checked(path, **run):
-    made = files.universe(N)
-    load_trajectory(made, path)
-    return ConstraintCheck(made, Distance(files.pairs(N), files.targets(N))).run(**run).check
+    return files.checked(path, N, run=run)
 
 
-def cut(path, new, bytes_left):
-    data = path.read_bytes()
-    new.write_bytes(data[:bytes_left] if bytes_left > 0 else data[: len(data) + bytes_left])
+def cut(path, lost):
+    """The file without its last bytes."""
+    new = path.with_name(f"cut{path.suffix}")
+    new.write_bytes(path.read_bytes()[:-lost])
     return new
 
 
@@ -36,7 +36,7 @@ def cut(path, new, bytes_left):
 def test_a_truncated_file_is_analysed_up_to_the_break(tmp_path, x, ending, lost):
     whole = files.write(tmp_path / f"whole.{ending}", files.whole(x))
     assert checked(whole).broken is None
-    path = cut(whole, tmp_path / f"cut.{ending}", -lost)
+    path = cut(whole, lost)
     result = checked(path)
     assert result.frames == list(range(7))
     assert result.broken is not None and result.broken.frame == 7 and result.broken.reason
@@ -44,22 +44,15 @@ def test_a_truncated_file_is_analysed_up_to_the_break(tmp_path, x, ending, lost)
     np.testing.assert_array_equal(result.series["largest Å"], checked(whole).series["largest Å"][:7])
 
 
-@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr"])
+@pytest.mark.parametrize("ending", ["xtc", "trr"])
 def test_garbage_in_the_middle(tmp_path, x, ending):
-    whole = files.write(tmp_path / f"whole.{ending}", x)
-    data = bytearray(whole.read_bytes())
-    # Over the beginning of the fifth frame.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        reader = mda.coordinates.core.reader(str(whole))
-    start = int(reader._xdr.offsets[4]) if ending != "dcd" else len(data) - 4 * (56 + 3 * (8 + 12 * N))
-    reader.close()
+    path = files.write(tmp_path / f"w.{ending}", x)
+    data = bytearray(path.read_bytes())
+    start = int(files.loaded(path, N).trajectory._xdr.offsets[4])
     data[start : start + 40] = b"\x7f" * 40
-    path = tmp_path / f"bad.{ending}"
-    path.write_bytes(bytes(data))
-    result = checked(path)
-    assert result.broken is not None and result.broken.frame == len(result.frames) <= 4
-    assert len(result.frames) >= 3
+    (tmp_path / f"bad.{ending}").write_bytes(bytes(data))
+    result = checked(tmp_path / f"bad.{ending}")
+    assert result.broken is not None and result.broken.frame == len(result.frames) and 3 <= len(result.frames) <= 4
 
 
 TEXTS = ["mdcrd", "arc", "lammpsdump"]
@@ -121,7 +114,7 @@ def test_a_header_that_announces_more_frames(tmp_path, x):
     """Cut between two frames: nothing but the header of DCD tells."""
     path = files.write(tmp_path / "w.dcd", x)
     size = 56 + 3 * (8 + 12 * N)
-    result = checked(cut(path, tmp_path / "c.dcd", -2 * size))
+    result = checked(cut(path, 2 * size))
     assert result.status == "incomplete" and len(result.frames) == 6
     assert "its header announces 8 frames, and it has 6" in result.verdict
     data = bytearray(path.read_bytes())
@@ -130,14 +123,67 @@ def test_a_header_that_announces_more_frames(tmp_path, x):
     assert checked(path).status == "kept"
 
 
-@pytest.mark.parametrize("compressed", ["gz", "bz2"])
-def test_compressed_files(tmp_path, x, compressed):
-    import bz2
-    import gzip
+def dcd(x, order="<", cell=(12.0, 90.0, 12.0, 90.0, 90.0, 12.0), fixed=0):
+    """The bytes of a DCD file: X-PLOR's kind without a cell, CHARMM's with one or with the first atoms fixed."""
+    words = [len(x), 0, 1, len(x), 0, 0, 0, 0, fixed]
+    head = struct.pack(order + "9i", *words)
+    head += (
+        struct.pack(order + "f10i", 1.0, int(cell is not None), *[0] * 8, 24)
+        if cell is not None or fixed
+        else struct.pack(order + "d36x", 1.0)
+    )
+    records = [b"CORD" + head, struct.pack(order + "i", 1) + b" " * 80, struct.pack(order + "i", x.shape[1])]
+    if fixed:
+        records.append(np.arange(fixed + 1, x.shape[1] + 1).astype(order + "i4").tobytes())
+    for k, frame in enumerate(x):
+        if cell is not None:
+            records.append(np.array(cell).astype(order + "f8").tobytes())
+        records += [column[fixed if k else 0 :].astype(order + "f4").tobytes() for column in frame.T]
+    return b"".join(struct.pack(order + "i", len(r)) + r + struct.pack(order + "i", len(r)) for r in records)
 
+
+KINDS = {
+    "CHARMM": {},
+    "other order of bytes": {"order": ">"},
+    "X-PLOR": {"cell": None},
+    "fixed atoms": {"fixed": 3},
+    "fixed atoms, no cell": {"fixed": 6, "cell": None},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_records_of_all_kinds_of_dcd(tmp_path, x, kind):
+    """Whole files have an end; a length of a record that is wrong, anywhere in a frame, ends what can be used."""
+    y, options = files.whole(x), KINDS[kind]
+    y[:, : options.get("fixed", 0)] = y[0, : options.get("fixed", 0)]
+    path, data = tmp_path / "w.dcd", bytearray(dcd(y, **options))
+    path.write_bytes(data)
+    assert checked(path).status == "kept" and len(checked(path).frames) == 8
+    size = 4 * 3 * (3 * N - options.get("fixed", 0)) + 8 * 3
+    size += 56 if options.get("cell", 1) else 0
+    for back in (3, 2):
+        path.write_bytes(data[: len(data) - back * size + 4])
+        result = checked(path)
+        assert result.broken.frame == 8 - back and result.status == "incomplete" and "4 bytes follow" in result.verdict
+    marks, place, begin = [], 0, len(data) - 3 * size
+    while place < size:
+        length = struct.unpack_from(options.get("order", "<") + "i", data, begin + place)[0]
+        marks += [place, place + 4 + length]
+        place += length + 8
+    assert place == size and len(marks) == (8 if options.get("cell", 1) else 6)
+    for mark in marks:
+        wrong = data.copy()
+        wrong[begin + mark : begin + mark + 4] = b"\x7f\x00\x00\x7f"
+        path.write_bytes(wrong)
+        result = checked(path)
+        assert result.broken.frame == 5 == len(result.frames) and result.status == "incomplete", mark
+
+
+@pytest.mark.parametrize("compressed", ["gzip", "bz2"])
+def test_compressed_files(tmp_path, x, compressed):
     path = files.write(tmp_path / "w.xyz", files.whole(x), side=None)
-    packed = {"gz": gzip, "bz2": bz2}[compressed].compress(path.read_bytes())
-    other = tmp_path / f"w.xyz.{compressed}"
+    packed = importlib.import_module(compressed).compress(path.read_bytes())
+    other = tmp_path / f"w.xyz.{compressed.removesuffix('ip')}"
     other.write_bytes(packed)
     one, two = checked(path), checked(other)
     assert one.status == two.status == "kept" and one.precision == two.precision
@@ -147,7 +193,7 @@ def test_compressed_files(tmp_path, x, compressed):
 
 
 def test_a_break_in_the_part_of_one_worker(tmp_path, x):
-    path = cut(files.write(tmp_path / "whole.xtc", x), tmp_path / "cut.xtc", -300)
+    path = cut(files.write(tmp_path / "whole.xtc", x), 300)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         result = checked(path, backend="multiprocessing", n_workers=2)
@@ -315,24 +361,16 @@ def test_a_frame_with_another_number_of_atoms(tmp_path, x, ending, wrong):
     make = files.write if ending == "xyz" else files.write_text
     options = {"side": None} if ending == "xyz" else {}
     path = make(tmp_path / f"w.{ending}", files.whole(x), **options)
-    text = path.read_text()
-    size = len(text.splitlines()) // 8
-    lines = text.splitlines()
-    at = 3 * size + {"xyz": 0, "arc": 0, "lammpsdump": 3}[ending]  # where the fourth frame says how many atoms it has
+    lines = path.read_text().splitlines()
+    size = len(lines) // 8
+    at = 3 * size + (3 if ending == "lammpsdump" else 0)  # where the fourth frame says how many atoms it has
     first = 3 * size + size - 3 * N  # its first atom
-    if wrong == "fewer":
-        lines[at] = lines[at].replace("90", "89")
-        del lines[first]
-    elif wrong == "more":
-        lines[at] = lines[at].replace("90", "91")
-        lines.insert(first, lines[first])
-    elif wrong == "two frames more":
-        lines[at] = lines[at].replace("90", str(90 + 2 * size))
-        lines[first:first] = 2 * size * [lines[first]]
-    elif wrong == "says fewer":
-        lines[at] = lines[at].replace("90", "89")
-    else:
+    says, more = {"fewer": (89, -1), "more": (91, 1), "two frames more": (90 + 2 * size, 2 * size)}.get(wrong, (89, 0))
+    if wrong == "an empty line":
         lines.insert(3 * size, "")
+    else:
+        lines[at] = lines[at].replace("90", str(says))
+        lines[first : first + max(-more, 0)] = max(more, 0) * [lines[first]]
     path.write_text("\n".join(lines) + "\n")
     result = checked(path)
     assert result.status == "incomplete" and result.frames == [0, 1, 2] and result.broken.frame == 3

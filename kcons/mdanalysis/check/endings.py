@@ -1,0 +1,232 @@
+"""Where a trajectory ends: whole frames, and what lies behind them.
+
+MDAnalysis does not tell: it counts the whole frames of DCD and of text formats, and those of XTC and TRR up to the
+first that it does not recognize. Of formats of structures, such as GRO, it reads one frame.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from MDAnalysis.coordinates.DCD import DCDReader
+from MDAnalysis.lib.util import anyopen
+
+from kcons.errors import NonFiniteError
+from kcons.mdanalysis.loading import READ_ERRORS, format_of
+
+
+@dataclass(frozen=True)
+class Break:
+    """Where a trajectory cannot be read any further.
+
+    Attributes
+    ----------
+    frame : int
+        The first frame that cannot be used.
+    reason : str
+    ends : bool
+        Whether the file ends or is damaged there; else it can be read but its numbers are none.
+    """
+
+    frame: int
+    reason: str
+    ends: bool = True
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        if self.ends:
+            return f"the file ends too early, at frame {self.frame}: {self.reason}"
+        return f"frame {self.frame} cannot be used, nor what follows: {self.reason}"
+
+
+def broken_by(error: BaseException, reader: Any, frame: int) -> Break:
+    """Where and why a trajectory cannot be read further; what the reader says, which iteration hides."""
+    if isinstance(error, StopIteration):
+        try:
+            reader[frame]
+        except READ_ERRORS as hidden:
+            error = hidden
+    lines = str(error).strip().splitlines()
+    return Break(frame, lines[0].strip() if lines else "the file ends", not isinstance(error, NonFiniteError))
+
+
+def ending_of(reader: Any) -> Break | None:
+    """What keeps the last frame from being read, or lies behind it; None if nothing does."""
+    return _first(reader, _ending)
+
+
+def damage_of(reader: Any) -> Break | None:
+    """The first frame of a DCD file whose records are not where they must be; of a text file the first whose lines are
+    not all there, to their ends, or that has another number of atoms. None where there is no such frame, and for other
+    formats.
+
+    The reader does not look: it takes what it finds for coordinates.
+    """
+    return _first(reader, _damage)
+
+
+def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:
+    """What is found first; in a chain of files, frames are counted from its beginning."""
+    parts, begin = getattr(reader, "readers", None) or [reader], 0
+    for part in parts:
+        path = str(getattr(part, "filename", None) or "")
+        found = look(part, path) if os.path.isfile(path) else None
+        if found is not None:
+            where = f"{path}: " if len(parts) > 1 else ""
+            return replace(found, frame=begin + found.frame, reason=where + found.reason)
+        begin += part.n_frames
+    return None
+
+
+def _ending(reader: Any, path: str) -> Break | None:
+    name, n, size = format_of(reader), reader.n_frames, os.path.getsize(path)
+    try:
+        reader[n - 1]
+    except READ_ERRORS as error:
+        return broken_by(error, reader, n - 1)
+    if isinstance(reader, DCDReader):
+        file = reader._file
+        end = file._header_size + file._firstframesize + (n - 1) * file._framesize
+        with open(path, "rb") as opened:
+            announced = np.frombuffer(opened.read(12), _order(path) + "i4")[2]
+        if end >= size and announced > n:
+            return Break(n, f"its header announces {announced} frames, and it has {n}")
+    elif name in ("XTC", "TRR"):
+        end = reader._xdr._bytes_tell()
+    elif more := _behind_the_only_frame(path, name, reader.n_atoms):
+        return Break(
+            1,
+            f"MDAnalysis reads one frame of {name} files, and {more}; write the frames as XTC, DCD or PDB",
+            ends=False,
+        )
+    else:
+        return None
+    return Break(n, f"{size - end} bytes follow the last whole frame") if end < size else None
+
+
+def _damage(reader: Any, path: str) -> Break | None:
+    if not isinstance(reader, DCDReader):
+        try:
+            return _text_break(path, format_of(reader), reader.n_atoms)
+        except (OSError, EOFError):
+            return None
+    # Of all frames but the first, which has coordinates of fixed atoms too.
+    file = reader._file
+    cell = [48] * file.is_periodic
+    records = np.array(cell + [(file._framesize - 56 * len(cell)) // file.ndims - 8] * file.ndims)
+    begin = file._header_size + file._firstframesize
+    n_frames = min(reader.n_frames - 1, (os.path.getsize(path) - begin) // file._framesize)
+    if n_frames < 1 or (records + 8).sum() != file._framesize:
+        return None
+    words = np.memmap(path, _order(path) + "i4", "r", begin, (n_frames, file._framesize // 4))
+    # Records are framed by their lengths.
+    ends = np.cumsum(records + 8)
+    wrong = (words[:, (ends - records - 8) // 4] != records) | (words[:, ends // 4 - 1] != records)
+    return Break(1 + int(np.argmax(wrong.any(axis=1))), "its records are damaged") if wrong.any() else None
+
+
+def _order(path: str) -> str:
+    """Of the bytes of a DCD file."""
+    with open(path, "rb") as file:
+        return "<" if struct.unpack("<i", file.read(4))[0] in (84, 164) else ">"
+
+
+def _behind_the_only_frame(path: str | Path, file_format: str, n_atoms: int) -> str:
+    """What lies behind the frame of a format of which MDAnalysis reads one; '' if nothing does."""
+    if file_format == "CIF":
+        import gemmi
+
+        of_atoms = [block.find_values("_atom_site.pdbx_PDB_model_num") for block in gemmi.cif.read(str(path))]
+        models = sum(len(set(numbers)) for numbers in of_atoms)
+        return f"this one has {models}" if models > 1 else ""
+    if file_format == "COOR":
+        more = os.path.getsize(path) - 4 - 24 * n_atoms
+        return f"{more} bytes follow it" if more > 0 else ""
+    if file_format not in ("GRO", "INPCRD", "CONFIG", "PQR", "PDBQT"):
+        return ""
+    lines = atoms = models = 0
+    with anyopen(str(path), "rb") as file:
+        for number, line in enumerate(file, 1):
+            lines = number if line.strip() else lines
+            atoms += line.startswith((b"ATOM", b"HETATM"))
+            models += line.startswith(b"MODEL")
+    if file_format in ("PQR", "PDBQT"):
+        if models > 1:
+            return f"this one has {models}"
+        return f"{atoms - n_atoms} atoms follow it" if atoms > n_atoms else ""
+    # At most: title, number of atoms and a cell; of INPCRD two atoms a line, with velocities.
+    most = {"GRO": n_atoms + 3, "INPCRD": 3 + 2 * ((n_atoms + 1) // 2)}.get(file_format)
+    if most is None:
+        most = 5 + n_atoms * (2 + int(_line(path, 1).split()[0]))
+    return f"{lines - most} lines follow it" if lines > most else ""
+
+
+def _text_break(path: str | Path, file_format: str, n_atoms: int) -> Break | None:
+    """Where the whole frames of a text format end whose frames have equal numbers of lines; None for other formats.
+
+    Of PDB, whose frames may differ, only a last line without an end is seen.
+    """
+    if file_format == "PDB":
+        return _pdb_break(path)
+    if file_format not in ("XYZ", "LAMMPSDUMP", "TXYZ", "TRJ"):
+        return None
+    # Lines of a title; those of a frame besides its atoms, and which of them says how many atoms there are.
+    title, more, count = {"XYZ": (0, 2, 0), "LAMMPSDUMP": (0, 9, 3), "TXYZ": (0, 1, 0), "TRJ": (1, 0, -1)}[file_format]
+    per_frame = n_atoms + more
+    if file_format == "TRJ":
+        # Ten numbers a line; a line of three for the cell may follow.
+        per_frame = -(-3 * n_atoms // 10)
+        per_frame += _all_numbers(_line(path, 1 + per_frame), 3)
+    elif file_format == "TXYZ":
+        # Six numbers of the cell may follow the number of atoms.
+        per_frame += _all_numbers(_line(path, 1), 6)
+    lines, blank, line, wrong = -title, 0, b"", None
+    with anyopen(str(path), "rb") as file:
+        for line in file:
+            blank = 0 if line.strip() else blank + 1
+            if count >= 0 and lines % per_frame == count and wrong is None and line.endswith(b"\n"):
+                word = next(iter(line.split()), b"")
+                if not (word.isdigit() and int(word) == n_atoms):
+                    wrong = lines // per_frame, line
+            # Empty lines at the end are no frame.
+            if wrong is not None and not blank:
+                said = wrong[1].decode(errors="replace").strip()
+                return Break(
+                    wrong[0], f"it has {said!r:.40} where its number of atoms has to be, {n_atoms}", ends=False
+                )
+            lines += 1
+    lines -= blank
+    whole = (lines - (not line.endswith(b"\n"))) // per_frame
+    more = lines - whole * per_frame
+    return Break(whole, f"{more} lines follow the last whole frame") if more > 0 else None
+
+
+def _pdb_break(path: str | Path) -> Break | None:
+    models, line = 0, b""
+    with anyopen(str(path), "rb") as file:
+        for line in file:
+            models += line.startswith(b"MODEL")
+    if line.startswith((b"ATOM", b"HETATM")) and not line.endswith(b"\n"):
+        return Break(max(models, 1) - 1, "its last line has no end")
+    return None
+
+
+def _line(path: str | Path, number: int) -> bytes:
+    """A line of a text file, counted from 0; b'' behind its end."""
+    with anyopen(str(path), "rb") as file:
+        found: bytes = next(islice(file, number, None), b"")
+    return found
+
+
+def _all_numbers(line: bytes, n: int) -> bool:
+    """Whether a line consists of n numbers with points."""
+    words = line.split()
+    return len(words) == n and all(b"." in word for word in words)

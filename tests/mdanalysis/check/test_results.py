@@ -1,0 +1,227 @@
+"""What a check says: temperatures, drifts, plain data, pictures and files, and what these do not overwrite."""
+
+import json
+
+import MDAnalysis as mda
+import numpy as np
+import pytest
+import water_files as files
+
+from kcons.constraints import CenterOfMass, Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import InputError, OccupiedError
+from kcons.mdanalysis import ConstraintCheck, check_trajectory, to_ase
+from kcons.mdanalysis.check import report
+from kcons.mdanalysis.check.result import fitted
+from kcons.motion import Motion
+
+N, SIDE = 40, 12.0
+
+
+# -- temperatures -----------------------------------------------------------------------------------
+
+
+def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
+    """Velocities drawn for rigid water: the mean over many molecules is the temperature, by 6 a molecule."""
+    n, frames = 300, 8
+    x = files.water(n, frames, side=40.0, seed=5)
+    masses = np.tile([15.999, 1.008, 1.008], n)
+    rng = np.random.default_rng(6)
+    v = np.zeros_like(x)
+    for k in range(frames):
+        held = ConstraintSet(Distance(files.pairs(n), files.targets(n)), x[k], masses, cell=[40.0] * 3)
+        drawn = rng.normal(size=(3 * n, 3)) * np.sqrt(0.831446 * 300 / masses)[:, None]
+        v[k] = Motion(held, x[k]).project_velocities(x[k], drawn)
+        v[k] -= masses @ v[k] / masses.sum()
+    path = files.write(tmp_path / "t.trr", x, side=40.0, velocities=v)
+    result = files.checked(path, n)
+    assert result.rank == 3 * n
+    assert result.degrees_of_freedom == 6 * n - 3
+    expected = np.einsum("i,kij->k", masses, v**2) / (0.831446261815324 * (6 * n - 3))
+    np.testing.assert_allclose(result.series["temperature K"], expected, rtol=1e-6)
+    assert result.temperature is not None
+    assert abs(result.temperature["mean"] - 300) < 4 * 300 * np.sqrt(2 / (6 * n * frames))
+    # Tangent velocities leave A v at what rounding makes of directions; radial ones do not.
+    directions = 2 * np.spacing(np.float32(40.0)) / files.OH
+    assert result.units[0].rate_largest is not None and result.units[0].rate_largest < 2 * np.abs(v).max() * directions
+    v[2, 1] += 0.5
+    path = files.write(tmp_path / "r.trr", x, side=40.0, velocities=v)
+    moved = files.checked(path, n)
+    assert moved.units[0].rate_largest is not None and moved.units[0].rate_largest > 0.1
+
+
+def test_a_moving_centre_of_mass_counts(tmp_path):
+    x = files.water(N, 3)
+    rng = np.random.default_rng(1)
+    v = rng.normal(size=x.shape) + 3.0
+    path = files.write(tmp_path / "m.trr", x, velocities=v)
+    assert files.checked(path, N).degrees_of_freedom == 6 * N
+    assert files.checked(path, N, removed=3).degrees_of_freedom == 6 * N - 3
+
+
+def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
+    x = files.water(N, 3)
+    path = files.write(tmp_path / "m.trr", x, velocities=np.ones_like(x))
+    result = files.checked(path, N, masses=False)
+    assert result.rank == 3 * N and result.temperature is None
+    assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
+    with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
+        files.checked(path, N, CenterOfMass([0, 1, 2]), masses=False)
+
+
+def test_sites_of_water_do_not_count(tmp_path):
+    """MDAnalysis takes EPW for phosphorus; as a mass it would be most of the kinetic energy."""
+    x = files.water(N, 3, side=SIDE)
+    four = np.concatenate([x.reshape(3, N, 3, 3), x.reshape(3, N, 3, 3)[:, :, :1]], axis=2).reshape(3, 4 * N, 3)
+    v = np.random.default_rng(1).normal(size=four.shape)
+    pairs = (4 * np.arange(N)[:, None, None] + [[0, 1], [0, 2], [1, 2]]).reshape(-1, 2)
+    found = []
+    for masses in ([15.999, 1.008, 1.008, 0.0], None):
+        universe = mda.Universe.empty(
+            4 * N, n_residues=N, atom_resindex=np.repeat(np.arange(N), 4), trajectory=True, velocities=True
+        )
+        universe.add_TopologyAttr("names", ["O", "H1", "H2", "EPW"] * N)
+        universe.add_TopologyAttr("resnames", ["WAT"] * N)
+        if masses is None:
+            universe.guess_TopologyAttrs(to_guess=["types", "masses"])
+        else:
+            universe.add_TopologyAttr("masses", masses * N)
+        universe.load_new(four, velocities=v, dimensions=[SIDE, SIDE, SIDE, 90.0, 90.0, 90.0])
+        found.append(ConstraintCheck(universe, Distance(pairs), targets="first").run().check)
+    assert found[0].degrees_of_freedom == found[1].degrees_of_freedom
+    assert found[0].temperature["mean"] == pytest.approx(found[1].temperature["mean"])
+
+
+def test_velocities_without_a_unit_are_no_temperature(tmp_path):
+    """Those of LAMMPS are in angstrom/fs, or in anything else: files do not say."""
+    text = files.write_text(tmp_path / "w.lammpsdump", files.whole(files.water(N, 2))).read_text()
+    lines = [f"{line} 0.01 0 0" if line[0].isdigit() and len(line.split()) == 5 else line for line in text.splitlines()]
+    path = tmp_path / "v.lammpsdump"
+    path.write_text("\n".join(lines).replace("type x y z", "type x y z vx vy vz") + "\n")
+    universe = files.loaded(path, N)
+    assert universe.trajectory.ts.has_velocities
+    result = ConstraintCheck(universe, Distance(files.pairs(N), files.targets(N))).run().check
+    assert result.status == "kept" and result.temperature is None and result.units[0].rate_largest is None
+    assert "no temperature: velocities of LAMMPSDUMP files have no unit" in result.remarks
+    with pytest.warns(UserWarning, match="velocities of LAMMPSDUMP files have no unit: they are left out"):
+        assert not to_ase(universe).has("momenta")
+
+
+# -- data -------------------------------------------------------------------------------------------
+
+
+def test_a_straight_line_and_its_error():
+    t = np.linspace(3.0, 11.0, 40)
+    y = 0.25 * t + np.random.default_rng(2).normal(scale=0.1, size=40)
+    (slope, _), covariance = np.polyfit(t, y, 1, cov=True)
+    found = fitted(t, y)
+    assert found.slope == pytest.approx(slope, rel=1e-10)
+    assert found.error == pytest.approx(np.sqrt(covariance[0, 0]), rel=0.5)  # neighbors might depend on each other
+    assert found.change == pytest.approx(8.0 * slope) and found.significant
+    assert not fitted(t, y - 0.25 * t).significant
+    y[[3, 7]] = np.nan, np.inf  # do not count
+    assert fitted(t, y).slope == pytest.approx(0.25, abs=0.05)
+    assert fitted(t[:2], y[:2]) is None and fitted(np.ones(6), np.arange(6.0)) is None
+
+
+def test_results_are_plain_data(tmp_path):
+    x = files.whole(files.water(5, 4))
+    result = files.checked(files.write(tmp_path / "run.dcd", x), 5, worst=0, rank=False)
+    data = result.to_dict()
+    assert json.loads(json.dumps(data)) == data
+    assert data["n_rows"] == 15 and data["frames"] == [0, 1, 2, 3] and data["broken"] is None
+    assert result.worst == [] and result.rank is None and result.degrees_of_freedom is None
+    assert list(result.series) == ["largest Å", "rms Å", "rounding Å"] and result.n_frames_in_file == 4
+
+
+# -- files ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("command")
+    x = files.water(20, 5)
+    files.topology(folder / "t.gro", 20, x[0])
+    files.write(folder / "good.xtc", x)
+    v = np.random.default_rng(0).normal(size=x.shape)
+    files.write(folder / "good.trr", x, velocities=v)
+    x[3, 7] += 0.2
+    files.write(folder / "bad.xtc", x % 12.0)
+    return folder
+
+
+def looked(path, **options):
+    return check_trajectory(path, path.parent / "t.gro", "none", rank=False, **options)
+
+
+def test_writing_refuses_others_and_follows_no_links(folder, tmp_path):
+    one, other = looked(folder / "good.xtc"), looked(folder / "good.trr")
+    report.write(one, tmp_path / "out")
+    with pytest.raises(OccupiedError, match=r"of other file \(.*good\.xtc\); give another folder"):
+        report.write(other, tmp_path / "out")
+    for name in ("check.json.unfinished", ".kcons.lock"):  # links that somebody has put there
+        (tmp_path / "out" / name).symlink_to(tmp_path / "victim")
+    with pytest.raises(OccupiedError, match=r"\.kcons\.lock is a link"):
+        report.write(one, tmp_path / "out")
+    (tmp_path / "out" / ".kcons.lock").unlink()
+    report.write(one, tmp_path / "out")
+    assert not (tmp_path / "victim").exists()
+
+
+def drawn(monkeypatch, result):
+    """Lines of the first panel by label, and its scale."""
+    from matplotlib.figure import Figure
+
+    kept = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
+    report.plot(result, None)
+    axes = kept[0].axes[0]
+    return {line.get_label(): line for line in axes.lines}, axes
+
+
+def test_the_picture_shows_what_was_allowed(folder, monkeypatch):
+    result = looked(folder / "bad.xtc", tolerance=0.01)
+    lines, axes = drawn(monkeypatch, result)
+    shown = {name: np.asarray(line.get_ydata(), dtype=float) for name, line in lines.items()}
+    rounding = 4 * np.sqrt(3) * 0.005  # of a frame and of the targets
+    np.testing.assert_allclose(shown["rounding of the file, at most"], rounding, rtol=1e-9)
+    shortest = min(row.target for row in looked(folder / "bad.xtc", worst=999).worst)
+    np.testing.assert_allclose(shown["rounding and tolerance of 0.01"], rounding + 0.01 * shortest, rtol=1e-9)
+    over = shown["largest"] > shown["rounding and tolerance of 0.01"]
+    assert over.tolist() == [False, False, False, True, False]
+    assert {"largest", "rms"} < set(shown)
+    low, high = axes.get_ylim()
+    assert low < rounding < high and np.nanmax(shown["largest"]) < high
+    exact = looked(folder / "bad.xtc", tolerance=0.0)
+    assert not any("tolerance" in label for label in drawn(monkeypatch, exact)[0])
+
+
+def test_the_picture_has_no_stroke_to_the_zero_of_the_first_frame(folder, monkeypatch):
+    """The frame that gives targets is off by nothing, which has no place on a logarithmic scale."""
+    result = looked(folder / "good.xtc")
+    assert result.series["largest Å"][0] < 1e-15
+    lines, axes = drawn(monkeypatch, result)
+    assert axes.get_yscale() == "log"
+    for label in ("largest", "rms"):
+        y = np.asarray(lines[label].get_ydata(), dtype=float)
+        assert np.isnan(y[0]) and np.isfinite(y[1:]).all()
+    assert axes.get_ylim()[0] > 1e-5
+
+
+def test_a_full_disk_leaves_nothing_that_blocks_the_folder(folder, tmp_path):
+    """Files may grow to some bytes only, as on a disk that is full; a check of any trajectory can be written later."""
+    resource = pytest.importorskip("resource")
+    result = looked(folder / "good.xtc", frames="2:3")
+    assert max(result.series["largest Å"]) < 1e-12 and result.status == "incomplete"
+    report.plot(result, tmp_path / "drawn.png")  # of one frame, with all that has to be imported or kept
+    assert (tmp_path / "drawn.png").stat().st_size > 5000
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for write in (report.write, lambda _, out: report.write_failure(folder / "good.xtc", "no" * 200, out)):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
+        try:
+            with pytest.raises(OSError):
+                write(result, tmp_path / "out")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert not list((tmp_path / "out").iterdir())
+    assert len(report.write(looked(folder / "good.trr"), tmp_path / "out")) == 2
