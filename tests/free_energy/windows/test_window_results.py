@@ -50,7 +50,7 @@ def test_a_torsion_may_be_given_beyond_its_period():
     within = found([0, 45, 90, 135, 180, 225, 270, 315]).profile
     np.testing.assert_allclose(np.degrees(beyond.windows), np.arange(0, 360, 45), atol=1e-9)
     assert beyond.closure is not None
-    assert np.abs(beyond.F - within.F).max() < 1e-3 * within.error.max()
+    assert np.abs(beyond.F - within.F).max() < 1e-6 * within.error.max()
     with pytest.raises(InputError, match="1 different windows"):
         _ = found([10, 370, 730]).profile
     with pytest.raises(InputError, match="0 different windows"):
