@@ -1,7 +1,7 @@
 """Free energies along held coordinates, and relaxed scans.
 
-- `rigid_turns`: torsions turned as rigid groups
-- `compiled_samples`, `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `torsion_force`: torsions turned as rigid groups
+- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
 - `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window

@@ -18,7 +18,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
-from kcons.free_energy.rigid_turns import warn_of_gaps
+from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.motion import Motion
 
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]

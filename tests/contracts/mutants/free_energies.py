@@ -52,7 +52,7 @@ MUTANTS = [
         "tests/ase/test_named_calculators.py::test_files_name_calculators_of_a_list_or_of_modules_that_their_reader_names",
     ),
     (
-        "free_energy/rigid_turns.py",
+        "free_energy/torsion_force.py",
         "{*pair} not in joined and bonded.issuperset(pair)",
         "{*pair} not in joined",
         "tests/free_energy/windows/test_ase_windows.py::test_torsions_over_atoms_that_form_no_bonds",
