@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ase import Atoms
+from ase.calculators.emt import EMT
 
 from kcons.constraints import Dihedral, Distance, Formula, KnifeEdge
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
-from kcons.free_energy import Settings, Window
-from kcons.free_energy.windows.window import Held, digest_of, scales_of
+from kcons.free_energy import AseWindows, Settings, Window
+from kcons.free_energy.windows.window import Held, digest_of
 
 X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
 TURN = Dihedral([[0, 1, 2, 3]])
@@ -41,9 +43,11 @@ def test_settings_say_what_is_wrong():
 
 
 def test_names_and_units():
+    """Of OpenMM a formula is in nm, and nobody knows whether it is a length."""
     assert Window(12, "up", (0.0,), (1.0,), 1).name == "window-0012-up"
     both = {"r": Distance([[0, 1]]), "turn": TURN, "f": Formula("x1 - 1", [[0]])}
-    assert scales_of(both, 10.0).tolist() == [10.0, 1.0, 1.0]
+    sampler = AseWindows(Atoms("H5", X), EMT, both)
+    assert sampler.scales.tolist() == [1.0, 1.0, 1.0] and sampler.angles == (False, True, None)
 
 
 def test_groups_are_turned_and_keep_their_shape():
@@ -85,7 +89,7 @@ def test_a_ring_is_not_torn():
 
 def test_a_pull_ends_where_the_window_is():
     rows = held()
-    (pulled,) = rows.towards(Window(0, "up", (0.3,), (0.5,), 1), duration=4.0)
+    (pulled,) = rows.towards([0.3], [0.5], duration=4.0)
     assert [pulled.target_at(t)[0] for t in (0.0, 2.0, 4.0)] == pytest.approx([0.3, 0.4, 0.5])
     assert rows.at([0.5])[0].target_at(0.0)[0] == 0.5
 

@@ -9,10 +9,8 @@ import pytest
 from window_samplers import Fake
 
 from kcons.cli.terminal import rendered
-from kcons.constraints import Dihedral, Distance, Formula
 from kcons.free_energy import Settings, Windows, pull_free_energy
 from kcons.free_energy.windows import windows_report
-from kcons.free_energy.windows.window import angles_of
 
 
 @pytest.fixture
@@ -59,8 +57,6 @@ def test_a_profile_or_why_there_is_none(places, tmp_path):
 
 def test_a_formula_has_its_own_unit(found, tmp_path):
     """Of OpenMM it is in nm, and nobody knows whether it is a length."""
-    coordinates = {"f": Formula("x1 * x2", [[0, 1]]), "r": Distance([[0, 1]]), "t": Dihedral([[0, 1, 2, 3]])}
-    assert angles_of(coordinates) == (None, False, True)
     text = rendered(windows_report.table(found, [None]))
     assert "torsion (own unit)" in text and "kJ/mol by own unit" in text and "angstrom" not in text
     (_, columns, _) = windows_report.write(found, tmp_path, [None])
