@@ -128,7 +128,7 @@ def _scan(chosen: argparse.Namespace) -> int:
 
 def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Constraint:
     from kcons import constraints
-    from kcons.free_energy.windows.plan_file import counted
+    from kcons.free_energy.windows.input_file import counted
 
     kind: Any = getattr(constraints, family.capitalize())
     return kind([counted(atoms, chosen.count_from)])
@@ -136,7 +136,7 @@ def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Cons
 
 def _held(chosen: argparse.Namespace) -> list[Constraint]:
     from kcons.constraints import FixedAtoms
-    from kcons.free_energy.windows.plan_file import counted
+    from kcons.free_energy.windows.input_file import counted
 
     held: list[Constraint] = [FixedAtoms(counted(chosen.fix, chosen.count_from))] if chosen.fix else []
     return held + [_made(f, atoms, chosen) for f in FAMILIES for atoms in getattr(chosen, f"hold_{f}")]

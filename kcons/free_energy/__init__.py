@@ -28,7 +28,7 @@ _NAMES = {
     "windows.window_results": ("FreeEnergy", "WindowResult"),
     "windows.driver": ("Windows",),
     "windows.windows_report": ("windows_report",),
-    "windows.plan_file": ("PlanFile", "read_plan"),
+    "windows.input_file": ("InputFile", "read_input"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),

@@ -4,6 +4,6 @@
 - `ase_windows`, `openmm_windows`: who samples it
 - `window_results`: what windows have found
 - `driver`: many of them, by any executor
-- `plan_file`: windows as a file describes them
+- `input_file`: windows as a file describes them
 - `windows_report`: what is shown of them
 """
