@@ -42,7 +42,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from kcons.cli.progress import Bars
-    from kcons.free_energy import Windows, read_input, windows_report
+    from kcons.free_energy import Windows, read_input
     from kcons.steppers.files import in_one_piece, text
 
     given = read_input(chosen.input, allow_modules=chosen.allow_module)
@@ -75,15 +75,15 @@ def _free_energy(chosen: argparse.Namespace) -> int:
         if given.improve and not found.failed:
             found = windows.improve(**given.improve, **how)
         # Before pulls, which may fail.
-        written = windows_report.write(found, folder, windows.angles)
+        written = found.write(folder)
         said = ""
         if given.pulls is not None and pulls is not None:
             pulled = pulls.pull(**given.pulls, **how)
-            numbers, said = windows_report.of_pulls(found, pulled, given.pulls["start"], given.pulls["end"])
+            numbers, said = found.beside(pulled, given.pulls["start"], given.pulls["end"])
             written.append(folder / "pulls.json")
             with in_one_piece(written[-1]) as opened:
                 opened.write(text(numbers).encode())
-    show(windows_report.table(found, windows.angles), windows_report.summary(found), console())
+    show(found.table(), found.summary(), console())
     if said:
         print(said)
     say_written(written)
