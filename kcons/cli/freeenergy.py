@@ -6,36 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kcons.cli.parser import Command, Option
 from kcons.cli.scan import INCOMPLETE
 from kcons.cli.terminal import console, say_written, show
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
     from kcons.free_energy.windows.input_file import InputFile
-
-
-def add(commands: Any) -> None:
-    """Its options."""
-    made = commands.add_parser(
-        "freeenergy",
-        help="free energy along held coordinates, from an input file",
-        description="Samples windows with coordinates held, and integrates their mean force. The input file is TOML; "
-        "see the page on free energies. Goes on where it stopped: finished windows are kept one by one. Exit status 0; "
-        "2 for wrong use; 3 if some windows failed.",
-    )
-    made.add_argument("input", metavar="INPUT", type=Path, help="structure, forces, coordinates and sampling, in TOML")
-    made.add_argument("--out", type=Path, help="folder of the windows and results (default ./INPUT without its ending)")
-    made.add_argument("--workers", type=int, help="processes of this machine (default: of the file, or one a core)")
-    made.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786, in place of processes")
-    made.add_argument(
-        "--allow-module",
-        action="append",
-        default=[],
-        metavar="MODULE",
-        help="let the input file take a calculator of this Python module, whose code then runs; may be repeated",
-    )
-    made.add_argument("--list", action="store_true", help="say what would be run, and leave")
-    made.set_defaults(run=_free_energy, kept="windows")
 
 
 def _free_energy(chosen: argparse.Namespace) -> int:
@@ -45,7 +22,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     from kcons.free_energy import Windows, read_input
     from kcons.steppers.files import in_one_piece, text
 
-    given = read_input(chosen.input, allow_modules=chosen.allow_module)
+    given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     if chosen.list:
         return _list(given)
     if given.scheduler is not None and chosen.scheduler is None:
@@ -103,3 +80,28 @@ def _list(given: InputFile) -> int:
         ways = "both ways" if given.pulls.get("both_ways", True) else "one way"
         print(f"{given.pulls.get('count', 20)} pulls {ways} of {given.pull_steps:,} steps each")
     return 0
+
+
+COMMAND = Command(
+    "freeenergy",
+    "free energy along held coordinates, from an input file",
+    "Samples windows with coordinates held, and integrates their mean force. The input file is TOML, see the page on "
+    "free energies. Goes on where it stopped: finished windows are kept one by one. Exit status 0; 2 for wrong use; 3 "
+    "if some windows failed.",
+    (
+        Option("input", Path, None, "structure, forces, coordinates and sampling, in TOML", {"metavar": "INPUT"}),
+        Option("--out", Path, None, "folder of the windows and results (default ./INPUT without its ending)"),
+        Option("--workers", int, None, "processes of this machine (default: of the file, or one a core)"),
+        Option("--scheduler", str, None, "address of a Dask scheduler, such as tcp://host:8786, in place of processes"),
+        Option(
+            "--allow-module",
+            str,
+            None,
+            "let the input file take a calculator of this Python module, whose code then runs; may be repeated",
+            {"action": "append", "metavar": "MODULE"},
+        ),
+        Option("--list", bool, False, "say what would be run, and leave"),
+    ),
+    _free_energy,
+    "windows",
+)

@@ -1,12 +1,73 @@
-"""The parser of the command line: where a name is not known, it says which one may have been meant."""
+"""The options of a command as a table, and a parser that says which name may have been meant."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
 from kcons.errors import InputError, did_you_mean
+
+
+class Option(NamedTuple):
+    """A row of the table of a command.
+
+    Attributes
+    ----------
+    name : str
+        '--out'; without dashes of what is given by its place.
+    kind : callable
+        What makes the value from the word given, such as int or Path; bool for a switch.
+    default
+    help : str
+    more : dict
+        Further arguments of `argparse.ArgumentParser.add_argument`: nargs, choices, metavar.
+    group : str
+        The heading it stands under.
+    """
+
+    name: str
+    kind: Callable[[str], Any]
+    default: Any
+    help: str
+    more: dict[str, Any] = {}
+    group: str = ""
+
+
+class Command(NamedTuple):
+    """A command: its table of options, and what runs it.
+
+    Attributes
+    ----------
+    name, help, description : str
+    options : sequence of Option
+    run : callable
+        Is given the options as attributes; returns the exit status.
+    kept : str
+        What of its work stays when it is stopped, and is gone on from.
+    """
+
+    name: str
+    help: str
+    description: str
+    options: Sequence[Option]
+    run: Callable[[argparse.Namespace], int]
+    kept: str = ""
+
+    def add(self, commands: Any, parents: Sequence[Parser] = ()) -> None:
+        parser = commands.add_parser(self.name, help=self.help, description=self.description, parents=list(parents))
+        add_options(parser, self.options)
+        parser.set_defaults(run=self.run, of=parser, kept=self.kept)
+
+
+def add_options(parser: argparse.ArgumentParser, options: Sequence[Option]) -> None:
+    """Make a parser know the options of a table."""
+    groups: dict[str, Any] = {"": parser}
+    for name, kind, default, text, more, heading in options:
+        if heading not in groups:
+            groups[heading] = parser.add_argument_group(heading)
+        how: dict[str, Any] = {"action": "store_true"} if kind is bool else {"type": kind, "default": default}
+        groups[heading].add_argument(name, help=text, **how, **more)
 
 
 class Parser(argparse.ArgumentParser):

@@ -33,8 +33,8 @@ _NAMES = {
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "profiles.plots": ("plot_profile", "plot_surface", "plot_works"),
     "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
-    "scans.relaxed_scan": ("Scan", "scan"),
-    "scans.scan_report": ("scan_report",),
+    "scans.relaxed_scan": ("scan",),
+    "scans.scan_result": ("Scan",),
     "scans.system_calculator": ("SystemCalculator",),
 }
 

@@ -27,10 +27,10 @@ MUTANTS = [
         "tests/free_energy/scans/test_model_hessian.py::test_terms_keep_their_images",
     ),
     (
-        "free_energy/scans/attempts.py",
+        "free_energy/scans/scan_result.py",
         "if found is not None and (found.point, found.source) != (point, source):",
         "if found is None and source == point:",
-        "tests/free_energy/scans/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
+        "tests/free_energy/scans/test_scan_result.py::test_an_attempt_of_another_scan_is_refused",
     ),
     # -- free energies from mean forces and works --
     (

@@ -163,7 +163,7 @@ def test_a_failed_point_is_tried_again_by_the_next_run(tmp_path):
     assert set(second.failed) == {(8,)} and calls == 1 and len(second.attempts) == len(first.attempts) + 1
     broken[0] = False
     third, calls = scanned()
-    assert third.failed == {} and len(third.attempts) > len(second.attempts) + 1  # its neighbours from it
+    assert third.failed == {} and len(third.attempts) > len(second.attempts) + 1  # its neighbors from it
     assert calls == third.evaluations - second.evaluations
     np.testing.assert_allclose(third.energies, 0.2 * (1 + np.cos(3 * RING)), atol=2e-5)
     fourth, calls = scanned()
