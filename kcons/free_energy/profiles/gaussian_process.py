@@ -28,7 +28,7 @@ from kcons.thermostats import Estimate
 
 #: Of the diagonal, added to the covariance: rounding of a matrix of that size.
 _ROUNDING = 1e-10
-#: Prior standard deviations of the logarithms of amplitude, of length, and of neighbouring local lengths.
+#: Prior standard deviations of the logarithms of amplitude, of length, and of neighboring local lengths.
 _WIDE, _LOCAL = 1.5, 0.5
 #: Prior standard deviation of a constant gradient, in units of the largest gradient seen.
 _TREND = 10.0
