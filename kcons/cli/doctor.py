@@ -182,6 +182,6 @@ COMMAND = Command(
     "doctor",
     "MD engines, platforms, threads, caches and optional packages of this machine",
     "What kcons finds on this machine. Exit status 0; 1 if something is wrong, which is said.",
-    (Option("--json", bool, False, "as JSON, to send along with a question"),),
+    (Option("--json", "as JSON, to send along with a question", action="store_true"),),
     _doctor,
 )

@@ -9,29 +9,22 @@ from typing import Any, NamedTuple
 from kcons.errors import InputError, did_you_mean
 
 
-class Option(NamedTuple):
+class Option:
     """A row of the table of a command.
 
-    Attributes
+    Parameters
     ----------
     name : str
         '--out'; without dashes of what is given by its place.
-    kind : callable
-        What makes the value from the word given, such as int or Path; bool for a switch.
-    default
     help : str
-    more : dict
-        Further arguments of `argparse.ArgumentParser.add_argument`: nargs, choices, metavar.
     group : str
         The heading it stands under.
+    more
+        Further arguments of `argparse.ArgumentParser.add_argument`: type, default, nargs, choices, metavar, action.
     """
 
-    name: str
-    kind: Callable[[str], Any]
-    default: Any
-    help: str
-    more: dict[str, Any] = {}
-    group: str = ""
+    def __init__(self, name: str, help: str, *, group: str = "", **more: Any) -> None:
+        self.name, self.group, self.how = name, group, {"help": help, **more}
 
 
 class Command(NamedTuple):
@@ -63,11 +56,10 @@ class Command(NamedTuple):
 def add_options(parser: argparse.ArgumentParser, options: Sequence[Option]) -> None:
     """Make a parser know the options of a table."""
     groups: dict[str, Any] = {"": parser}
-    for name, kind, default, text, more, heading in options:
-        if heading not in groups:
-            groups[heading] = parser.add_argument_group(heading)
-        how: dict[str, Any] = {"action": "store_true"} if kind is bool else {"type": kind, "default": default}
-        groups[heading].add_argument(name, help=text, **how, **more)
+    for option in options:
+        if option.group not in groups:
+            groups[option.group] = parser.add_argument_group(option.group)
+        groups[option.group].add_argument(option.name, **option.how)
 
 
 class Parser(argparse.ArgumentParser):

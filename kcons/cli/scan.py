@@ -161,48 +161,35 @@ def _of_system(path: Path, settings: dict[str, Any]) -> Any:
 
 def _options() -> Iterator[Option]:
     """The table: options of each family are alike."""
-    yield Option("structure", Path, None, "any file that ASE reads; its last structure")
+    yield Option("structure", "any file that ASE reads; its last structure", type=Path)
     for family, size in FAMILIES.items():
         again = "; a second coordinate makes the scan two-dimensional" if size == 2 else ""
-        how = {"nargs": size, "metavar": "ATOM", "action": _Coordinate, "dest": "coordinates"}
-        yield Option(f"--{family}", int, None, f"{size} atoms{again}", how)
-    for name, dest, which, turn in (("--from", "begin", "first", -180), ("--to", "end", "last", 180)):
-        said = f"{which} value, one for each coordinate (dihedrals: {turn})"
-        yield Option(name, float, None, said, {"nargs": "+", "metavar": "VALUE", "dest": dest})
+        how: dict[str, Any] = {"nargs": size, "type": int, "metavar": "ATOM"}
+        yield Option(f"--{family}", f"{size} atoms{again}", action=_Coordinate, dest="coordinates", **how)
+    how = {"nargs": "+", "type": float, "metavar": "VALUE"}
+    yield Option("--from", "first value, one for each coordinate (dihedrals: -180)", dest="begin", **how)
+    yield Option("--to", "last value, one for each coordinate (dihedrals: 180)", dest="end", **how)
     said = "steps from the first value to the last, one for each (default 24)"
-    yield Option("--steps", int, None, said, {"nargs": "+", "metavar": "N"})
-    yield Option("--count-from", int, 0, "number of the first atom (default 0)", {"choices": (0, 1)})
-    yield Option("--fix", int, (), "atoms that stay where they are", {"nargs": "+", "metavar": "ATOM"})
+    yield Option("--steps", said, nargs="+", type=int, metavar="N")
+    yield Option("--count-from", "number of the first atom (default 0)", type=int, choices=(0, 1), default=0)
+    yield Option("--fix", "atoms that stay where they are", nargs="+", type=int, default=(), metavar="ATOM")
     for family, size in FAMILIES.items():
         again = "; may be repeated" if size == 2 else ""
-        how = {"nargs": size, "metavar": "ATOM", "action": "append"}
-        yield Option(f"--hold-{family}", int, None, f"held as it is{again}", how)
-    yield Option(
-        "--constrain",
-        str,
-        None,
-        "bonds (guessed from distances) and angles that are held as they are",
-        {"choices": ("hbonds", "allbonds", "hangles", "allangles")},
-    )
-    yield Option(
-        "--calculator",
-        str,
-        "gfn2",
+        how = {"nargs": size, "type": int, "metavar": "ATOM"}
+        yield Option(f"--hold-{family}", f"held as it is{again}", action="append", **how)
+    said = "bonds (guessed from distances) and angles that are held as they are"
+    yield Option("--constrain", said, choices=("hbonds", "allbonds", "hangles", "allangles"))
+    forces = "energy and forces"
+    said = (
         "gfn2 (default) or gfn1, by tblite; emt, lj, ...: one of ASE by name; MODULE:NAME: what makes one; "
-        "FILE.xml: a System of OpenMM, with what it constrains",
-        group="energy and forces",
+        "FILE.xml: a System of OpenMM, with what it constrains"
     )
-    yield Option(
-        "--settings",
-        str,
-        "{}",
-        "such as '{\"charge\": 1}', for what makes it",
-        {"metavar": "JSON"},
-        "energy and forces",
-    )
-    yield Option("--fmax", float, 0.01, "largest force left, eV/angstrom (default 0.01)")
-    yield Option("--one-way", bool, False, "relax each point from the first neighbor only")
-    yield Option("--out", Path, None, "folder for all results (default ./scan-STRUCTURE)")
+    yield Option("--calculator", said, default="gfn2", group=forces)
+    said = "such as '{\"charge\": 1}', for what makes it"
+    yield Option("--settings", said, default="{}", metavar="JSON", group=forces)
+    yield Option("--fmax", "largest force left, eV/angstrom (default 0.01)", type=float, default=0.01)
+    yield Option("--one-way", "relax each point from the first neighbor only", action="store_true")
+    yield Option("--out", "folder for all results (default ./scan-STRUCTURE)", type=Path)
 
 
 COMMAND = Command(

@@ -46,8 +46,8 @@ COMMAND = Command(
     "Compile the kernels that systems of these kinds need, once on a machine (a processor), and keep them where later "
     "runs find them. Without names: all.",
     (
-        Option("what", str, None, "kinds of systems; see --list", {"nargs": "*"}),
-        Option("--list", bool, False, "say what each of them is, and leave"),
+        Option("what", "kinds of systems; see --list", nargs="*"),
+        Option("--list", "say what each of them is, and leave", action="store_true"),
     ),
     _warmup,
 )
