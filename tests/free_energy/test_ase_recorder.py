@@ -14,14 +14,13 @@ from ase.md.verlet import VelocityVerlet
 from kcons.ase import (
     ConstrainedDynamics,
     ConstrainedLangevin,
-    Constraints,
     MultipleTimeSteps,
     constrain,
     draw_velocities,
 )
 from kcons.ase.binding import applied_forces
 from kcons.constraints import Dihedral, Distance, MovingTarget
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 from kcons.free_energy import AseRecorder, held_coordinates
 
 
@@ -112,18 +111,6 @@ def first_energy(start):
     state = dynamics.state
     kinetic = 0.5 * np.sum(atoms.get_masses()[:, None] * state.velocities**2)
     return atoms.get_potential_energy() + kinetic
-
-
-def test_bad_input():
-    atoms = methanol()
-    with pytest.raises(InputError, match=r"no kcons\.ase\.Constraints objects"):
-        AseRecorder(VelocityVerlet(atoms, units.fs), {"turn": rows()[0]})
-    atoms.set_constraint(Constraints(rows()[1]))
-    with pytest.raises(InputError, match=r"turn, Dihedral\(2, 0, 1, 3\), is not among"):
-        AseRecorder(VelocityVerlet(atoms, units.fs), {"turn": rows()[0]})
-    for name in ("energy", "pbc", "a=b"):  # extended XYZ: an error of ASE, nothing, and a = "b=1.5"
-        with pytest.raises(InputError, match=f"called '{name}', which extended XYZ files cannot keep"):
-            AseRecorder(VelocityVerlet(atoms, units.fs), {name: rows()[0]})
 
 
 def test_forces_that_ase_constraints_add_count():

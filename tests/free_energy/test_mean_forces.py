@@ -7,7 +7,6 @@ import pytest
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Angle, Distance, FixedAtoms, Formula, Plane
-from kcons.errors import InputError
 from kcons.free_energy import HeldCoordinates, Recorder, Sample, Series, local_mean_force, mean_force, weighted_mean
 from kcons.free_energy.mean_forces import _quietest
 from kcons.thermostats import Langevin
@@ -212,39 +211,6 @@ def test_errors_of_repeated_runs_are_as_large_as_they_say():
     away, said = np.array(found).T
     assert abs(away.mean()) < 3 * away.std() / np.sqrt(len(away))
     assert 0.9 <= np.sqrt((away**2).mean() / (said**2).mean()) <= 1.15
-
-
-def test_bad_input():
-    series = series_of(
-        {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.ones(2), ring(1.7, 20), spring
-    )
-    for kT in (0.0, -1.0, np.nan, "x"):
-        with pytest.raises(InputError, match="kT is"):
-            mean_force(series, kT)
-    series.isokinetic_degrees_of_freedom = 1
-    with pytest.raises(InputError, match="no temperature"):
-        mean_force(series, KT)
-    series.isokinetic_degrees_of_freedom = 0
-    with pytest.raises(InputError, match="20 of 20 samples are to be discarded"):
-        mean_force(series, KT, discard=20)
-    with pytest.raises(InputError, match="series is None"):
-        mean_force(None, KT)
-    broken = Series(["r"])
-    for k, sample in enumerate(series):
-        broken.append(sample._replace(value=np.array([np.nan])) if k == 7 else sample)
-    with pytest.raises(InputError, match="values of r are not finite"):
-        mean_force(broken, KT)
-    pulled = Series(["r"])
-    for k, sample in enumerate(series):
-        pulled.append(sample._replace(value=sample.value + 0.1 * (k > 9)))
-    with pytest.raises(InputError, match=r"r moved by 0\.1"):
-        for sample in list(
-            series_of(
-                {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.ones(2), ring(1.8, 4), spring
-            )._samples
-        ):
-            series.append(sample)
-        mean_force(series, KT)
 
 
 def test_of_two_estimates_the_mixture_that_fluctuates_least():

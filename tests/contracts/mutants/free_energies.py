@@ -12,7 +12,7 @@ MUTANTS = [
         "free_energy/scans/relaxed_scan.py",
         "if with_it.rank != rank + n + 1:",
         "if False:",
-        "tests/free_energy/scans/test_relaxed_scan.py::test_bad_coordinates",
+        "tests/free_energy/test_refusals.py::test_refusals",
     ),
     (
         "free_energy/scans/relaxation.py",
@@ -74,13 +74,13 @@ MUTANTS = [
         "free_energy/averages.py",
         "covariance *= np.outer(widening, widening)",
         "covariance *= 1.0",
-        "tests/free_energy/test_averages.py::test_intervals_cover_as_often_as_they_say",
+        "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say",
     ),
     (
         "free_energy/averages.py",
         "return factors[:, None] * (series",
         "return 1.0 * (series",
-        "tests/free_energy/test_averages.py::test_weights_that_belong_to_the_values",
+        "tests/thermostats/test_correlated_series.py::test_errors_with_weights",
     ),
     (
         "free_energy/profiles/gaussian_process.py",

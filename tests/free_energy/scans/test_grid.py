@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from kcons.constraints import Dihedral, Distance, Formula
-from kcons.errors import InputError
 from kcons.free_energy.scans.grid import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
@@ -42,24 +41,3 @@ def test_two_coordinates():
     assert grid.names == ["Dihedral(0, 1, 2, 3)", "Distance(0, 1)"] and grid.in_degrees == [True, False]
     assert grid.units == ["degrees", "angstrom"]
     assert Grid([Formula("x1 * x2", [[0, 1]]), TURN], [[0.1], [0.2]]).units == ["own unit", "degrees"]
-
-
-@pytest.mark.parametrize(
-    ("coordinates", "values", "said"),
-    [
-        ([], [], "one or two coordinates, not 0"),
-        ([TURN, LENGTH, TURN], [[0], [1], [0]], "one or two coordinates, not 3"),
-        ([TURN], [[0], [1]], "1 coordinates have 2 lists of values"),
-        ([Distance([[0, 1], [1, 2]])], [[1]], "has 2 rows; a coordinate of a scan has one"),
-        ([LENGTH], [[]], "not a list of finite numbers"),
-        ([LENGTH], [[1, np.nan]], "not a list of finite numbers"),
-        ([LENGTH], [[[1, 2]]], "not a list of finite numbers"),
-        ([LENGTH], [["far"]], "values of Distance"),
-        ([LENGTH], [[1, 2, 1]], "two values of .* are the same"),
-        ([LENGTH], [[1, 3, 2]], "go up and down; give them in order"),
-        ([TURN], [np.radians([-180, 0, 200])], "span more than its period"),
-    ],
-)
-def test_bad_grids(coordinates, values, said):
-    with pytest.raises(InputError, match=said):
-        Grid(coordinates, values)
