@@ -10,15 +10,15 @@ from ase.build import molecule
 from tblite.ase import TBLite
 
 from kcons.constraints import Dihedral
-from kcons.free_energy import scan, scan_report
+from kcons.free_energy import scan
 
 atoms = molecule("H2O2")
 atoms.calc = TBLite(method="GFN2-xTB", verbosity=0)
 degrees = np.arange(-180, 180, 15)
 
 found = scan(atoms, Dihedral([[2, 0, 1, 3]]), np.radians(degrees))
-scan_report.write(found, "torsion_scan")
-print(scan_report.summary(found), "\n")
+found.write("torsion_scan")
+print(found.summary(), "\n")
 
 kj_mol = (found.energies - found.energies.min()) * units.mol / units.kJ
 for angle, energy in zip(degrees, kj_mol, strict=True):

@@ -1,4 +1,4 @@
-"""The torsion of butane with GFN2-xTB at 300 K, from a plan, beside its relaxed scan.
+"""The torsion of butane with GFN2-xTB at 300 K, from an input file, beside its relaxed scan.
 
 python examples/studies/butane_torsion.py           four short windows, to see how it goes
 python examples/studies/butane_torsion.py --full    the profile, into docs: some ten minutes on two cores
@@ -16,11 +16,11 @@ from ase.io import write
 
 from kcons.comparison import environment, json_files
 from kcons.constraints import Dihedral
-from kcons.free_energy import Windows, read_plan, scan
+from kcons.free_energy import Windows, read_input, scan
 
 DOCS = Path(__file__).parents[2] / "docs"
 CARBONS = [0, 1, 2, 3]
-PLAN = """
+INPUT = """
 [structure]
 file = "butane.xyz"
 
@@ -49,7 +49,7 @@ every = 5
 """
 
 
-def plan_in(folder: Path, full: bool) -> Path:
+def input_in(folder: Path, full: bool) -> Path:
     """butane.xyz and butane.toml."""
     atoms = molecule("trans-butane")
     carbons = [a.index for a in atoms if a.symbol == "C"]
@@ -62,7 +62,7 @@ def plan_in(folder: Path, full: bool) -> Path:
     numbers = {"to": 0, "windows": 10, "relax": 30, "pull": 300, "equilibration": 500, "production": 9000}
     if not full:
         numbers |= {"windows": 4, "relax": 0, "pull": 5, "equilibration": 5, "production": 160}
-    text = PLAN.format(atoms=", ".join(map(str, chain)), **numbers)
+    text = INPUT.format(atoms=", ".join(map(str, chain)), **numbers)
     (folder / "butane.toml").write_text(text)
     CARBONS[:] = chain
     return folder / "butane.toml"
@@ -71,15 +71,15 @@ def plan_in(folder: Path, full: bool) -> Path:
 def main(full: bool) -> None:
     folder = Path("butane") if full else Path(tempfile.mkdtemp())
     folder.mkdir(exist_ok=True)
-    plan = read_plan(plan_in(folder, full))
-    windows = Windows(plan.sampler, folder / "windows", plan.settings, both_sides=full)
-    found = windows.run(plan.targets, workers=2 if full else 1, progress=lambda *n: print(*n, flush=True))
+    given = read_input(input_in(folder, full))
+    windows = Windows(given.sampler, folder / "windows", given.settings, both_sides=full)
+    found = windows.run(given.targets, workers=2 if full else 1, progress=lambda *n: print(*n, flush=True))
     for window in found.windows:
         degrees = np.degrees(window.value[0])
         print(f"{degrees:7.1f} {window.force[0]:8.2f} +- {window.error[0]:.2f} kJ/mol/rad, raw {window.raw[0]:.2f}")
     if not full:
         return
-    sampler = plan.sampler
+    sampler = given.sampler
     atoms = sampler.atoms.copy()
     atoms.calc = sampler.calculator()
     relaxed = scan(atoms, [Dihedral([CARBONS])], [np.radians(np.arange(-180, 1, 15))])
@@ -90,7 +90,7 @@ def main(full: bool) -> None:
     points = {name: profile.difference(-np.pi, np.radians(at)) for name, at in PLACES.items()}
     numbers = {
         "windows": len(found.windows),
-        "steps": plan.settings.production * 2,
+        "steps": given.settings.production * 2,
         "free energy": {name: [each.value, each.error] for name, each in points.items()},
         "relaxed scan": {name: float(energies[round((at + 180) / 15)] - energies[0]) for name, at in PLACES.items()},
         "hysteresis": [w.hysteresis for w in found.windows],

@@ -88,16 +88,6 @@ def thermostats() -> None:
     run(system, system.initial_state(x), 1e-3, 1, stepper=stepper)
 
 
-def freeenergy() -> None:
-    """kcons freeenergy: samples of a torsion that is held beside bonds and angles"""
-    from kcons.free_energy import HeldCoordinates
-
-    x = ZIGZAG[:6]
-    bonds, angles, torsion = ROWS
-    held = ConstraintSet([bonds, angles, torsion], x, np.ones(6), cell=100.0 * np.eye(3))
-    HeldCoordinates(held, {"torsion": torsion}, x).sample(x, np.zeros_like(x), np.zeros_like(x), 0.0)
-
-
 def ase() -> None:
     """dynamics of ASE"""
     from ase import Atoms, units
@@ -160,7 +150,7 @@ def _use(molecule: FloatArray, *rows: Constraint, copies: int = 1, steppers: tup
 
 
 KINDS: dict[str, Callable[[], None]] = {
-    use.__name__: use for use in (molecules, water, bonds, proteins, surfaces, thermostats, freeenergy, ase, check)
+    use.__name__: use for use in (molecules, water, bonds, proteins, surfaces, thermostats, ase, check)
 }
 #: Packages that some of them need.
 NEEDS = {"check": "MDAnalysis"}

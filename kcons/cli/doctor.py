@@ -14,23 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from kcons import __version__
+from kcons.cli.parser import Command, Option
 from kcons.cli.terminal import console
 from kcons.errors import EXTRAS
 
 #: Names of distributions that differ from those of the packages.
 DISTRIBUTIONS = {"MDAnalysis": "mdanalysis", "openmm": "OpenMM"}
 NEEDED = ("numpy", "scipy", "numba", "rich")
-
-
-def add(commands: Any) -> None:
-    """Its options."""
-    made = commands.add_parser(
-        "doctor",
-        help="MD engines, platforms, threads, caches and optional packages of this machine",
-        description="What kcons finds on this machine. Exit status 0; 1 if something is wrong, which is said.",
-    )
-    made.add_argument("--json", action="store_true", help="as JSON, to send along with a question")
-    made.set_defaults(run=_doctor)
 
 
 def _doctor(chosen: argparse.Namespace) -> int:
@@ -186,3 +176,12 @@ def writable(folder: Path) -> bool:
             return True
     except OSError:
         return False
+
+
+COMMAND = Command(
+    "doctor",
+    "MD engines, platforms, threads, caches and optional packages of this machine",
+    "What kcons finds on this machine. Exit status 0; 1 if something is wrong, which is said.",
+    (Option("--json", "as JSON, to send along with a question", action="store_true"),),
+    _doctor,
+)

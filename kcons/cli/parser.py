@@ -1,12 +1,65 @@
-"""The parser of the command line: where a name is not known, it says which one may have been meant."""
+"""The options of a command as a table, and a parser that says which name may have been meant."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
 from kcons.errors import InputError, did_you_mean
+
+
+class Option:
+    """A row of the table of a command.
+
+    Parameters
+    ----------
+    name : str
+        '--out'; without dashes of what is given by its place.
+    help : str
+    group : str
+        The heading it stands under.
+    more
+        Further arguments of `argparse.ArgumentParser.add_argument`: type, default, nargs, choices, metavar, action.
+    """
+
+    def __init__(self, name: str, help: str, *, group: str = "", **more: Any) -> None:
+        self.name, self.group, self.how = name, group, {"help": help, **more}
+
+
+class Command(NamedTuple):
+    """A command: its table of options, and what runs it.
+
+    Attributes
+    ----------
+    name, help, description : str
+    options : sequence of Option
+    run : callable
+        Is given the options as attributes; returns the exit status.
+    kept : str
+        What of its work stays when it is stopped, and is gone on from.
+    """
+
+    name: str
+    help: str
+    description: str
+    options: Sequence[Option]
+    run: Callable[[argparse.Namespace], int]
+    kept: str = ""
+
+    def add(self, commands: Any, parents: Sequence[Parser] = ()) -> None:
+        parser = commands.add_parser(self.name, help=self.help, description=self.description, parents=list(parents))
+        add_options(parser, self.options)
+        parser.set_defaults(run=self.run, of=parser, kept=self.kept)
+
+
+def add_options(parser: argparse.ArgumentParser, options: Sequence[Option]) -> None:
+    """Make a parser know the options of a table."""
+    groups: dict[str, Any] = {"": parser}
+    for option in options:
+        if option.group not in groups:
+            groups[option.group] = parser.add_argument_group(option.group)
+        groups[option.group].add_argument(option.name, **option.how)
 
 
 class Parser(argparse.ArgumentParser):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kcons.cli.parser import Command, Option
 from kcons.cli.terminal import console, say_written, show
 from kcons.errors import InputError, UnsupportedError
 
@@ -31,68 +32,6 @@ class _Coordinate(argparse.Action):
         setattr(namespace, self.dest, [*(getattr(namespace, self.dest) or []), (family, values)])
 
 
-def add(commands: Any) -> None:
-    """Its options."""
-    scan = commands.add_parser(
-        "scan",
-        help="minima of the energy with one or two coordinates held at given values",
-        description="A relaxed scan: distances, angles or dihedrals are held exactly at each of their values, all else "
-        "is relaxed, from all neighbouring points (torsions are driven both ways). Atoms are counted from 0, unless "
-        "--count-from 1 is given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; "
-        "2 for wrong use, or if no point succeeded; 3 if some points failed.",
-    )
-    scan.add_argument("structure", type=Path, help="any file that ASE reads; its last structure")
-    for family, size in FAMILIES.items():
-        scan.add_argument(
-            f"--{family}",
-            nargs=size,
-            type=int,
-            action=_Coordinate,
-            dest="coordinates",
-            metavar="ATOM",
-            help=f"{size} atoms; a second coordinate makes the scan two-dimensional" if size == 2 else f"{size} atoms",
-        )
-    value = {"nargs": "+", "type": float, "metavar": "VALUE"}
-    scan.add_argument("--from", dest="begin", help="first value, one for each coordinate (dihedrals: -180)", **value)
-    scan.add_argument("--to", dest="end", help="last value, one for each coordinate (dihedrals: 180)", **value)
-    scan.add_argument(
-        "--steps",
-        nargs="+",
-        type=int,
-        metavar="N",
-        help="steps from the first value to the last, one for each (default 24)",
-    )
-    scan.add_argument("--count-from", type=int, choices=(0, 1), default=0, help="number of the first atom (default 0)")
-    scan.add_argument("--fix", nargs="+", type=int, default=(), metavar="ATOM", help="atoms that stay where they are")
-    for family, size in FAMILIES.items():
-        scan.add_argument(
-            f"--hold-{family}",
-            nargs=size,
-            type=int,
-            action="append",
-            default=[],
-            metavar="ATOM",
-            help="held as it is" if size > 2 else "held as it is; may be repeated",
-        )
-    scan.add_argument(
-        "--constrain",
-        choices=("hbonds", "allbonds", "hangles", "allangles"),
-        help="bonds (guessed from distances) and angles that are held as they are",
-    )
-    forces = scan.add_argument_group("energy and forces")
-    forces.add_argument(
-        "--calculator",
-        default="gfn2",
-        help="gfn2 (default) or gfn1, by tblite; emt, lj, ...: one of ASE by name; MODULE:NAME: what makes one; "
-        "FILE.xml: a System of OpenMM, with what it constrains",
-    )
-    forces.add_argument("--settings", default="{}", metavar="JSON", help="such as '{\"charge\": 1}', for what makes it")
-    scan.add_argument("--fmax", type=float, default=0.01, help="largest force left, eV/angstrom (default 0.01)")
-    scan.add_argument("--one-way", action="store_true", help="relax each point from the first neighbour only")
-    scan.add_argument("--out", type=Path, help="folder for all results (default ./scan-STRUCTURE)")
-    scan.set_defaults(run=_scan, kept="relaxations")
-
-
 def _scan(chosen: argparse.Namespace) -> int:
     coordinates, values = _grid(chosen)
     atoms = _structure(chosen.structure)
@@ -105,7 +44,7 @@ def _scan(chosen: argparse.Namespace) -> int:
     held += getattr(atoms.calc, "held", [])
 
     from kcons.cli.progress import Bars
-    from kcons.free_energy import scan, scan_report
+    from kcons.free_energy import scan
 
     folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
     with Bars() as watcher:
@@ -121,14 +60,14 @@ def _scan(chosen: argparse.Namespace) -> int:
             progress=lambda done, points, line: watcher.advance(done / points),
         )
         watcher.end()
-    show(scan_report.table(found), scan_report.summary(found), console())
-    say_written(scan_report.write(found, folder))
+    show(found.table(), found.summary(), console())
+    say_written(found.write(folder))
     return INCOMPLETE if found.failed else 0
 
 
 def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Constraint:
     from kcons import constraints
-    from kcons.free_energy.windows.plan_file import counted
+    from kcons.free_energy.windows.input_file import counted
 
     kind: Any = getattr(constraints, family.capitalize())
     return kind([counted(atoms, chosen.count_from)])
@@ -136,10 +75,10 @@ def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Cons
 
 def _held(chosen: argparse.Namespace) -> list[Constraint]:
     from kcons.constraints import FixedAtoms
-    from kcons.free_energy.windows.plan_file import counted
+    from kcons.free_energy.windows.input_file import counted
 
     held: list[Constraint] = [FixedAtoms(counted(chosen.fix, chosen.count_from))] if chosen.fix else []
-    return held + [_made(f, atoms, chosen) for f in FAMILIES for atoms in getattr(chosen, f"hold_{f}")]
+    return held + [_made(f, atoms, chosen) for f in FAMILIES for atoms in getattr(chosen, f"hold_{f}") or ()]
 
 
 def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
@@ -218,3 +157,49 @@ def _of_system(path: Path, settings: dict[str, Any]) -> Any:
         return SystemCalculator(system, **settings)
     except (TypeError, openmm.OpenMMException) as error:
         raise InputError(f'--settings of a System are {{"platform": NAME}}: {error}', item="settings") from error
+
+
+def _options() -> Iterator[Option]:
+    """The table: options of each family are alike."""
+    yield Option("structure", "any file that ASE reads; its last structure", type=Path)
+    for family, size in FAMILIES.items():
+        again = "; a second coordinate makes the scan two-dimensional" if size == 2 else ""
+        how: dict[str, Any] = {"nargs": size, "type": int, "metavar": "ATOM"}
+        yield Option(f"--{family}", f"{size} atoms{again}", action=_Coordinate, dest="coordinates", **how)
+    how = {"nargs": "+", "type": float, "metavar": "VALUE"}
+    yield Option("--from", "first value, one for each coordinate (dihedrals: -180)", dest="begin", **how)
+    yield Option("--to", "last value, one for each coordinate (dihedrals: 180)", dest="end", **how)
+    said = "steps from the first value to the last, one for each (default 24)"
+    yield Option("--steps", said, nargs="+", type=int, metavar="N")
+    yield Option("--count-from", "number of the first atom (default 0)", type=int, choices=(0, 1), default=0)
+    yield Option("--fix", "atoms that stay where they are", nargs="+", type=int, default=(), metavar="ATOM")
+    for family, size in FAMILIES.items():
+        again = "; may be repeated" if size == 2 else ""
+        how = {"nargs": size, "type": int, "metavar": "ATOM"}
+        yield Option(f"--hold-{family}", f"held as it is{again}", action="append", **how)
+    said = "bonds (guessed from distances) and angles that are held as they are"
+    yield Option("--constrain", said, choices=("hbonds", "allbonds", "hangles", "allangles"))
+    forces = "energy and forces"
+    said = (
+        "gfn2 (default) or gfn1, by tblite; emt, lj, ...: one of ASE by name; MODULE:NAME: what makes one; "
+        "FILE.xml: a System of OpenMM, with what it constrains"
+    )
+    yield Option("--calculator", said, default="gfn2", group=forces)
+    said = "such as '{\"charge\": 1}', for what makes it"
+    yield Option("--settings", said, default="{}", metavar="JSON", group=forces)
+    yield Option("--fmax", "largest force left, eV/angstrom (default 0.01)", type=float, default=0.01)
+    yield Option("--one-way", "relax each point from the first neighbor only", action="store_true")
+    yield Option("--out", "folder for all results (default ./scan-STRUCTURE)", type=Path)
+
+
+COMMAND = Command(
+    "scan",
+    "minima of the energy with one or two coordinates held at given values",
+    "A relaxed scan: distances, angles or dihedrals are held exactly at each of their values, all else is relaxed, "
+    "from all neighboring points (torsions are driven both ways). Atoms are counted from 0, unless --count-from 1 is "
+    "given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; 2 for wrong use, or "
+    "if no point succeeded; 3 if some points failed.",
+    tuple(_options()),
+    _scan,
+    "relaxations",
+)

@@ -5,23 +5,10 @@ from __future__ import annotations
 import argparse
 import time
 from importlib.util import find_spec
-from typing import Any
 
+from kcons.cli.parser import Command, Option
 from kcons.cli.terminal import console, names
 from kcons.errors import InputError, did_you_mean
-
-
-def add(commands: Any) -> None:
-    """Its options."""
-    warmup = commands.add_parser(
-        "warmup",
-        help="compile beforehand what a first run would compile",
-        description="Compile the kernels that systems of these kinds need, once on a machine (a processor), and keep "
-        "them where later runs find them. Without names: all.",
-    )
-    warmup.add_argument("what", nargs="*", help="kinds of systems; see --list")
-    warmup.add_argument("--list", action="store_true", help="say what each of them is, and leave")
-    warmup.set_defaults(run=_warmup)
 
 
 def _warmup(chosen: argparse.Namespace) -> int:
@@ -32,7 +19,7 @@ def _warmup(chosen: argparse.Namespace) -> int:
         for name, use in KINDS.items():
             print(f"{name:12} {use.__doc__}")
         return 0
-    wanted = [name for given in chosen.what for name in names(given)] or list(KINDS)
+    wanted = [name for given in chosen.what or () for name in names(given)] or list(KINDS)
     if unknown := sorted(set(wanted) - set(KINDS)):
         raise InputError(
             f"nothing here is called {unknown[0]!r}{did_you_mean(unknown[0], KINDS)}; choose of {', '.join(KINDS)}",
@@ -51,3 +38,16 @@ def _warmup(chosen: argparse.Namespace) -> int:
         compiled, whole = announcer.seconds - before, time.perf_counter() - begun
         terminal.print(f"{name}: compiled in {compiled:.1f} s" if compiled else f"{name}: is there ({whole:.1f} s)")
     return 0
+
+
+COMMAND = Command(
+    "warmup",
+    "compile beforehand what a first run would compile",
+    "Compile the kernels that systems of these kinds need, once on a machine (a processor), and keep them where later "
+    "runs find them. Without names: all.",
+    (
+        Option("what", "kinds of systems; see --list", nargs="*"),
+        Option("--list", "say what each of them is, and leave", action="store_true"),
+    ),
+    _warmup,
+)

@@ -1,7 +1,7 @@
 """Free energies along held coordinates, and relaxed scans.
 
-- `rigid_turns`: torsions turned as rigid groups
-- `compiled_samples`, `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `torsion_force`: torsions turned as rigid groups
+- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
 - `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
@@ -25,17 +25,16 @@ _NAMES = {
     "windows.window": ("Settings", "Window"),
     "windows.ase_windows": ("AseWindows",),
     "windows.openmm_windows": ("OpenMMWindows",),
-    "windows.window_results": ("FreeEnergy", "WindowResult"),
+    "windows.free_energy": ("FreeEnergy", "WindowResult"),
     "windows.driver": ("Windows",),
-    "windows.windows_report": ("windows_report",),
-    "windows.plan_file": ("PlanFile", "read_plan"),
+    "windows.input_file": ("InputFile", "read_input"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "profiles.plots": ("plot_profile", "plot_surface", "plot_works"),
     "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
-    "scans.relaxed_scan": ("Scan", "scan"),
-    "scans.scan_report": ("scan_report",),
+    "scans.relaxed_scan": ("scan",),
+    "scans.scan_result": ("Scan",),
     "scans.system_calculator": ("SystemCalculator",),
 }
 

@@ -113,8 +113,7 @@ class AseRecorder:
         if spheres and not np.isfinite(sample.mean_kinetic).all():
             raise UnsupportedError(
                 f"velocities on isokinetic spheres are not thermal, and multipliers of {', '.join(self._held.names)} "
-                "need them: their mean is known without only where all that is held on these atoms are distances, "
-                "angles and torsions. Take bath='langevin'"
+                "need them: their mean is found without only for up to 60 rows at rest. Take bath='langevin'"
             )
         self.last = sample
         self.series.append(sample)

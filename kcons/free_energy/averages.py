@@ -117,11 +117,11 @@ def weighted_mean(
     """
     series, factors = _checked(values, weights, log_weights)
     _refuse_one_sample(factors)
-    start = _equilibrated(_linearised(series, factors)) if equilibration else 0
+    start = _equilibrated(_linearized(series, factors)) if equilibration else 0
     series, factors = series[start:], factors[start:]
     _refuse_one_sample(factors)
     n = len(series)
-    fluctuation = _linearised(series, factors)
+    fluctuation = _linearized(series, factors)
     counted = series[factors > 0]
     scale = np.maximum(np.abs(counted).max(axis=0), np.finfo(float).tiny)
     constant = np.abs(counted - counted[0]).max(axis=0) <= 1e-13 * scale
@@ -253,7 +253,7 @@ def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:
     return np.asarray(factors @ series / factors.sum())
 
 
-def _linearised(series: FloatArray, factors: FloatArray) -> FloatArray:
+def _linearized(series: FloatArray, factors: FloatArray) -> FloatArray:
     """What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0."""
     return factors[:, None] * (series - _mean(series, factors)) / factors.mean()
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dtrtri
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -15,12 +16,17 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet, rows_like
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
-from kcons.free_energy.compiled_samples import CompiledSamples, compilable
-from kcons.free_energy.rigid_turns import RigidTurn, leaves_the_rest, rigid_turn
+from kcons.free_energy.torsion_force import RigidTurn, leaves_the_rest, rigid_turn
 from kcons.motion.motion import Motion
 
 #: A coordinate of which the other constraints leave less than this share of its Z depends on them.
 DEPENDENT = 1e-9
+#: Pivots below which rows may depend on each other, and eigenvalues that count as none; of rows of length 1.
+_PIVOT, _NONE = 1e-4, 1e-12
+#: Share of a coordinate in a combination of rows that vanishes, above which it depends on the others.
+_LOST = 1e-12
+#: Rows of the clusters, and atoms of a row, up to which the mean over velocities is computed.
+_MOST_ROWS, _MOST_ATOMS = 60, 12
 
 
 class Sample(NamedTuple):
@@ -45,8 +51,8 @@ class Sample(NamedTuple):
     turned : ndarray
         dU/dq of the rigid turn of a torsion's group; NaN where there is none.
     mean_kinetic : ndarray
-        The mean of `kinetic` over canonical velocities, by kT; NaN where not all that is held in the clusters of the
-        coordinates are independent distances, angles and torsions at rest.
+        The mean of `kinetic` over canonical velocities, by kT; NaN where the clusters of the coordinates have more than
+        60 rows, rows of more than 12 atoms, or targets that move.
     """
 
     time: float
@@ -93,7 +99,7 @@ class HeldCoordinates:
         Each a constraint of the set, named by an object of the same kind on the same atoms. One with n > 1 rows gives
         n coordinates, ``name[0]`` to ``name[n - 1]``.
     positions : array_like, shape (n_atoms, 3)
-        Where rank and clusters are found.
+        Where it is found out whether the coordinates depend on the other constraints.
     time : float
         Time of `positions`, for targets that move.
     bonds : array_like of int, shape (n, 2), optional
@@ -108,8 +114,6 @@ class HeldCoordinates:
         2 pi for dihedrals; 0 for coordinates without a period.
     atoms : ndarray of int
         The atoms whose positions, velocities and forces matter.
-    motion : Motion or None
-        The engine of the other constraints of these clusters; None if there are none.
 
     Raises
     ------
@@ -153,28 +157,26 @@ class HeldCoordinates:
         self.names = tuple(names)
         self.rows: IntArray = np.array(rows, dtype=np.int64)
         self._source = held
-        order = np.argsort(self.rows)
-        self._rank_of = np.argsort(order)
-        self._own, own_atoms = held.subset(self.rows[order])
-        self.periods = self._named(np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in self._own.constraints]))
-        others = np.setdiff1d(_joined_rows(held, self.rows), self.rows)
+        everything = _joined_rows(held, self.rows)
+        others = np.setdiff1d(everything, self.rows)
         if not held.holonomic[others].all():
             raise UnsupportedError(
                 f"{' and '.join(names)} share atoms with velocity constraints, under which configurations have no "
                 "known distribution; multipliers alone are those of Motion.multipliers"
             )
-        self._others, other_atoms = held.subset(others)
-        self.atoms: IntArray = np.union1d(own_atoms, other_atoms).astype(np.int64)
-        self._own_atoms = np.searchsorted(self.atoms, own_atoms)
-        self._other_atoms = np.searchsorted(self.atoms, other_atoms)
-        self._inverse_masses = 1 / held.masses[self.atoms, None]
-        self.motion = Motion(self._others, x[other_atoms], time=time) if len(others) else None
-        self._at(x[self.atoms], time)
-        self._compiled: CompiledSamples | None = None
-        if compilable(self._own) and compilable(self._others):
-            places = (self._rank_of, self._own_atoms, self._other_atoms)
-            masses = held.masses[self.atoms]
-            self._compiled = CompiledSamples(self._own, self._others, *places, self.atoms, 1 / masses, self.periods)
+        #: All rows of the clusters; in results those of the coordinates, as they are named, come after the others.
+        self._rows, self.atoms = held.subset(everything)
+        self._order = np.searchsorted(everything, np.concatenate([others, self.rows]))
+        self.periods = np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in self._rows.constraints])
+        self.periods = self.periods[self._order][-len(self) :]
+        self._inverse_masses = np.repeat(1 / held.masses[self.atoms], 3)
+        widest = max(item.width for item in self._rows.constraints)
+        self._averages = len(everything) <= _MOST_ROWS and widest <= _MOST_ATOMS and not self._rows.moving
+        self._copies: dict[tuple[int, int], Constraint] = {}
+        here = x[self.atoms]
+        near = 1e-3 * np.random.default_rng(1).normal(size=here.shape) * np.ptp(here, axis=0).max()
+        for place in (here, here + near):  # beside a structure so symmetric that a gradient vanishes
+            self._at(place, time)
         self._turns: list[RigidTurn | None] = [None] * len(self)
         if bonds is not None:
             pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
@@ -187,8 +189,9 @@ class HeldCoordinates:
         return len(self.names)
 
     def __repr__(self) -> str:
-        beside = 0 if self.motion is None else self.motion.rank
-        return f"<HeldCoordinates: {', '.join(self.names)}, beside {beside} independent rows of their clusters>"
+        return (
+            f"<HeldCoordinates: {', '.join(self.names)}, beside {len(self._order) - len(self)} rows of their clusters>"
+        )
 
     def sample(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> Sample:
         """The coordinates at one configuration.
@@ -208,14 +211,9 @@ class HeldCoordinates:
         SingularGeometryError
             A coordinate has come to depend on the other constraints.
         """
-        shape = (self._source.n_atoms, 3)
+        shape, d = (self._source.n_atoms, 3), len(self)
         named = ((x, "positions"), (v, "velocities"), (f, "forces"))
         whole = [as_array(array, shape, item) for array, item in named]
-        turned = np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns])
-        found = None if self._compiled is None else self._compiled.sample(whole, time, self._source.lattice)
-        if found is not None:
-            value, moving, kinetic, gradient, off, log_det_z, mean = found
-            return Sample(time, value, moving, kinetic, float(log_det_z[0]), gradient, max(off.tolist()), turned, mean)
         for array, (_, item) in zip(whole, named, strict=True):
             finite = np.isfinite(array[self.atoms]).all(axis=1)
             if not finite.all():
@@ -223,19 +221,24 @@ class HeldCoordinates:
                 raise NonFiniteError(f"{item} of atom {atom} are not finite at time {time:g}", item=item, atom=atom)
         here, speed, force = (array[self.atoms] for array in whole)
         metric = self._at(here, time)
-        pushed = np.einsum("ian,an->i", metric.kept, force)
-        bent = self._curvatures(here, self._fields(speed, metric.directions), time, metric)
-        if self._source.moving:
-            rest, driven = (self._targets(here, u, time, metric) for u in (np.zeros_like(here), speed))
+        along = metric.directions
+        pairs = [along[s] + sign * along[j] for s in range(d) for j in range(s) for sign in (1, -1)]
+        fields = [speed.ravel(), *along, *pairs, *(metric.fields if self._averages else ())]
+        bent, traces = self._curvatures(here, np.array(fields), time)
+        rows, order, respond = self._rows, self._order, metric.respond
+        if rows.moving:
+            rest, driven = (rows.acceleration_target(here, u, time)[order] for u in (np.zeros_like(here), speed))
         else:
-            rest, driven = np.zeros(len(self)), -bent[0]
-        still, moving = metric.inverse @ (rest - pushed), metric.inverse @ (driven - pushed)
-        value = self._named(self._own.measure(here[self._own_atoms], time))
-        gradient = self._change_of_z(bent[1:])
-        off = nearest_image(value - self._named(self._own.target(time)), self.periods)
-        largest = float(np.abs(off).max())
-        unknown = np.full(len(self), np.nan)
-        return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, largest, turned, unknown)
+            rest, driven = np.zeros(len(order)), -bent[0]
+        still, moving = (respond @ b - along @ force.ravel() for b in (rest, driven))
+        mean = np.full(d, np.nan)
+        if self._averages:
+            mean = respond @ (bent[1 + d * d :].sum(axis=0) - traces)
+        value = rows.measure(here, time)[order][-d:]
+        off = float(np.abs(nearest_image(value - rows.target(time)[order][-d:], self.periods)).max())
+        turned = np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns])
+        gradient = self._change_of_z(bent[1 : 1 + d * d] @ metric.shares.T)
+        return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, off, turned, mean)
 
     def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Displacements that change one coordinate by one, and no other nor any constraint, shape (d, n_atoms, 3).
@@ -245,81 +248,63 @@ class HeldCoordinates:
         """
         here = as_array(x, (self._source.n_atoms, 3), "positions")
         result = np.zeros((len(self), *here.shape))
-        result[:, self.atoms] = self._at(here[self.atoms], time).directions
+        result[:, self.atoms] = self._at(here[self.atoms], time).directions.reshape(len(self), -1, 3)
         return result
 
     # -- pieces, on the atoms of the clusters ---------------------------------------------------
 
-    def _named(self, of_rows: FloatArray) -> FloatArray:
-        """From the order of rows in the set to that of the names."""
-        return of_rows[self._rank_of]
-
     def _at(self, x: FloatArray, time: float) -> _Metric:
         """Z and all that follows from the gradients at `x`; raises where a coordinate depends on other constraints."""
-        self._own.lattice = self._others.lattice = self._source.lattice
-        d, near = len(self), self._other_atoms
-        gradients = np.zeros((d, *x.shape))
-        gradients[:, self._own_atoms] = self._named(_gradients(self._own, x[self._own_atoms], time))
-        kept = gradients * self._inverse_masses
-        free = np.einsum("ian,ian->i", gradients, kept)
-        reactions = np.zeros((d, 0))
-        if self.motion is not None:
-            rest = np.zeros((len(near), 3))
-            rows = self.motion.constraint_set
-            b = -rows.acceleration_target(x[near], rest, time) if rows.moving else None
-            answers = [self.motion.respond(x[near], rest, g[near], time, feedback=b) for g in gradients]
-            kept[:, near] = [acceleration for acceleration, _ in answers]
-            reactions = np.array([multipliers for _, multipliers in answers])
-        z = np.einsum("ian,jan->ij", gradients, kept)
-        z = (z + z.T) / 2
-        with np.errstate(all="ignore"):
-            share = z / np.sqrt(np.outer(free, free))
-        if not np.all(np.isfinite(share)):
+        d = len(self)
+        self._rows.lattice = self._source.lattice
+        gradients = _gradients(self._rows, x, time)[self._order]
+        weighed = gradients * self._inverse_masses
+        product = weighed @ gradients.T
+        if not np.isfinite(product).all():
             raise NonFiniteError(f"the gradient of {', '.join(self.names)} is not finite", item="positions")
-        left, mixture = np.linalg.eigh(share) if d > 1 else (share[0], np.ones((1, 1)))
+        size = np.sqrt(np.diagonal(product))
+        size = np.where(size > 0, size, 1.0)
+        root, lost = _root(product / np.outer(size, size))
+        self._refuse(np.flatnonzero(lost[-d:] > _LOST).tolist())
+        root /= size
+        respond = root[:, -d:].T @ root  # of (A M^-1 A^T)^-1, of which Z^-1 is the last block
+        z = np.linalg.inv(respond[:, -d:])
+        share = z / np.outer(size[-d:], size[-d:])
+        left, mixture = np.linalg.eigh(share)
         if left[0] < DEPENDENT:
-            worst = [k for k in range(d) if abs(mixture[k, 0]) > 0.1]
+            self._refuse([k for k in range(d) if abs(mixture[k, 0]) > 0.1])
+        log_det_z = float(np.linalg.slogdet(z)[1])
+        return _Metric(log_det_z, respond, z @ respond, respond @ weighed, root @ weighed)
+
+    def _refuse(self, dependent: list[int]) -> None:
+        if dependent:
+            atoms = [_row(self._source, row).atoms.ravel() for row in self.rows[dependent].tolist()]
             raise SingularGeometryError(
-                f"{' and '.join(self.names[k] for k in worst)} depend{'s' if len(worst) == 1 else ''} on the other "
-                "constraints (Z = 0): nothing is left to move along; take out the constraints that fix it, or measure "
-                "another coordinate",
-                rows=self.rows[worst],
-                atoms=self.atoms[self._own_atoms],
+                f"{' and '.join(self.names[k] for k in dependent)} depend{'s' if len(dependent) == 1 else ''} on the "
+                "other constraints (Z = 0): nothing is left to move along; take out the constraints that fix it, or "
+                "measure another coordinate",
+                rows=self.rows[dependent],
+                atoms=np.unique(np.concatenate(atoms)),
             )
-        inverse = np.linalg.inv(z) if d > 1 else 1 / z
-        log_det_z = float(np.linalg.slogdet(z)[1] if d > 1 else np.log(z[0, 0]))
-        return _Metric(log_det_z, inverse, kept, reactions, np.tensordot(inverse, kept, 1))
 
-    def _seen(self, own: FloatArray, others: FloatArray | None, metric: _Metric) -> FloatArray:
-        """What a quantity of rows means for the coordinates once the other constraints have had their share."""
-        seen = self._named(own)
-        return seen if others is None else seen + metric.reactions @ others
-
-    def _targets(self, x: FloatArray, v: FloatArray, time: float, metric: _Metric) -> FloatArray:
-        """b of the coordinates, less what the other constraints' b gives them."""
-        own, near = self._own_atoms, self._other_atoms
-        others = None if self.motion is None else self.motion.constraint_set
-        return self._seen(
-            self._own.acceleration_target(x[own], v[own], time),
-            None if others is None else others.acceleration_target(x[near], v[near], time),
-            metric,
-        )
-
-    def _curvatures(self, x: FloatArray, u: FloatArray, time: float, metric: _Metric) -> FloatArray:
-        """u^T q'' u of the coordinates on the surface of the other constraints, for k fields u at once, (k, d)."""
-        own, near = self._own_atoms, self._other_atoms
-        seen = self._named(_curvatures(self._own, x[own], u[:, own], time).T).T
-        if self.motion is not None:
-            seen = seen + _curvatures(self.motion.constraint_set, x[near], u[:, near], time) @ metric.reactions.T
-        return seen
-
-    def _fields(self, v: FloatArray, along: FloatArray) -> FloatArray:
-        """The velocities, the directions, and of each two directions the sum and the difference."""
-        pairs = [along[s] + sign * along[j] for s in range(len(along)) for j in range(s) for sign in (1, -1)]
-        return np.array([v, *along, *pairs])
+    def _curvatures(self, x: FloatArray, u: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        """u^T q'' u of all rows for k fields u, shape (k, rows), and the trace of M^-1 q'' of each row, or zeros."""
+        fields, bent, traces = u.reshape(len(u), -1, 3), [], []
+        for k, item in enumerate(self._rows.constraints):
+            w = item.width
+            unit = np.repeat(np.eye(3 * w).reshape(-1, 1, w, 3), item.n_rows, axis=1)
+            v = np.concatenate([fields[:, item.atoms], unit]) if self._averages else fields[:, item.atoms]
+            if (k, len(v)) not in self._copies:  # the rows once more for each field
+                self._copies[k, len(v)] = item.select(np.tile(np.arange(item.n_rows), len(v)))
+            r = np.tile(self._rows.gather(item, x), (len(v), 1, 1))
+            found = self._copies[k, len(v)].curvature(r, v.reshape(r.shape), time).reshape(len(v), -1)
+            bent.append(found[: len(u)])
+            each = found[len(u) :].reshape(-1, 3, item.n_rows).sum(axis=1)
+            traces.append((each * self._inverse_masses[::3][item.atoms].T[: len(each)]).sum(axis=0))
+        return np.concatenate(bent, axis=1)[:, self._order], np.concatenate(traces)[self._order]
 
     def _change_of_z(self, bent: FloatArray) -> FloatArray:
-        """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarised."""
+        """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarized."""
         d = len(self)
         result, pairs = np.diagonal(bent).copy(), iter(bent[d:])
         for s in range(d):
@@ -331,37 +316,39 @@ class HeldCoordinates:
 
 
 class _Metric(NamedTuple):
-    """At one configuration, on n atoms.
+    """At one configuration, for d coordinates among r rows on n atoms.
 
-    `inverse` (d, d) of Z; `kept` (d, n, 3), M_par^+ times the gradients; `reactions` (d, rows), the multipliers with
-    which the other constraints answer a gradient; `directions` (d, n, 3).
+    `respond` (d, r), rows of (A M^-1 A^T)^-1; `shares` (d, r), of each row in a coordinate's gradient that the other
+    rows have answered; `directions` (d, 3 n); `fields` (r, 3 n), whose squares are what the rows take from M^-1.
     """
 
     log_det_z: float
-    inverse: FloatArray
-    kept: FloatArray
-    reactions: FloatArray
+    respond: FloatArray
+    shares: FloatArray
     directions: FloatArray
+    fields: FloatArray
+
+
+def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """W with W^T W the (pseudo)inverse of a matrix with a diagonal of 1; how much of each row depends on others."""
+    try:
+        root = np.linalg.cholesky(product)
+        if np.diagonal(root).min() > _PIVOT:
+            return np.array(dtrtri(root, lower=1)[0]), np.zeros(len(product))
+    except np.linalg.LinAlgError:
+        pass
+    sizes, axes = np.linalg.eigh(product)
+    known = sizes > _NONE * sizes[-1]
+    return (axes[:, known] / np.sqrt(sizes[known])).T, (axes[:, ~known] ** 2).sum(axis=1)
 
 
 def _gradients(held: ConstraintSet, x: FloatArray, time: float) -> FloatArray:
-    """The rows' gradients, shape (n_rows, n_atoms, 3)."""
+    """The rows' gradients, shape (n_rows, 3 n_atoms)."""
     result = np.zeros((held.n_rows, *x.shape))
     for start, item in zip(held.starts, held.constraints, strict=False):
         rows = start + np.arange(item.n_rows)[:, None]
         np.add.at(result, (rows, item.atoms), item.gradient(held.gather(item, x), time))
-    return result
-
-
-def _curvatures(held: ConstraintSet, x: FloatArray, u: FloatArray, time: float) -> FloatArray:
-    """u^T q'' u of all rows for k fields, shape (k, n_rows): the rows once more for each field, in one call."""
-    many, parts = len(u), []
-    for item in held.constraints:
-        again = item.select(np.tile(np.arange(item.n_rows), many))
-        r = np.tile(held.gather(item, x), (many, 1, 1))
-        v = u[:, item.atoms].reshape(r.shape)
-        parts.append(again.curvature(r, v, time).reshape(many, -1))
-    return np.concatenate(parts, axis=1)
+    return result.reshape(held.n_rows, -1)
 
 
 def _row(held: ConstraintSet, row: int) -> Constraint:

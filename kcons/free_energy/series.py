@@ -20,6 +20,16 @@ _VECTORS = ("value", "multiplier", "kinetic", "gradient", "turned", "mean_kineti
 _NUMBERS = ("time", "log_det_z", "off")
 
 
+def _column(field: str) -> property:
+    """A quantity of all samples."""
+
+    def column(series: Series) -> FloatArray:
+        found = np.array([getattr(sample, field) for sample in series], dtype=np.float64)
+        return found.reshape(len(series), len(series.names)) if field in _VECTORS else found
+
+    return property(column)
+
+
 class Series:
     """Samples of held coordinates; see `Sample` for what they are.
 
@@ -98,47 +108,8 @@ class Series:
             raise InputError(f"there is no coordinate {name!r}; there are {', '.join(self.names)}", item="name")
         return self.multiplier[:, self.names.index(name)]
 
-    def _numbers(self, field: str) -> FloatArray:
-        return np.array([getattr(sample, field) for sample in self._samples], dtype=np.float64)
-
-    def _vectors(self, field: str) -> FloatArray:
-        return self._numbers(field).reshape(len(self), len(self.names))
-
-    @property
-    def time(self) -> FloatArray:
-        return self._numbers("time")
-
-    @property
-    def log_det_z(self) -> FloatArray:
-        return self._numbers("log_det_z")
-
-    @property
-    def off(self) -> FloatArray:
-        return self._numbers("off")
-
-    @property
-    def value(self) -> FloatArray:
-        return self._vectors("value")
-
-    @property
-    def multiplier(self) -> FloatArray:
-        return self._vectors("multiplier")
-
-    @property
-    def kinetic(self) -> FloatArray:
-        return self._vectors("kinetic")
-
-    @property
-    def gradient(self) -> FloatArray:
-        return self._vectors("gradient")
-
-    @property
-    def turned(self) -> FloatArray:
-        return self._vectors("turned")
-
-    @property
-    def mean_kinetic(self) -> FloatArray:
-        return self._vectors("mean_kinetic")
+    time, log_det_z, off = map(_column, _NUMBERS)
+    value, multiplier, kinetic, gradient, turned, mean_kinetic = map(_column, _VECTORS)
 
     @property
     def weights(self) -> FloatArray:

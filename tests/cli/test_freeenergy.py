@@ -16,9 +16,9 @@ from ase.build import molecule
 from ase.io import write
 
 from kcons.cli.main import main
-from kcons.free_energy import Windows, read_plan
+from kcons.free_energy import Windows, read_input
 
-PLAN = """
+INPUT = """
 [structure]
 file = "methanol.xyz"
 [forces]
@@ -41,21 +41,21 @@ both_sides = false
 """
 
 
-def test_a_plan_runs_and_goes_on(tmp_path, capsys, monkeypatch):
+def test_an_input_runs_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "plan.toml").write_text(PLAN)
-    assert main(["freeenergy", "plan.toml", "--list"]) == 0
+    (tmp_path / "input.toml").write_text(INPUT)
+    assert main(["freeenergy", "input.toml", "--list"]) == 0
     assert capsys.readouterr().out == (
         "4 windows of turn, a run each\n84 steps a run: pull 10, equilibration 10, production 64; a sample every 2\n"
     )
-    assert main(["freeenergy", "plan.toml", "--workers", "1"]) == 0
+    assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr()
-    assert "turn (degrees)" in shown.out and "wrote plan/profile.png" in shown.out
-    assert len(list((tmp_path / "plan").glob("window-*.npz"))) == 4
-    known = json.loads((tmp_path / "plan" / "free_energy.json").read_text())
-    assert main(["freeenergy", "plan.toml", "--workers", "1"]) == 0
-    assert json.loads((tmp_path / "plan" / "free_energy.json").read_text()) == known
+    assert "turn (degrees)" in shown.out and "wrote input/profile.png" in shown.out
+    assert len(list((tmp_path / "input").glob("window-*.npz"))) == 4
+    known = json.loads((tmp_path / "input" / "free_energy.json").read_text())
+    assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
+    assert json.loads((tmp_path / "input" / "free_energy.json").read_text()) == known
     assert main(["freeenergy", "nothing.toml"]) == 2
     assert "there is no file" in capsys.readouterr().err
 
@@ -71,14 +71,14 @@ steps = 40
 def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "plan.toml").write_text(PLAN + PULLS)
-    assert main(["freeenergy", "plan.toml", "--list"]) == 0
+    (tmp_path / "input.toml").write_text(INPUT + PULLS)
+    assert main(["freeenergy", "input.toml", "--list"]) == 0
     assert "5 pulls both ways of 40 steps each" in capsys.readouterr().out
-    assert main(["freeenergy", "plan.toml", "--workers", "1"]) == 0
+    assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr().out
-    assert "pulls give " in shown and "(BAR;" in shown and " standard errors" in shown and "plan/pulls.json" in shown
-    assert len(list((tmp_path / "plan" / "pulls").glob("pull-*.npz"))) == 10
-    known = json.loads((tmp_path / "plan" / "pulls.json").read_text())
+    assert "pulls give " in shown and "(BAR;" in shown and " standard errors" in shown and "input/pulls.json" in shown
+    assert len(list((tmp_path / "input" / "pulls").glob("pull-*.npz"))) == 10
+    known = json.loads((tmp_path / "input" / "pulls.json").read_text())
     assert np.degrees([known["from"][0], known["to"][0]]) == pytest.approx([60, 200])
     assert set(known) >= {"bar", "jarzynski", "windows"}
     difference = (known["bar"][0] - known["windows"][0]) / np.hypot(known["bar"][1], known["windows"][1])
@@ -89,29 +89,29 @@ def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
 def test_list_looks_at_torsions_and_imports_no_calculator(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "plan.toml").write_text(PLAN.replace("[2, 0, 1, 3]", "[0, 2, 1, 3]"))
-    assert main(["freeenergy", "plan.toml", "--list"]) == 0
+    (tmp_path / "input.toml").write_text(INPUT.replace("[2, 0, 1, 3]", "[0, 2, 1, 3]"))
+    assert main(["freeenergy", "input.toml", "--list"]) == 0
     shown = capsys.readouterr()
     assert "4 windows of turn" in shown.out and "2-1 is no bond" in shown.err and shown.err.startswith("kcons: turn is")
     mine = 'calculator = "lj"\nsettings = {sigma = 1.0, epsilon = 0.02, rc = 6.0}'
     other = 'calculator = "os:system"\nsettings = {command = "touch ran"}'
-    assert mine in PLAN
-    (tmp_path / "plan.toml").write_text(PLAN.replace(mine, other))
-    assert main(["freeenergy", "plan.toml", "--list"]) == 2
+    assert mine in INPUT
+    (tmp_path / "input.toml").write_text(INPUT.replace(mine, other))
+    assert main(["freeenergy", "input.toml", "--list"]) == 2
     assert "--allow-module os on the command line" in capsys.readouterr().err
-    assert main(["freeenergy", "plan.toml", "--list", "--allow-module", "os"]) == 0
-    assert main(["freeenergy", "plan.toml", "--allow-module", "os"]) == 2
+    assert main(["freeenergy", "input.toml", "--list", "--allow-module", "os"]) == 0
+    assert main(["freeenergy", "input.toml", "--allow-module", "os"]) == 2
     assert "os:system is no calculator of ASE" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["methanol.xyz", "plan.toml"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["input.toml", "methanol.xyz"]
 
 
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
 def test_a_run_that_is_stopped_says_how_it_goes_on(sent, tmp_path):
     """And ends within seconds, whatever its windows would take."""
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "plan.toml").write_text(PLAN.replace("production = 64", "production = 100_000_000"))
+    (tmp_path / "input.toml").write_text(INPUT.replace("production = 64", "production = 100_000_000"))
     process = subprocess.Popen(
-        [sys.executable, "-m", "kcons", "freeenergy", "plan.toml", "--workers", "2"],
+        [sys.executable, "-m", "kcons", "freeenergy", "input.toml", "--workers", "2"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])},
         stdout=subprocess.DEVNULL,
@@ -119,7 +119,7 @@ def test_a_run_that_is_stopped_says_how_it_goes_on(sent, tmp_path):
         text=True,
     )
     try:
-        while not (tmp_path / "plan" / "settings.json").exists():
+        while not (tmp_path / "input" / "settings.json").exists():
             assert process.poll() is None
             time.sleep(0.05)
         time.sleep(1.0)
@@ -130,39 +130,39 @@ def test_a_run_that_is_stopped_says_how_it_goes_on(sent, tmp_path):
     word, status = {"SIGINT": ("interrupted", 130), "SIGTERM": ("terminated", 143)}[sent]
     assert process.returncode == status
     assert f"kcons: {word}; finished windows are kept: run again to resume" in said and "Traceback" not in said
-    assert [path.name for path in (tmp_path / "plan").iterdir()] == ["settings.json"]
+    assert [path.name for path in (tmp_path / "input").iterdir()] == ["settings.json"]
 
 
 def test_a_scheduler_is_named_by_who_runs_the_plan(tmp_path, capsys, monkeypatch):
     """Its answers are pickles."""
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "plan.toml").write_text(PLAN + '[workers]\nscheduler = "tcp://127.0.0.1:9"\n')
-    assert main(["freeenergy", "plan.toml"]) == 2
+    (tmp_path / "input.toml").write_text(INPUT + '[workers]\nscheduler = "tcp://127.0.0.1:9"\n')
+    assert main(["freeenergy", "input.toml"]) == 2
     assert "if you trust it, say so: --scheduler tcp://127.0.0.1:9" in capsys.readouterr().err
-    assert not (tmp_path / "plan").exists()
-    assert main(["freeenergy", "plan.toml", "--list"]) == 0
+    assert not (tmp_path / "input").exists()
+    assert main(["freeenergy", "input.toml", "--list"]) == 0
 
 
 def test_two_runs_into_one_folder_and_results_of_others(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "plan.toml").write_text(PLAN)
-    plan = read_plan("plan.toml")
-    with Windows(plan.sampler, "plan", plan.settings, **plan.options).taken():
-        assert main(["freeenergy", "plan.toml"]) == 2
-    assert "kcons: another run writes into plan (process " in capsys.readouterr().err
+    (tmp_path / "input.toml").write_text(INPUT)
+    given = read_input("input.toml")
+    with Windows(given.sampler, "input", given.settings, **given.options).taken():
+        assert main(["freeenergy", "input.toml"]) == 2
+    assert "kcons: another run writes into input (process " in capsys.readouterr().err
     for name in ("free_energy.json", "profile.csv", "pulls.json"):
         other = tmp_path / f"of-{name}" / name
         other.parent.mkdir()
         other.write_text("precious")
-        assert main(["freeenergy", "plan.toml", "--out", str(other.parent)]) == 2
+        assert main(["freeenergy", "input.toml", "--out", str(other.parent)]) == 2
         assert f"other files called {name}; give another folder (--out)" in capsys.readouterr().err
         assert other.read_text() == "precious" and len(list(other.parent.iterdir())) == 1
     # Before any window is sampled.
-    (tmp_path / "plan.toml").write_text(PLAN + PULLS)
+    (tmp_path / "input.toml").write_text(INPUT + PULLS)
     (tmp_path / "new" / "pulls").mkdir(parents=True)
     (tmp_path / "new" / "pulls" / "settings.json").write_text("precious")
-    assert main(["freeenergy", "plan.toml", "--out", "new"]) == 2
+    assert main(["freeenergy", "input.toml", "--out", "new"]) == 2
     assert "new/pulls has other files called settings.json" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["pulls"]

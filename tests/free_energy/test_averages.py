@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import kstest, norm
+from scipy.stats import kstest
 
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 from kcons.free_energy import averages
 from kcons.free_energy.averages import agreement, weighted_mean
 
@@ -21,43 +21,14 @@ def ar1(rng, n, memory, d=1):
     return lfilter([1.0], [1.0, -memory], noise, axis=0)
 
 
-def within(found, expected, deviations):
-    """How many of the results are within so many standard errors."""
-    off = np.array([(m.value - expected) / m.error for m in found])
-    return float((np.abs(off) < deviations).mean())
-
-
-@pytest.mark.parametrize("memory", [0.0, 0.7, 0.9])
-def test_intervals_cover_as_often_as_they_say(memory):
-    rng, exact = np.random.default_rng(1), (1 + memory) / (1 - memory)
-    found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(300)]
-    # Standard deviation of the counts: 0.027 and 0.013.
-    assert within(found, 5.0, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.08)
-    assert within(found, 5.0, norm.ppf(0.975)) == pytest.approx(0.95, abs=0.04)
-    assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
-    assert np.median([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
-
-
-def test_a_small_slow_part_counts():
-    """A hundredth of the variance with a memory of 300 samples: noise hides it in the autocorrelation (g of 1.3)."""
-    rng, memory = np.random.default_rng(1), np.exp(-1 / 300)
-    exact = 1 + 2 * 0.01 / 1.01 * memory / (1 - memory)
-    series = (rng.standard_normal(30_000) + 0.1 * ar1(rng, 30_000, memory)[:, 0] for _ in range(60))
-    found = [weighted_mean(values) for values in series]
-    assert within(found, 0.0, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.15)
-    assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.3)
-
-
-@pytest.mark.filterwarnings("ignore:.*independent ones")  # in one of 300, a single block has most of the spread
-def test_weights_that_belong_to_the_values():
-    """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
-    rng, b = np.random.default_rng(2), 1.0
-    found = []
-    for _ in range(300):
-        x = ar1(rng, 3000, 0.6)
-        found.append(weighted_mean(x, log_weights=b * x[:, 0] + 900.0))
-    assert within(found, b, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.08)
-    assert within(found, b, norm.ppf(0.975)) == pytest.approx(0.95, abs=0.04)
+def test_samples_are_worth_fewer_independent_ones():
+    """That intervals cover as often as they say is asked in tests/thermostats/test_correlated_series.py."""
+    rng = np.random.default_rng(1)
+    for memory in (0.0, 0.7, 0.9):
+        exact = (1 + memory) / (1 - memory)
+        found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(100)]
+        assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
+        assert np.median([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
 
 
 def test_several_quantities_at_once_have_a_covariance():
@@ -90,34 +61,10 @@ def test_the_beginning_can_be_left_out():
     assert abs(right.value[0]) < 4 * right.error[0] < 0.5 * abs(biased.value[0])
 
 
-@pytest.mark.parametrize(
-    ("values", "weights", "item", "message"),
-    [
-        (np.zeros(15), None, "values", "too few"),
-        (np.zeros((20, 0)), None, "values", "too few"),
-        ([1.0] * 19 + [np.nan], None, "values", "sample 19"),
-        (np.arange(20.0), np.ones(19), "weights", r"shape \(20,\)"),
-        (np.arange(20.0), np.full(20, np.inf), "weights", "sample 0"),
-        (np.arange(20.0), -np.ones(20), "weights", "negative"),
-        (np.arange(20.0), np.zeros(20), "weights", "positive"),
-        (np.arange(20.0), np.eye(20)[3], "weights", "sample 3 has all of the weight"),
-    ],
-)
-def test_bad_input_is_refused(values, weights, item, message):
-    with pytest.raises(InputError, match=message) as caught:
-        weighted_mean(values, weights)
-    assert caught.value.item == item
-
-
 def test_a_common_factor_of_weights_does_not_matter():
     values = np.random.default_rng(3).standard_normal(64)
     small, large = weighted_mean(values, np.full(64, 1e-300)), weighted_mean(values, np.full(64, 1e308))
     assert small.value == large.value and small.error == large.error and np.isfinite(large.value).all()
-
-
-def test_both_kinds_of_weights_are_refused():
-    with pytest.raises(InputError, match="one of them"):
-        weighted_mean(np.arange(20.0), np.ones(20), log_weights=np.zeros(20))
 
 
 def test_one_sample_with_all_the_weight_is_warned_of():
@@ -162,14 +109,6 @@ def test_agreement_of_single_numbers_and_of_exact_ones():
     assert agreement(1.0, 0.0, 1.1, 0.0).p_value == 0.0
     one = np.diag([1.0, 0.0])
     assert agreement([0.0, 2.0], one, [1.0, 2.0], one).degrees_of_freedom == 1
-    for wrong in (
-        ([0.0, 1.0], one, [0.0], [[1.0]]),
-        ([0.0], one, [0.0], one),
-        ([np.nan], [[1.0]], [0.0], [[1.0]]),
-        (1.0, -1.0, 2.0, 2.0),
-    ):
-        with pytest.raises(InputError):
-            agreement(*wrong)
 
 
 def test_what_changes_without_any_weight_is_constant():

@@ -21,20 +21,24 @@ from typing import TypeAlias
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve, cholesky
-from scipy.optimize import OptimizeResult, minimize
+from scipy.optimize import OptimizeResult, minimize, root
 
 from kcons.constraints.arguments import FloatArray
 from kcons.thermostats import Estimate
 
 #: Of the diagonal, added to the covariance: rounding of a matrix of that size.
 _ROUNDING = 1e-10
-#: Prior standard deviations of the logarithms of amplitude, of length, and of neighbouring local lengths.
+#: Prior standard deviations of the logarithms of amplitude, of length, and of neighboring local lengths.
 _WIDE, _LOCAL = 1.5, 0.5
 #: Prior standard deviation of a constant gradient, in units of the largest gradient seen.
 _TREND = 10.0
 #: Step of differences of logarithms of hyperparameters, least curvature of the likelihood that is believed, and the
 #: logarithm of the largest weight of a place against that of a normal distribution.
 _STEP, _FLATTEST, _HEAVIEST = 0.05, 0.5, 2.0
+#: By how much more the last parameter counts than the first where directions of the cubature are chosen.
+_TILT = 1e-3
+#: Largest logarithm of a parameter, and minus the log likelihood of those that are too smooth for double precision.
+_FURTHEST, _IMPOSSIBLE = 7.0, 1e30
 #: Lengths from which the search for the most likely ones starts, as parts of the range.
 _STARTS = (0.3, 0.1)
 
@@ -144,21 +148,15 @@ class GradientProcess:
         self.points, self.gradients, self.covariances = points, gradients, covariances
         self.axes, self.parameters, self.trends = axes, parameters, trends
         self._rotation = rotation
-        logarithms = np.split(parameters[1:], np.cumsum([axis.coefficients for axis in axes])[:-1])
-        self._factors = [np.exp(each) for each in logarithms]
         # Gradients that vanish within their errors may be as large as these.
         squares = gradients**2 + np.diagonal(covariances, axis1=1, axis2=2)
-        size = max(float(np.sqrt(g.mean())) * axis.length for g, axis in zip(squares.T, axes, strict=True)) or 1.0
-        level = float(np.mean([each.mean() for each in logarithms]))
-        self._variance = (size * math.exp(parameters[0] - level)) ** 2
+        self._size = max(float(np.sqrt(g.mean())) * axis.length for g, axis in zip(squares.T, axes, strict=True)) or 1.0
         steepest = math.sqrt(float(squares.max())) or 1.0
         self._slopes = [_TREND * steepest if free else 0.0 for free in trends]
         n, d = gradients.shape
         self._seen: Asked = (points, range(d))
-        prior = self._covariance(self._seen, self._seen)
-        prior[np.diag_indices(n * d)] += _ROUNDING * np.trace(prior) / (n * d)
         noise = np.einsum("ipq,ij->piqj", covariances, np.eye(n)).reshape(n * d, n * d)
-        self._root = cholesky(prior + noise, lower=True, check_finite=False)
+        self._root = cholesky(self._prior(parameters) + noise, lower=True, check_finite=False)
         self._weights = cho_solve((self._root, True), gradients.T.ravel(), check_finite=False)
 
     def log_likelihood(self) -> float:
@@ -166,16 +164,36 @@ class GradientProcess:
         y = self.gradients.T.ravel()
         return -0.5 * float(y @ self._weights) - float(np.log(np.diag(self._root)).sum())
 
-    def _covariance(self, left: Asked, right: Asked) -> FloatArray:
-        """Prior covariance, component by component."""
+    def slope(self, directions: FloatArray) -> FloatArray:
+        """Derivatives of the log likelihood along directions in the space of parameters, shape (k, parameters).
+
+        Those of the covariance are complex steps, exact but for rounding.
+        """
+        inverse = cho_solve((self._root, True), np.eye(len(self._weights)), check_finite=False)
+        kernel = 0.5 * (np.outer(self._weights, self._weights) - inverse)
+        steps = (self._prior(self.parameters + 1e-30j * direction) for direction in directions)
+        return np.array([float((kernel * step.imag).sum()) / 1e-30 for step in steps])
+
+    def _prior(self, parameters: FloatArray) -> FloatArray:
+        """Covariance of the gradients seen, without their errors; complex where the parameters are."""
+        prior = self._covariance(self._seen, self._seen, parameters)
+        prior[np.diag_indices(len(prior))] += _ROUNDING * np.trace(prior) / len(prior)
+        return prior
+
+    def _covariance(self, left: Asked, right: Asked, parameters: FloatArray | None = None) -> FloatArray:
+        """Prior covariance, component by component, with the parameters of the process or others."""
         (one, rows), (other, columns) = left, right
+        given = self.parameters if parameters is None else parameters
+        logarithms = np.split(given[1:], np.cumsum([axis.coefficients for axis in self.axes])[:-1])
+        factors = [np.exp(each) for each in logarithms]
+        variance = (self._size * np.exp(given[0] - np.mean([each.mean() for each in logarithms]))) ** 2
         parts = [
-            _parts(axis.periodic, factors, one.designs[j], other.designs[j])
-            for j, (axis, factors) in enumerate(zip(self.axes, self._factors, strict=True))
+            _parts(axis.periodic, factor, one.designs[j], other.designs[j])
+            for j, (axis, factor) in enumerate(zip(self.axes, factors, strict=True))
         ]
 
         def block(p: int, q: int) -> FloatArray:
-            product = self._variance * math.prod(part[p == j][q == j] for j, part in enumerate(parts))
+            product = variance * math.prod(part[p == j][q == j] for j, part in enumerate(parts))
             for j, slope in enumerate(self._slopes):
                 if slope and p in (-1, j) and q in (-1, j):
                     ends = [
@@ -184,9 +202,9 @@ class GradientProcess:
                     ]
                     product = product + slope**2 * np.outer(*ends)
             if self._rotation and p == q >= 0:
-                du, dw = (z.designs[p][1] @ self._factors[p] for z in (one, other))
+                du, dw = (z.designs[p][1] @ factors[p] for z in (one, other))
                 alike = math.prod(part[0][0] for part in parts)
-                product = product + self._rotation**2 * self._variance * alike * np.outer(du, dw)
+                product = product + self._rotation**2 * variance * alike * np.outer(du, dw)
             return np.asarray(product)
 
         return np.block([[block(p, q) for q in columns] for p in rows])
@@ -214,7 +232,7 @@ def _parts(
     (u, du), (w, dw) = ([design @ factors for design in side] for side in (left, right))
     away = u[:, None] - w[None, :]
     if periodic:  # u grows by the mean of the coefficients in a period.
-        radius = float(factors.mean()) / (2 * math.pi)
+        radius = factors.mean() / (2 * math.pi)
         square = (2 * radius * np.sin(away / (2 * radius))) ** 2
         first, second = 2 * radius * np.sin(away / radius), 2 * np.cos(away / radius)
     else:
@@ -274,32 +292,56 @@ def learn(
     def process(p: FloatArray) -> GradientProcess:
         return GradientProcess(points, gradients, covariances, axes, p, trends)
 
+    def prior(p: FloatArray) -> tuple[float, FloatArray]:
+        """Of the parameters: minus the logarithm of its density, and the slope of that."""
+        value, slope = 0.5 * (p[0] / _WIDE) ** 2, np.zeros_like(p)
+        slope[0] = p[0] / _WIDE**2
+        ends = np.cumsum([1, *counts])
+        for own, out in zip(np.split(p[1:], ends[1:-1] - 1), np.split(slope[1:], ends[1:-1] - 1), strict=True):
+            level, bends = (own.mean() + math.log(_STARTS[0])) / _WIDE, np.diff(own) / _LOCAL
+            value += 0.5 * level**2 + 0.5 * float(bends @ bends)
+            out += level / (_WIDE * len(own)) - np.diff(bends, prepend=0.0, append=0.0) / _LOCAL
+        return value, slope
+
     def unlikely(p: FloatArray) -> float:
-        prior = 0.5 * (p[0] / _WIDE) ** 2
-        for own in np.split(p[1:], np.cumsum(counts)[:-1]):
-            prior += 0.5 * ((own.mean() + math.log(_STARTS[0])) / _WIDE) ** 2
-            prior += 0.5 * float(((np.diff(own) / _LOCAL) ** 2).sum())
         try:
-            return prior - process(p).log_likelihood()
+            return prior(p)[0] - process(p).log_likelihood()
         except np.linalg.LinAlgError:
-            return 1e30  # too smooth for double precision
+            return _IMPOSSIBLE
 
-    # Steps of differences that are well above the rounding of the likelihood.
-    options = {"ftol": 1e-6, "maxiter": 100, "eps": 1e-4}
+    def search(start: FloatArray, directions: FloatArray) -> OptimizeResult:
+        """The most likely parameters that are sums of `directions`, shape (parameters, k)."""
 
-    def search(function: Callable[[FloatArray], float], start: FloatArray) -> OptimizeResult:
-        return minimize(function, start, method="L-BFGS-B", bounds=[(-7.0, 7.0)] * len(start), options=options)
+        def function(q: FloatArray) -> tuple[float, FloatArray]:
+            p = directions @ q
+            try:
+                here = process(p)
+            except np.linalg.LinAlgError:
+                return _IMPOSSIBLE, np.zeros_like(q)
+            value, slope = prior(p)
+            return value - here.log_likelihood(), slope @ directions - here.slope(directions.T)
+
+        options = {"ftol": 1e-12, "gtol": 1e-7, "maxiter": 200}
+        bounds = [(-_FURTHEST, _FURTHEST)] * len(start)
+        found = minimize(function, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        # Values are exact to their rounding, in which a flat maximum is lost; slopes find it.
+        exact = root(lambda q: function(q)[1], found.x, options={"xtol": 1e-11})
+        if exact.success and np.abs(exact.x - found.x).max() < _STEP and np.abs(exact.x).max() < _FURTHEST:
+            found.x = exact.x
+        return found
 
     # The same length everywhere along a coordinate first, from two starts; then lengths that differ.
-    spread = np.repeat(np.eye(1 + len(axes)), [1, *counts], axis=0)
+    same = np.repeat(np.eye(1 + len(axes)), [1, *counts], axis=0)
     starts = [np.array([0.0, *(-math.log(part) for _ in axes)]) for part in _STARTS]
-    found = min(
-        (search(lambda q: unlikely(spread @ q), start) for start in starts), key=lambda result: float(result.fun)
-    )
-    best = spread @ found.x if len(spread) == len(axes) + 1 else np.asarray(search(unlikely, spread @ found.x).x)
-    sizes, directions = np.linalg.eigh(_curvature(unlikely, best))
+    best = same @ min((search(start, same) for start in starts), key=lambda result: float(result.fun)).x
+    if len(best) > len(axes) + 1:
+        best = np.asarray(search(best, np.eye(len(best))).x)
+    # Where windows are symmetric eigenvalues are equal, and rounding would choose their directions: parameters count a
+    # little differently.
+    tilt = 1.0 + _TILT * np.linspace(0.0, 1.0, len(best)) ** 2
+    sizes, directions = np.linalg.eigh(tilt[:, None] * _curvature(unlikely, best) * tilt)
     away = directions * np.sqrt(len(best) / np.maximum(sizes, _FLATTEST))
-    chosen = np.clip(np.concatenate([best + away.T, best - away.T]), -7.0, 7.0)
+    chosen = np.clip(np.concatenate([best + away.T, best - away.T]), -_FURTHEST, _FURTHEST)
     # The density of each over that of the normal distribution which the points stand for.
     logarithms = unlikely(best) - np.array([unlikely(p) for p in chosen]) + 0.5 * len(best)
     weights = np.exp(np.clip(logarithms, -50.0, _HEAVIEST))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Colour-blind safe (Okabe and Ito).
+#: Color-blind safe (Okabe and Ito).
 _BLUE, _RED, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "0.35"
 #: Standard errors of bands, and points of a surface along each coordinate.
 _BAND, _POINTS = 2.0, 61
@@ -116,8 +116,8 @@ def plot_works(forward: ArrayLike, backward: ArrayLike | None, found: Pulled, *,
     if backward is not None:
         works.append(("-W backward", -numbers(backward, "backward"), _GREEN))
     edges = np.histogram_bin_edges(np.concatenate([each for _, each, _ in works]), bins="auto")
-    for label, values, colour in works:
-        axes.hist(values, edges.tolist(), density=True, color=colour, alpha=0.5, label=label)
+    for label, values, color in works:
+        axes.hist(values, edges.tolist(), density=True, color=color, alpha=0.5, label=label)
     best = found.best
     axes.axvspan(best.value - _BAND * best.error, best.value + _BAND * best.error, color=_RED, alpha=0.25, linewidth=0)
     name = "Jarzynski" if found.bar is None else "BAR"

@@ -228,7 +228,7 @@ class Profile:
 
         Each is put where the variance of all differences of free energy together is reduced most (Bayesian
         quadrature: Kempkes and Perez de Alba Ortiz, arXiv 2601.08783), taking those before it as done. A window has
-        the error that its neighbours suggest. Where a profile was made by a spline, a Gaussian process is learned
+        the error that its neighbors suggest. Where a profile was made by a spline, a Gaussian process is learned
         from the same windows.
 
         Parameters

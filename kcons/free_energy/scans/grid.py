@@ -100,7 +100,7 @@ class Grid:
         """The coordinates with their values at a point as targets."""
         return [item.with_target(v) for item, v in zip(self.coordinates, self.at(point), strict=True)]
 
-    def neighbours(self, point: Point) -> list[Point]:
+    def neighbors(self, point: Point) -> list[Point]:
         """One value further along one coordinate, either way."""
         found = []
         for axis, (n, size, ring) in enumerate(zip(point, self.shape, self.rings, strict=True)):

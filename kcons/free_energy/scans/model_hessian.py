@@ -1,6 +1,6 @@
 """A model of the Hessian of a molecule from its geometry alone, and the internal coordinates it is made of.
 
-E = sum of k_i (q_i - q_i0)^2/2 over distances, angles and dihedrals q_i of neighbours, with constants k_i that fall off
+E = sum of k_i (q_i - q_i0)^2/2 over distances, angles and dihedrals q_i of neighbors, with constants k_i that fall off
 with the distances of the atoms. No bonds need to be known, and weak contacts have weak constants.
 """
 
@@ -93,7 +93,7 @@ class Internals:
         # The two directions across a straight angle are those of this structure alone.
         self.terms += [(*row, -1, side) for side in (0, 1) for row in self._straight.tolist()]
 
-    def taken_over(self, data: FloatArray, terms: Sequence[tuple[int, ...]]) -> FloatArray:
+    def remapped(self, data: FloatArray, terms: Sequence[tuple[int, ...]]) -> FloatArray:
         """Data for other terms, shape (..., m), as data for these; zero for terms that were not among them."""
         place = {term: n for n, term in enumerate(terms) if -1 not in term}
         mine = [(n, place[term]) for n, term in enumerate(self.terms) if term in place]

@@ -1,6 +1,6 @@
 """Relaxed scans: minima of the energy with one or two coordinates held at the points of a grid.
 
-Every point is relaxed from each of its neighbours, and again from a neighbour whose energy became lower, until nothing
+Every point is relaxed from each of its neighbors, and again from a neighbor whose energy became lower, until nothing
 changes (the wavefront of TorsionDrive): both ways, as torsions are driven. The next value is reached by turning and
 moving groups as rigid pieces. What was learned of the curvature goes along from point to point.
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from os import PathLike
 
 import numpy as np
@@ -36,15 +35,15 @@ from kcons.errors import (
     KconsError,
     NonFiniteError,
 )
-from kcons.free_energy.rigid_turns import warn_of_gaps
-from kcons.free_energy.scans.attempts import Attempt, Attempts
 from kcons.free_energy.scans.grid import Grid, Point
 from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import FIRST, relax
+from kcons.free_energy.scans.scan_result import Attempt, Attempts, Scan
+from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimisation import minimise
 from kcons.motion.motion import Motion
 
-#: Energy by which a structure has to be lower to be handed on to the neighbours, in eV (10^-5 hartree).
+#: Energy by which a structure has to be lower to be handed on to the neighbors, in eV (10^-5 hartree).
 LOWER = 2.7e-4
 #: Atoms up to which curvatures are kept as a table; beyond, relaxations remember their last steps only.
 MOST_ATOMS = 150
@@ -54,98 +53,6 @@ MOST_TRIES = 4
 
 #: Told of every attempt: points done, points in all, and a line about it.
 Progress = Callable[[int, int, str], None]
-
-
-@dataclass
-class Scan:
-    """What a scan found.
-
-    Attributes
-    ----------
-    grid : Grid
-    atoms : ase.Atoms
-        As given, without calculator and constraints.
-    held : list of Constraint
-        What was held besides the coordinates.
-    attempts : list of Attempt
-        All relaxations, in the order in which they were made.
-    best : dict
-        The attempt of lowest energy of each point that was reached.
-    """
-
-    grid: Grid
-    atoms: Atoms
-    held: list[Constraint] = field(default_factory=list)
-    attempts: list[Attempt] = field(default_factory=list)
-    best: dict[Point, Attempt] = field(default_factory=dict)
-
-    @property
-    def energies(self) -> FloatArray:
-        """In eV, shape of the grid; NaN where no relaxation succeeded."""
-        return self._table({point: attempt.energy for point, attempt in self.best.items()})
-
-    @property
-    def hysteresis(self) -> FloatArray:
-        """How much the last relaxations from the neighbours of each point differ in energy, in eV, shape of the grid.
-
-        Zero where they ended in the same minimum, or where there was one only.
-        """
-        spread: dict[Point, float] = {}
-        for point in self.best:
-            last: dict[Point | None, float] = {}
-            for attempt in self.attempts:
-                if attempt.point == point and attempt.error is None:
-                    origin = None if attempt.source is None else self.attempts[attempt.source].point
-                    last[origin] = attempt.energy
-            spread[point] = max(last.values()) - min(last.values())
-        return self._table(spread)
-
-    @property
-    def failed(self) -> dict[Point, str]:
-        """Points that were not reached, with the last error of each."""
-        errors = {a.point: a.error for a in self.attempts if a.error is not None}
-        return {p: errors.get(p) or "no relaxation was tried" for p in self.grid.points if p not in self.best}
-
-    @property
-    def evaluations(self) -> int:
-        """Calls of energy and forces in all."""
-        return sum(attempt.evaluations for attempt in self.attempts)
-
-    def structure(self, point: Point, *, hold: bool = False) -> Atoms:
-        """The minimum at a point, its values and energy in `info`.
-
-        Parameters
-        ----------
-        point : tuple of int
-            Numbers of its values in the lists of the scan.
-        hold : bool
-            Whether the atoms get the constraints they had there: what was held besides, and the coordinates.
-
-        Raises
-        ------
-        InputError
-            The point was not reached.
-        """
-        if point not in self.best:
-            raise InputError(
-                f"there is no structure at {point}: {self.failed.get(point, 'no such point')}", item="point"
-            )
-        found = self.atoms.copy()
-        found.positions[:] = self.best[point].positions
-        found.info["energy"] = self.best[point].energy
-        for key, v in zip(self.grid.keys, self.grid.shown(point), strict=True):
-            found.info[key] = v
-        if hold:
-            pairs = zip(self.grid.coordinates, self.grid.values, point, strict=True)
-            here = [item.with_target(float(values[n])) for item, values, n in pairs]
-            found.set_constraint(Constraints([*self.held, *here]))
-        return found
-
-    def _table(self, entries: dict[Point, float]) -> FloatArray:
-        table = np.full(self.grid.shape, np.nan)
-        for point, entry in entries.items():
-            table[point] = entry
-        return table
 
 
 def scan(
@@ -178,7 +85,7 @@ def scan(
     fmax : float
         The largest force along the constraints that may be left on an atom, in eV/angstrom.
     both_ways : bool
-        Whether points are relaxed from all their neighbours, and not only from the one that is reached first.
+        Whether points are relaxed from all their neighbors, and not only from the one that is reached first.
     evaluations : int
         Calls of energy and forces after which a relaxation is given up.
     progress : callable, optional
@@ -294,7 +201,7 @@ class _Surface:
         internals = Internals(self.atoms.numbers, x, motion.lattice)
         memory = None
         if source is not None and len(source.memory):
-            memory = internals.taken_over(source.memory, source.terms)
+            memory = internals.remapped(source.memory, source.terms)
         done = relax(motion, self.evaluate, internals, x, fmax=fmax, memory=memory, evaluations=evaluations)
         attempt.fill(done.positions, done.energy, done.largest, done.evaluations)
         attempt.memory, attempt.terms = done.memory, internals.terms
@@ -323,7 +230,7 @@ class _Wavefront:
         bare = surface.atoms.copy()
         bare.set_constraint()
         self.scan = Scan(grid, bare, surface.held)
-        #: The attempt whose structure a point has handed on to its neighbours.
+        #: The attempt whose structure a point has handed on to its neighbors.
         self._handed: dict[Point, int] = {}
         self._queue: deque[tuple[Point, int | None]] = deque()
         self._tried: set[tuple[Point, int | None]] = set()
@@ -378,7 +285,7 @@ class _Wavefront:
                 best[point] = attempt
             if handed is None or attempt.energy < self.scan.attempts[handed].energy - LOWER:
                 self._handed[point] = attempt.number
-                self._queue.extend((other, attempt.number) for other in self.grid.neighbours(point))
+                self._queue.extend((other, attempt.number) for other in self.grid.neighbors(point))
         if self.progress is not None:
             said = f"{attempt.energy:.6f} eV" if attempt.error is None else f"failed: {attempt.error}"
             self.progress(len(best), len(self.grid.points), f"{self.grid.said(point)}: {said}")
@@ -404,11 +311,9 @@ class _Wavefront:
     def _try_again(self) -> bool:
         """Try a point that failed in an earlier run, once in this one, as it was tried first; False if none is left."""
         attempts = self.scan.attempts
-        again = self.attempts.tried(len(attempts))
-        if again is None:
-            failed = (a for a in attempts if a.point not in self.scan.best and a.point not in self._tried_now)
-            again = next(((a.point, a.source) for a in failed), None)
+        failed = (a for a in attempts if a.point not in self.scan.best and a.point not in self._tried_now)
+        again = self.attempts.tried(len(attempts)) or next(failed, None)
         if again is None:
             return False
-        self._settle(self._made(*again))
+        self._settle(self._made(again.point, again.source))
         return True

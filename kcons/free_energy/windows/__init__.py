@@ -2,8 +2,7 @@
 
 - `window`: one window and its settings
 - `ase_windows`, `openmm_windows`: who samples it
-- `window_results`: what windows have found
+- `free_energy`: what windows have found, and how it is shown
 - `driver`: many of them, by any executor
-- `plan_file`: windows as a file describes them
-- `windows_report`: what is shown of them
+- `input_file`: windows as a file describes them
 """

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,15 +22,15 @@ from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.free_energy.ase_recorder import AseRecorder
-from kcons.free_energy.held_coordinates import named
-from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
+from kcons.free_energy.series import Series
+from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
 from kcons.motion import minimise
 
 #: Largest force left by a relaxation, eV/angstrom, and the longest way of an atom in one of its steps, angstrom.
 _FORCE, _STRIDE = 0.1, 0.1
 
 
-class AseWindows:
+class AseWindows(Sampler):
     """Windows of ASE `Atoms`.
 
     Parameters
@@ -68,14 +66,11 @@ class AseWindows:
                 f"calculator is {calculator!r:.80}; give what makes one, such as functools.partial(EMT)",
                 item="calculator",
             )
+        super().__init__(coordinates, 1.0)
         self.atoms = atoms.copy()
         self.calculator = calculator
-        self.coordinates = named(coordinates)
         self.held = [*from_ase_constraints(self.atoms), *held]
         self.atoms.set_constraint()
-        self.names = tuple(self.coordinates)
-        self.angles = angles_of(self.coordinates)
-        self.scales = scales_of(self.coordinates, 1.0)
 
     @property
     def digest(self) -> str:
@@ -93,7 +88,7 @@ class AseWindows:
         frame.append(self.atoms.get_masses())
         return digest_of(frame, maker, self.held, list(self.coordinates.values()))
 
-    def _rows(self) -> Held:
+    def rows(self) -> Held:
         atoms = self.atoms
         return Held(
             self.coordinates,
@@ -105,58 +100,24 @@ class AseWindows:
             lambda: bonds_of(atoms),
         )
 
-    def begin(self) -> tuple[FloatArray, FloatArray]:
-        return self._rows().begin()
+    def simulation(self, held: Held, window: Window, settings: Settings) -> _Simulation:
+        return _Simulation(self, held, window, settings)
 
-    def sample(self, window: Window, settings: Settings, file: Path) -> None:
-        began = time.process_time()
-        held = self._rows()
-        atoms = self._prepared(held, window, settings)
-        if settings.pull:
-            self._moving(held, atoms, window, settings).run(settings.pull)
-        rows = [*held.others, *held.at(window.target)]
-        # Velocities of the pull's end have its rate.
-        free = settings.thermostat != "langevin" and all(row.translation_invariant for row in rows)
-        draw_velocities(atoms, settings.temperature, window.seed + 1, constraints=rows, zero_momentum=free)
-        dt, friction, common = _units(settings)
-        if settings.thermostat == "langevin":
-            common |= {"friction": friction, "rng": window.seed + 2}
-            dynamics: Any = ConstrainedLangevin(atoms, dt, constraints=rows, **common)
-        elif settings.thermostat == "nose-hoover":
-            dynamics = ConstrainedNoseHoover(atoms, dt, tdamp=1 / friction, constraints=rows, **common)
-        else:
-            dynamics = IsokineticDynamics(atoms, dt, constraints=rows, **common)
-        dynamics.run(settings.equilibration)
-        recorder = AseRecorder(dynamics, self.coordinates)
-        dynamics.attach(recorder, interval=settings.every)
-        dynamics.run(settings.production)
-        recorder.series.seconds = time.process_time() - began
-        recorder.series.save(file)
 
-    def pull(self, window: Window, settings: Settings, file: Path) -> None:
-        held = self._rows()
-        atoms = self._prepared(held, window, settings)
-        dt, friction, common = _units(settings)
-        rows = [*held.others, *held.at(window.start)]
-        dynamics = ConstrainedLangevin(atoms, dt, friction=friction, rng=window.seed + 2, constraints=rows, **common)
-        dynamics.run(settings.equilibration)
-        moving = self._moving(held, atoms, window, settings)
-        recorder = AseRecorder(moving, self.coordinates)
-        moving.attach(recorder, interval=1)
-        moving.run(settings.pull)
-        recorder.series.save(file)
+class _Simulation:
+    """A run in ASE."""
 
-    def _prepared(self, held: Held, window: Window, settings: Settings) -> Atoms:
-        """The atoms at the start of a window, relaxed, with velocities."""
-        atoms = self.atoms.copy()
-        atoms.calc = self.calculator()
+    def __init__(self, sampler: AseWindows, held: Held, window: Window, settings: Settings) -> None:
+        self._held, self._settings, self._coordinates = held, settings, sampler.coordinates
+        self.atoms = atoms = sampler.atoms.copy()
+        atoms.calc = sampler.calculator()
         motion, x = held.placed(window.start)
+
+        def force(x: FloatArray, _: float) -> FloatArray:
+            atoms.positions = x
+            return np.asarray(atoms.get_forces(apply_constraint=False))
+
         if settings.relax:
-
-            def force(x: FloatArray, _: float) -> FloatArray:
-                atoms.positions = x
-                return np.asarray(atoms.get_forces(apply_constraint=False))
-
             try:
                 x = minimise(motion, force, x, tolerance=_FORCE, longest=_STRIDE, steps=settings.relax).positions
             except ConvergenceError as error:  # relaxed as far as wanted
@@ -164,16 +125,32 @@ class AseWindows:
                     raise
                 x = error.positions
         atoms.positions = x
-        draw_velocities(atoms, settings.temperature, window.seed, constraints=[*held.others, *held.at(window.start)])
-        return atoms
+        self._dynamics: Any = None
 
-    def _moving(self, held: Held, atoms: Atoms, window: Window, settings: Settings) -> ConstrainedLangevin:
-        """Langevin dynamics with the coordinates moving from the start of the window to its target."""
-        dt, friction, common = _units(settings)
-        rows = [*held.others, *held.towards(window, settings.pull * dt)]
-        return ConstrainedLangevin(atoms, dt, friction=friction, rng=window.seed, constraints=rows, **common)
+    def hold(
+        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
+    ) -> None:
+        settings, dt = self._settings, self._settings.timestep * units.fs
+        friction = settings.friction / (1000 * units.fs)
+        rows = [*self._held.others, *self._held.at(begin)]
+        if velocities is not None:
+            still = thermostat != "langevin" and not self._held.knows_a_place
+            draw_velocities(self.atoms, settings.temperature, velocities, constraints=rows, zero_momentum=still)
+        if tuple(begin) != tuple(end):
+            rows = [*self._held.others, *self._held.towards(begin, end, settings.pull * dt)]
+        common: dict[str, Any] = {"temperature_K": settings.temperature, "constraints": rows}
+        if thermostat == "langevin":
+            self._dynamics = ConstrainedLangevin(self.atoms, dt, friction=friction, rng=seed, **common)
+        elif thermostat == "nose-hoover":
+            self._dynamics = ConstrainedNoseHoover(self.atoms, dt, tdamp=1 / friction, **common)
+        else:
+            self._dynamics = IsokineticDynamics(self.atoms, dt, **common)
 
+    def step(self, steps: int) -> None:
+        self._dynamics.run(steps)
 
-def _units(settings: Settings) -> tuple[float, float, dict[str, Any]]:
-    """Time step and friction in ASE's units, and the temperature as its classes take it."""
-    return settings.timestep * units.fs, settings.friction / (1000 * units.fs), {"temperature_K": settings.temperature}
+    def record(self, steps: int, every: int, *, start: bool = False) -> Series:
+        recorder = AseRecorder(self._dynamics, self._coordinates)
+        self._dynamics.attach(recorder, interval=every)  # before the first step ASE calls it
+        self._dynamics.run(steps)
+        return recorder.series

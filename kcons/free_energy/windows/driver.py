@@ -29,15 +29,15 @@ from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
+from kcons.free_energy.windows.free_energy import FreeEnergy, combine_sides
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
-from kcons.free_energy.windows.window_results import FreeEnergy, together
 from kcons.steppers.files import ResultFolder
 
 #: Boltzmann's constant in kJ/mol/K.
 BOLTZMANN = 0.00831446261815324
 #: How often a window is begun again whose process was killed.
 RETRIES = 3
-#: Files of a folder of windows, those of `windows_report` and of the command line included.
+#: Files of a folder of windows, those of `FreeEnergy` and of the command line included.
 FILES = (
     "window-*.npz",
     "window-*.txt",
@@ -99,11 +99,6 @@ class Windows:
         self._results = ResultFolder(folder, "settings.json", mine, FILES, "windows")
         self._results.refuse_others()
         self.folder = self._results.path
-
-    @property
-    def angles(self) -> list[bool | None]:
-        """Which coordinates are angles; None where the unit is that of a formula or a function."""
-        return list(self.sampler.angles)
 
     # -- running --------------------------------------------------------------------------------
 
@@ -354,9 +349,9 @@ class Windows:
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
-                found.append(together(number, np.array(target), sides, self.sampler, seconds))
+                found.append(combine_sides(number, np.array(target), sides, self.sampler, seconds))
         found.sort(key=lambda w: w.value.tolist())
-        return FreeEnergy(self.sampler.names, self.periods, found, problems)
+        return FreeEnergy(self.sampler.names, self.periods, found, problems, tuple(self.sampler.angles))
 
 
 #: What is said of a window whose process was killed, or whose worker was lost.

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,12 +13,10 @@ from openmm import app, unit
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, Formula
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.free_energy.held_coordinates import named
 from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
+from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.hold import constraints_about
@@ -36,7 +32,7 @@ _FORCE = 50.0
 _SAME_BOX = 1e-3
 
 
-class OpenMMWindows:
+class OpenMMWindows(Sampler):
     """Windows of an OpenMM System.
 
     Parameters
@@ -78,21 +74,24 @@ class OpenMMWindows:
     ) -> None:
         n = system.getNumParticles()
         _refuse_another(topology, system)
+        super().__init__(coordinates, 10.0)
         self.positions = nanometers(positions, n)
-        self.coordinates = named(coordinates)
-        self.names = tuple(self.coordinates)
-        self.angles = angles_of(self.coordinates)
-        self.scales = scales_of(self.coordinates, 10.0)
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
-        self.digest = digest_of(self._system, self.positions, list(self.coordinates.values()))
         self._bonds: IntArray = bonds_of(system, self.positions)
-        # A Topology cannot be pickled where its elements are; what a Simulation needs of it is the number of atoms.
-        self._n = n
         for name, item in self.coordinates.items():
             _force_of(name, item, system.usesPeriodicBoundaryConditions())
 
-    def _rows(self, system: openmm.System) -> Held:
+    @property
+    def digest(self) -> str:
+        return digest_of(self._system, self.positions, list(self.coordinates.values()))
+
+    def system(self) -> openmm.System:
+        """A copy."""
+        return openmm.XmlSerializer.deserialize(self._system)
+
+    def rows(self) -> Held:
+        system = self.system()
         masses = masses_of(system)
         given = tuple(self.coordinates.values())
         touched = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
@@ -109,93 +108,78 @@ class OpenMMWindows:
             lambda: self._bonds,
         )
 
-    def begin(self) -> tuple[FloatArray, FloatArray]:
-        return self._rows(openmm.XmlSerializer.deserialize(self._system)).begin()
+    def simulation(self, held: Held, window: Window, settings: Settings) -> _Simulation:
+        return _Simulation(self, held, window, settings)
 
-    def sample(self, window: Window, settings: Settings, file: Path) -> None:
-        began = time.process_time()
-        dt = settings.timestep / 1000
-        langevin = Langevin(settings.temperature, settings.friction)
-        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
-        simulation = self._simulation(window.start, self._rates(window, settings), langevin, dt, window)
-        self._begin(simulation, held, window, settings)
-        simulation.step(settings.pull)
-        ensemble: Any = langevin
-        if settings.thermostat == "nose-hoover":
-            ensemble = NoseHoover(settings.temperature, settings.friction)
-        elif settings.thermostat == "isokinetic":
-            ensemble = Isokinetic(settings.temperature)
-        x = positions_of(simulation.context)
-        simulation = self._simulation(window.target, [0.0] * len(self.names), ensemble, dt, window)
-        simulation.context.setPositions(x)
-        integrator: Any = simulation.integrator
-        integrator.applyConstraints()
-        integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, (window.seed + 1) % 2**31)
-        if settings.thermostat != "langevin":
-            _without_momentum(simulation.context, held)
-        simulation.step(settings.equilibration)
-        series = self._recorded(simulation, settings.every, settings.production)
-        series.seconds = time.process_time() - began
-        series.save(file)
 
-    def pull(self, window: Window, settings: Settings, file: Path) -> None:
-        dt = settings.timestep / 1000
-        langevin = Langevin(settings.temperature, settings.friction)
-        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
-        simulation = self._simulation(window.start, [0.0] * len(self.names), langevin, dt, window)
-        self._begin(simulation, held, window, settings)
-        simulation.step(settings.equilibration)
-        x, v = positions_of(simulation.context), velocities_of(simulation.context)
-        simulation = self._simulation(window.start, self._rates(window, settings), langevin, dt, window)
-        simulation.context.setPositions(x)
-        simulation.context.setVelocities(v)
-        integrator: Any = simulation.integrator
-        integrator.applyVelocityConstraints()
-        self._recorded(simulation, 1, settings.pull, start=True).save(file)
+class _Simulation:
+    """A run in OpenMM."""
 
-    def _begin(self, simulation: app.Simulation, held: Held, window: Window, settings: Settings) -> None:
-        """To the start of a window, relaxed, with velocities."""
-        simulation.context.setPositions(held.placed(window.start)[1])
-        integrator: Any = simulation.integrator
+    def __init__(self, sampler: OpenMMWindows, held: Held, window: Window, settings: Settings) -> None:
+        self._sampler, self._held, self._settings = sampler, held, settings
+        self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
         if settings.relax:
-            integrator.minimizeEnergy(simulation.context, _FORCE, settings.relax)
-        integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, window.seed % 2**31)
+            self.hold(window.start, window.start, "langevin", window.seed, None)
+            self._integrator.minimizeEnergy(self._simulation.context, _FORCE, settings.relax)
+            self._x = positions_of(self._simulation.context)
+        self._simulation: app.Simulation
 
-    def _rates(self, window: Window, settings: Settings) -> list[float]:
-        """In nm or radian in a ps."""
-        duration = max(settings.pull, 1) * settings.timestep / 1000
-        return [(b - a) / duration for a, b in zip(window.start, window.target, strict=True)]
+    @property
+    def _integrator(self) -> Any:
+        return self._simulation.integrator
 
-    def _recorded(self, simulation: app.Simulation, every: int, steps: int, *, start: bool = False) -> Series:
+    def hold(
+        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
+    ) -> None:
+        settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
+        system = sampler.system()
+        duration, wraps = max(settings.pull, 1) * dt, system.usesPeriodicBoundaryConditions()
+        rows = [
+            Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, period=item.period, name=name)
+            for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
+        ]
+        ensemble: Any = Isokinetic(settings.temperature)
+        if thermostat != "isokinetic":
+            ensemble = (Langevin if thermostat == "langevin" else NoseHoover)(settings.temperature, settings.friction)
+        part = CollectiveRows(system, rows, positions=sampler.positions)
+        integrator = ProjectedIntegrator(dt * unit.picosecond, parts=[part], ensemble=ensemble)
+        integrator.setRandomNumberSeed(seed % 2**31 + 1)
+        platform = sampler.platform
+        chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform), sampler.properties]
+        topology = app.Topology()  # one with elements cannot be sent to other processes; this is all that is needed
+        residue = topology.addResidue("X", topology.addChain())
+        for _ in range(system.getNumParticles()):
+            topology.addAtom("X", None, residue)
+        self._simulation = app.Simulation(topology, system, integrator, *chosen)
+        context = self._simulation.context
+        context.setPositions(self._x)
+        self._integrator.applyConstraints()
+        if velocities is None:
+            context.setVelocities(self._v)
+            self._integrator.applyVelocityConstraints()
+        else:
+            self._integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
+            if thermostat != "langevin" and not self._held.knows_a_place:
+                # Thermostats that scale velocities never forget the total momentum.
+                masses, v = masses_of(system), velocities_of(context)
+                v[masses > 0] -= masses @ v / masses.sum()
+                context.setVelocities(v)
+
+    def step(self, steps: int) -> None:
+        self._simulation.step(steps)
+        self._x, self._v = positions_of(self._simulation.context), velocities_of(self._simulation.context)
+
+    def record(self, steps: int, every: int, *, start: bool = False) -> Series:
+        simulation = self._simulation
         simulation.currentStep = 0
-        reporter = HeldCoordinatesReporter(io.StringIO(), every, self.coordinates)
+        reporter = HeldCoordinatesReporter(io.StringIO(), every, self._sampler.coordinates)
         if start:
-            groups = simulation.integrator.getIntegrationForceGroups()
-            reporter.report(
-                simulation, simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups)
-            )
+            what: dict[str, Any] = {"positions": True, "velocities": True, "forces": True}
+            what["groups"] = simulation.integrator.getIntegrationForceGroups()
+            reporter.report(simulation, simulation.context.getState(**what))
         simulation.reporters.append(reporter)
         simulation.step(steps)
         return reporter.series
-
-    def _simulation(
-        self, targets: Sequence[float], rates: Sequence[float], ensemble: Any, dt: float, window: Window
-    ) -> app.Simulation:
-        system = openmm.XmlSerializer.deserialize(self._system)
-        wraps = system.usesPeriodicBoundaryConditions()
-        rows = [
-            Row(_force_of(name, item, wraps), float(target), float(rate), period=item.period, name=name)
-            for (name, item), target, rate in zip(self.coordinates.items(), targets, rates, strict=True)
-        ]
-        part = CollectiveRows(system, rows, positions=self.positions)
-        integrator = ProjectedIntegrator(dt * unit.picosecond, parts=[part], ensemble=ensemble)
-        integrator.setRandomNumberSeed(window.seed % 2**31 + 1)
-        chosen = [] if self.platform is None else [openmm.Platform.getPlatformByName(self.platform), self.properties]
-        topology = app.Topology()
-        residue = topology.addResidue("X", topology.addChain())
-        for _ in range(self._n):
-            topology.addAtom("X", None, residue)
-        return app.Simulation(topology, system, integrator, *chosen)
 
 
 def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
@@ -219,15 +203,6 @@ def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
     barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
     if barostats:
         raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
-
-
-def _without_momentum(context: openmm.Context, held: Held) -> None:
-    """Take total momentum out, which thermostats that scale velocities never forget, where no row knows a place."""
-    if all(row.translation_invariant for row in [*held.coordinates.values(), *held.others]):
-        masses = masses_of(context.getSystem())
-        v = velocities_of(context)
-        v[masses > 0] -= masses @ v / masses.sum()
-        context.setVelocities(v)
 
 
 def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,12 +19,12 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
-from kcons.free_energy.held_coordinates import HeldCoordinates
-from kcons.free_energy.rigid_turns import warn_of_gaps
+from kcons.free_energy.held_coordinates import HeldCoordinates, named
+from kcons.free_energy.series import Series
+from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.motion import Motion
 
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
-
 
 #: What the sides of a window and the directions of a pull are called.
 SIDES, DIRECTIONS = ("up", "down"), ("forward", "backward")
@@ -87,10 +89,9 @@ class Settings:
         for name in ("relax", "pull", "equilibration", "production", "every"):
             least = int(name in ("production", "every"))
             object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
-        if self.thermostat not in ("langevin", "nose-hoover", "isokinetic"):
-            raise InputError(
-                f"no thermostat {self.thermostat!r}; there are langevin, nose-hoover, isokinetic", item="thermostat"
-            )
+        known = get_args(Thermostat)
+        if self.thermostat not in known:
+            raise InputError(f"no thermostat {self.thermostat!r}; there are {', '.join(known)}", item="thermostat")
         if self.production // self.every < 32:
             raise InputError(
                 f"production of {self.production} steps with a sample every {self.every} gives fewer than 32 samples; "
@@ -99,51 +100,92 @@ class Settings:
             )
 
 
-class Sampler(Protocol):
-    """What samples a window in an MD engine; it is sent to other processes, so it can be pickled.
+class Simulation(Protocol):
+    """A run in an MD engine, at the start of a window to begin with: relaxed there, and without velocities."""
+
+    def hold(
+        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
+    ) -> None:
+        """Go on with the coordinates moving from `begin` to `end` in the steps of a pull, or at rest where these agree.
+
+        `velocities` is the seed of new ones at the temperature of the settings, or None to keep those that there are.
+        """
+
+    def step(self, steps: int) -> None:
+        """Take steps."""
+
+    def record(self, steps: int, every: int, *, start: bool = False) -> Series:
+        """Take steps and record the coordinates; with `start` before the first one, too."""
+
+
+class Sampler(ABC):
+    """What samples windows in an MD engine; it is sent to other processes, so it can be pickled.
 
     Attributes
     ----------
+    coordinates : dict of str to Constraint
     names : tuple of str
-        Of the coordinates.
     kJ : float
-        Its unit of energy in kJ/mol.
+        The engine's unit of energy in kJ/mol.
     scales : ndarray, shape (d,)
-        The units of its coordinates in angstrom and radian.
+        The units of the coordinates in angstrom and radian; formulas stay in the units they are written in.
     angles : tuple of bool or None
         Which coordinates are angles; None where the unit is that of a formula or a function.
-    digest : str
-        Of structure, forces and constraints: what a folder of windows belongs to.
     """
 
-    names: tuple[str, ...]
     kJ: float
-    scales: FloatArray
-    angles: tuple[bool | None, ...]
+
+    def __init__(self, coordinates: Mapping[str, Constraint], angstrom: float) -> None:
+        self.coordinates = named(coordinates)
+        self.names = tuple(self.coordinates)
+        rows = self.coordinates.values()
+        self.scales = np.array([angstrom if c.held is LENGTH and c.family != "Formula" else 1.0 for c in rows])
+        self.angles = tuple({ANGLE: True, LENGTH: False}.get(c.held) for c in rows)
 
     @property
+    @abstractmethod
     def digest(self) -> str:
-        """See above."""
-        ...
+        """Of structure, forces and constraints: what a folder of windows belongs to."""
+
+    @abstractmethod
+    def rows(self) -> Held:
+        """What is held, over the initial structure."""
+
+    @abstractmethod
+    def simulation(self, held: Held, window: Window, settings: Settings) -> Simulation:
+        """A run at the start of a window."""
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
-        """Coordinates at the initial structure, and their periods, shape (d,); raises where a window cannot be made."""
+        """Coordinates at the initial structure, and their periods, shape (d,).
+
+        Raises
+        ------
+        KconsError
+            A window cannot be made: a coordinate is undefined here or depends on the other constraints.
+        """
+        return self.rows().begin()
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         """Run the window, and write its `Series` to `file` once it is finished."""
+        began = time.process_time()
+        run = self.simulation(self.rows(), window, settings)
+        if settings.pull:
+            run.hold(window.start, window.target, "langevin", window.seed, window.seed)
+            run.step(settings.pull)
+        # New velocities: those of the pull's end have its rate.
+        run.hold(window.target, window.target, settings.thermostat, window.seed + 2, window.seed + 1)
+        run.step(settings.equilibration)
+        series = run.record(settings.production, settings.every)
+        series.seconds = time.process_time() - began
+        series.save(file)
 
     def pull(self, window: Window, settings: Settings, file: Path) -> None:
         """Equilibrate at the start, pull to the target, and write the `Series` of the pull, every step of it."""
-
-
-def scales_of(coordinates: Mapping[str, Constraint], angstrom: float) -> FloatArray:
-    """Units of coordinates in angstrom and radian; formulas stay in the units they are written in."""
-    return np.array([angstrom if c.held is LENGTH and c.family != "Formula" else 1.0 for c in coordinates.values()])
-
-
-def angles_of(coordinates: Mapping[str, Constraint]) -> tuple[bool | None, ...]:
-    """Which coordinates are angles; None where the unit is that of a formula or a function."""
-    return tuple({ANGLE: True, LENGTH: False}.get(c.held) for c in coordinates.values())
+        run = self.simulation(self.rows(), window, settings)
+        run.hold(window.start, window.start, "langevin", window.seed + 2, window.seed)
+        run.step(settings.equilibration)
+        run.hold(window.start, window.target, "langevin", window.seed, None)
+        run.record(settings.pull, 1, start=True).save(file)
 
 
 def digest_of(*parts: Any) -> str:
@@ -233,13 +275,18 @@ class Held:
             for item, value in zip(self.coordinates.values(), np.asarray(values), strict=True)
         ]
 
-    def towards(self, window: Window, duration: float, time: float = 0.0) -> list[Constraint]:
-        """The coordinates moved from the start of a window to its target, at a constant rate."""
+    def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
+        """The coordinates moved at a constant rate from time 0 on."""
         rows = []
-        for item, a, b in zip(self.coordinates.values(), window.start, window.target, strict=True):
+        for item, a, b in zip(self.coordinates.values(), begin, end, strict=True):
             rate = (b - a) / duration
-            rows.append(item.with_target(MovingTarget(lambda t, a=a, rate=rate: a + rate * (t - time))))  # type: ignore[misc]
+            rows.append(item.with_target(MovingTarget(lambda t, a=a, rate=rate: a + rate * t)))  # type: ignore[misc]
         return rows
+
+    @property
+    def knows_a_place(self) -> bool:
+        """Whether shifting all atoms would change a row."""
+        return not all(row.translation_invariant for row in [*self.coordinates.values(), *self.others])
 
     def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
         """The engine of a window, and the initial structure with groups turned and moved so that it is there.

@@ -12,7 +12,7 @@ MUTANTS = [
         "free_energy/scans/relaxed_scan.py",
         "if with_it.rank != rank + n + 1:",
         "if False:",
-        "tests/free_energy/scans/test_relaxed_scan.py::test_bad_coordinates",
+        "tests/free_energy/test_refusals.py::test_refusals",
     ),
     (
         "free_energy/scans/relaxation.py",
@@ -27,10 +27,10 @@ MUTANTS = [
         "tests/free_energy/scans/test_model_hessian.py::test_terms_keep_their_images",
     ),
     (
-        "free_energy/scans/attempts.py",
+        "free_energy/scans/scan_result.py",
         "if found is not None and (found.point, found.source) != (point, source):",
         "if found is None and source == point:",
-        "tests/free_energy/scans/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
+        "tests/free_energy/scans/test_scan_result.py::test_an_attempt_of_another_scan_is_refused",
     ),
     # -- free energies from mean forces and works --
     (
@@ -52,7 +52,7 @@ MUTANTS = [
         "tests/ase/test_named_calculators.py::test_files_name_calculators_of_a_list_or_of_modules_that_their_reader_names",
     ),
     (
-        "free_energy/rigid_turns.py",
+        "free_energy/torsion_force.py",
         "{*pair} not in joined and bonded.issuperset(pair)",
         "{*pair} not in joined",
         "tests/free_energy/windows/test_ase_windows.py::test_torsions_over_atoms_that_form_no_bonds",
@@ -74,13 +74,13 @@ MUTANTS = [
         "free_energy/averages.py",
         "covariance *= np.outer(widening, widening)",
         "covariance *= 1.0",
-        "tests/free_energy/test_averages.py::test_intervals_cover_as_often_as_they_say",
+        "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say",
     ),
     (
         "free_energy/averages.py",
         "return factors[:, None] * (series",
         "return 1.0 * (series",
-        "tests/free_energy/test_averages.py::test_weights_that_belong_to_the_values",
+        "tests/thermostats/test_correlated_series.py::test_errors_with_weights",
     ),
     (
         "free_energy/profiles/gaussian_process.py",

@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from kcons.errors import InputError
 from kcons.free_energy.profiles.mean_force_surface import fit_surface
 from kcons.free_energy.profiles.profile import integrate
 
@@ -154,36 +153,3 @@ def test_three_coordinates():
     F, errors = surface.free_energy(at)
     assert np.abs((F - 0.5 * np.einsum("ni,ij,nj->n", at, matrix, at)) / errors).max() < 4
     assert np.abs(surface.minima()[0].x).max() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("change", "item", "message"),
-    [
-        ({"x": np.zeros((3, 2))}, "x", r"d \+ 2 or more"),
-        ({"x": np.ones((9, 2))}, "x", "one value of coordinate 0"),
-        ({"f": np.zeros((9, 3))}, "f", r"shape \(9, 2\)"),
-        ({"f": np.full((9, 2), np.nan)}, "f", "window 0"),
-        ({"errors": np.ones(9)}, "errors", "shape"),
-        ({"errors": -np.ones((9, 2))}, "errors", "negative"),
-        ({"errors": np.tile([[1.0, 2.0], [2.0, 1.0]], (9, 1, 1))}, "errors", "window 0 is not symmetric and positive"),
-        ({"periods": (1.0,)}, "periods", "2 positive"),
-        ({"periods": ("a", None)}, "periods", "positive"),
-        ({"periods": (0.5, None)}, "x", "further apart than the period in coordinate 0"),
-        ({"zero": [0.0]}, "zero", "2 finite"),
-        ({"zero": [9.0, 0.0]}, "x", "beyond the windows"),
-    ],
-)
-def test_bad_input_is_refused(change, item, message):
-    x = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
-    good = {"x": x, "f": x, "errors": np.ones((9, 2))}
-    with pytest.raises(InputError, match=message) as caught:
-        fit_surface(**{**good, **change})
-    assert caught.value.item == item
-
-
-def test_differences_between_places_of_other_shapes_are_refused():
-    x = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
-    surface = fit_surface(x, x, np.ones((9, 2)))
-    for other in ([0.5], 0.5, [0.5, 0.5, 0.5]):
-        with pytest.raises(InputError, match="a and b must be places of 2 coordinates"):
-            surface.difference([0.0, 0.0], other)

@@ -151,28 +151,6 @@ def test_pulls_that_do_not_overlap_are_warned_of():
         pull_free_energy(one, thermal_energy=KT)
 
 
-@pytest.mark.parametrize(
-    ("call", "item", "message"),
-    [
-        (lambda: pull_free_energy([1.0] * 4, thermal_energy=1.0), "forward", "5 pulls"),
-        (lambda: pull_free_energy([1.0] * 5, [1.0] * 4, thermal_energy=1.0), "backward", "5 pulls"),
-        (lambda: pull_free_energy([1.0] * 5 + [np.inf], thermal_energy=1.0), "forward", "work 5"),
-        (lambda: pull_free_energy([1.0] * 5, thermal_energy=-1.0), "thermal_energy", "positive"),
-        (lambda: pull_free_energy([1.0] * 5, thermal_energy="x"), "thermal_energy", "positive"),
-        (lambda: pull_free_energy([1.0] * 5, thermal_energy="1"), "thermal_energy", "positive"),
-        (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, seed="x"), "seed", "seed is 'x'"),
-        (lambda: work_along([0.0, 1.0], [0.0, 1.0, 2.0]), "force", "do not go"),
-        (lambda: work_along([0.0, 1.0], [0.0, np.nan]), "force", "finite"),
-        (lambda: work_profile(np.zeros(5), thermal_energy=1.0), "works", "shape"),
-        (lambda: work_profile(np.zeros((5, 2)), thermal_energy=1.0, log_weights=np.zeros(5)), "log_weights", "shape"),
-    ],
-)
-def test_bad_input_is_refused(call, item, message):
-    with pytest.raises(InputError, match=message) as caught:
-        call()
-    assert caught.value.item == item
-
-
 def test_one_direction_needs_no_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymbar", None)
     works = np.random.default_rng(9).normal(F, 0.1, 50)

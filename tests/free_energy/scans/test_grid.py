@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from kcons.constraints import Dihedral, Distance, Formula
-from kcons.errors import InputError
 from kcons.free_energy.scans.grid import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
@@ -15,11 +14,11 @@ TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
 def test_a_whole_turn_is_a_ring():
     grid = Grid([TURN], [np.radians(np.arange(-180, 181, 30))])
     assert grid.shape == (12,) and grid.rings == [True]
-    assert grid.neighbours((0,)) == [(1,), (11,)]
+    assert grid.neighbors((0,)) == [(1,), (11,)]
     assert grid.apart((0,), [np.pi]) == pytest.approx(0) and grid.apart((0,), [np.radians(150)]) == pytest.approx(1)
     assert grid.shown((1,)) == pytest.approx([-150]) and grid.said((1,)) == "Dihedral(0, 1, 2, 3) = -150"
     part = Grid([TURN], [np.radians([0, 30, 60])])
-    assert part.rings == [False] and part.neighbours((2,)) == [(1,)]
+    assert part.rings == [False] and part.neighbors((2,)) == [(1,)]
 
 
 def test_values_that_descend_stay_in_their_order():
@@ -27,7 +26,7 @@ def test_values_that_descend_stay_in_their_order():
     values = np.radians(np.arange(180, -181, -30))
     grid = Grid([TURN], [values])
     np.testing.assert_array_equal(grid.values[0], values[:-1])
-    assert grid.rings == [True] and grid.neighbours((0,)) == [(1,), (11,)]
+    assert grid.rings == [True] and grid.neighbors((0,)) == [(1,), (11,)]
     assert grid.apart((0,), [np.radians(150)]) == pytest.approx(1)
     assert Grid([TURN], [values[2:5]]).rings == [False]
 
@@ -35,31 +34,10 @@ def test_values_that_descend_stay_in_their_order():
 def test_two_coordinates():
     grid = Grid([TURN, LENGTH], [np.radians(np.arange(0, 360, 120)), [1.4, 1.2]])
     assert grid.shape == (3, 2) and len(grid.points) == 6 and grid.rings == [True, False]
-    assert grid.neighbours((0, 0)) == [(1, 0), (2, 0), (0, 1)]
+    assert grid.neighbors((0, 0)) == [(1, 0), (2, 0), (0, 1)]
     assert grid.at((0, 0)) == [0.0, 1.4]  # in the order given
     held = grid.held_at((2, 1))
     assert held[0].target == pytest.approx([np.radians(240)]) and held[1].target == pytest.approx([1.2])
     assert grid.names == ["Dihedral(0, 1, 2, 3)", "Distance(0, 1)"] and grid.in_degrees == [True, False]
     assert grid.units == ["degrees", "angstrom"]
     assert Grid([Formula("x1 * x2", [[0, 1]]), TURN], [[0.1], [0.2]]).units == ["own unit", "degrees"]
-
-
-@pytest.mark.parametrize(
-    ("coordinates", "values", "said"),
-    [
-        ([], [], "one or two coordinates, not 0"),
-        ([TURN, LENGTH, TURN], [[0], [1], [0]], "one or two coordinates, not 3"),
-        ([TURN], [[0], [1]], "1 coordinates have 2 lists of values"),
-        ([Distance([[0, 1], [1, 2]])], [[1]], "has 2 rows; a coordinate of a scan has one"),
-        ([LENGTH], [[]], "not a list of finite numbers"),
-        ([LENGTH], [[1, np.nan]], "not a list of finite numbers"),
-        ([LENGTH], [[[1, 2]]], "not a list of finite numbers"),
-        ([LENGTH], [["far"]], "values of Distance"),
-        ([LENGTH], [[1, 2, 1]], "two values of .* are the same"),
-        ([LENGTH], [[1, 3, 2]], "go up and down; give them in order"),
-        ([TURN], [np.radians([-180, 0, 200])], "span more than its period"),
-    ],
-)
-def test_bad_grids(coordinates, values, said):
-    with pytest.raises(InputError, match=said):
-        Grid(coordinates, values)

@@ -61,10 +61,10 @@ def test_data_go_from_terms_to_terms():
     numbers = [8, 8, 1, 1]
     first = Internals(numbers, x)
     data = np.arange(2.0 * len(first.terms)).reshape(2, -1)
-    assert np.array_equal(first.taken_over(data, first.terms), data)
+    assert np.array_equal(first.remapped(data, first.terms), data)
     shuffled = first.terms[::-1]
-    assert np.array_equal(first.taken_over(data[:, ::-1], shuffled), data)
-    assert not first.taken_over(data[:, :1], [(7, 8)]).any()
+    assert np.array_equal(first.remapped(data[:, ::-1], shuffled), data)
+    assert not first.remapped(data[:, :1], [(7, 8)]).any()
 
 
 def test_a_dihedral_changes_by_the_shorter_way():

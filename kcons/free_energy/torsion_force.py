@@ -11,7 +11,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
@@ -53,7 +52,10 @@ class RigidTurn(NamedTuple):
 
     def force(self, x: FloatArray, f: FloatArray) -> float:
         """dU/dphi of the turn; NaN where a bond of the group is broken, by a box for example."""
-        return float(_torque(x, f, self.axis, self.group, self.bonds, self.lengths))
+        i, j = self.bonds.T
+        if (((x[i] - x[j]) ** 2).sum(axis=1) > (_BROKEN * self.lengths) ** 2).any():
+            return float("nan")
+        return float(-self._direction(x) @ np.cross(x[self.group] - x[self.axis[1]], f[self.group]).sum(axis=0))
 
     def _direction(self, x: FloatArray) -> FloatArray:
         e: FloatArray = x[self.axis[1]] - x[self.axis[0]]
@@ -145,20 +147,3 @@ def _volume(rows: ConstraintSet, x: FloatArray) -> float:
         return 0.0
     a = rows.jacobian(x).toarray() / np.sqrt(np.repeat(rows.masses, 3))
     return float(np.linalg.slogdet(a @ a.T)[1])
-
-
-@njit(cache=True, error_model="numpy")
-def _torque(x, f, axis, group, bonds, lengths):  # type: ignore[no-untyped-def]
-    for b in range(len(bonds)):
-        i, j = bonds[b, 0], bonds[b, 1]
-        square = (x[i, 0] - x[j, 0]) ** 2 + (x[i, 1] - x[j, 1]) ** 2 + (x[i, 2] - x[j, 2]) ** 2
-        if square > (_BROKEN * lengths[b]) ** 2:
-            return np.nan
-    far, near = axis
-    a, b, c = x[near, 0] - x[far, 0], x[near, 1] - x[far, 1], x[near, 2] - x[far, 2]
-    total = 0.0
-    for atom in group:
-        u, v, w = x[atom, 0] - x[near, 0], x[atom, 1] - x[near, 1], x[atom, 2] - x[near, 2]
-        p, q, r = f[atom, 0], f[atom, 1], f[atom, 2]
-        total -= a * (v * r - w * q) + b * (w * p - u * r) + c * (u * q - v * p)
-    return total / np.sqrt(a * a + b * b + c * c)

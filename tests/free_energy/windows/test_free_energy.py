@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
+from window_samplers import Fake
 
+from kcons.cli.terminal import rendered
 from kcons.errors import InputError
-from kcons.free_energy import FreeEnergy, MeanForce, WindowResult
-from kcons.free_energy.windows.window_results import together
+from kcons.free_energy import FreeEnergy, MeanForce, Settings, WindowResult, Windows, pull_free_energy
+from kcons.free_energy.windows.free_energy import combine_sides
 
 PERIOD = 2 * np.pi
 
@@ -24,7 +28,7 @@ def of_two_sides(apart):
         name: MeanForce(("a", "b"), np.zeros(2), force, error**2 * np.eye(2), force, 100, 50.0)
         for name, force, error in (("up", np.zeros(2), 0.1), ("down", np.array(apart), 0.2))
     }
-    return together(0, np.zeros(2), sides, Units(), 0.0)
+    return combine_sides(0, np.zeros(2), sides, Units(), 0.0)
 
 
 def test_sides_that_differ_by_more_than_chance_widen_the_error():
@@ -50,7 +54,7 @@ def test_a_torsion_may_be_given_beyond_its_period():
     within = found([0, 45, 90, 135, 180, 225, 270, 315]).profile
     np.testing.assert_allclose(np.degrees(beyond.windows), np.arange(0, 360, 45), atol=1e-9)
     assert beyond.closure is not None
-    assert np.abs(beyond.F - within.F).max() < 1e-3 * within.error.max()
+    assert np.abs(beyond.F - within.F).max() < 1e-6 * within.error.max()
     with pytest.raises(InputError, match="1 different windows"):
         _ = found([10, 370, 730]).profile
     with pytest.raises(InputError, match="0 different windows"):
@@ -99,3 +103,64 @@ def test_surfaces_of_torsions_beyond_their_period():
     assert np.degrees(both.surface.windows[:, 0].max()) == pytest.approx(240.0)
     with pytest.raises(InputError, match="2 coordinates; see surface"):
         _ = both.profile
+
+
+@pytest.fixture
+def sampled(tmp_path):
+    windows = Windows(
+        Fake(str(tmp_path / "diary"), fails=("window-0001-up",), shift=0.4),
+        tmp_path / "out",
+        Settings(production=640, every=10),
+    )
+    return windows.run(np.linspace(-np.pi, np.pi, 9)[:-1], executor=ThreadPoolExecutor(1))
+
+
+def test_table_and_sentences(sampled):
+    text = rendered(sampled.table())
+    assert "torsion (degrees)" in text and "-180" in text and "±" in text
+    said = sampled.summary()
+    assert said.startswith("8 windows") and "window-0001-up failed: RuntimeError" in said
+    assert "from the lowest to the highest point" in said
+    low = min(w.hysteresis for w in sampled.windows if w.number != 1)
+    assert ("(marked !)" in said) == (low < 0.01) == ("!" in text)
+
+
+def test_files(sampled, tmp_path):
+    paths = sampled.write(tmp_path)
+    assert [path.name for path in paths] == ["free_energy.json", "profile.csv", "profile.png"]
+    lines = paths[1].read_text().splitlines()
+    assert lines[0] == "torsion (radian),F (kJ/mol),error (kJ/mol)"
+    numbers = np.loadtxt(paths[1], delimiter=",", skiprows=1)
+    np.testing.assert_allclose(numbers[:, 1], sampled.profile.F, rtol=1e-6, atol=1e-9)
+    assert paths[2].read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("places", [[0.1, 0.5, 0.9], [0.1, 0.5], [0.1, 0.1, 0.5]], ids=str)
+def test_a_profile_or_why_there_is_none(places, tmp_path):
+    """What `integrate` takes: three windows at different places."""
+    profile = len(set(places)) == 3
+    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=640, every=10))
+    found = windows.run(places, executor=ThreadPoolExecutor(1))
+    said = found.summary()
+    names = [path.name for path in found.write(tmp_path)]
+    assert ("from the lowest to the highest point" in said) == ("profile.csv" in names) == profile
+    assert ("no profile: 2 different windows are too few for a profile; give 3 or more" in said) == (not profile)
+
+
+def test_a_formula_has_its_own_unit(sampled, tmp_path):
+    """Of OpenMM it is in nm, and nobody knows whether it is a length."""
+    sampled.angles = (None,)
+    text = rendered(sampled.table())
+    assert "torsion (own unit)" in text and "kJ/mol by own unit" in text and "angstrom" not in text
+    (_, columns, _) = sampled.write(tmp_path)
+    assert columns.read_text().startswith("torsion (own unit),F")
+
+
+def test_pulls_beside_windows_that_do_not_reach_their_ends(sampled):
+    pulled = pull_free_energy(np.linspace(0, 1, 20), thermal_energy=2.5)
+    numbers, said = sampled.beside(pulled, np.array([0.1]), np.array([4.0]))
+    assert numbers["windows"][0] == pytest.approx(sampled.profile.difference(0.1, 4.0 - 2 * np.pi).value)
+    sampled.windows[:] = sampled.windows[:4]
+    del sampled.profile
+    numbers, said = sampled.beside(pulled, np.array([0.1]), np.array([4.0]))
+    assert "windows" not in numbers and said.endswith("; the windows do not reach both ends")

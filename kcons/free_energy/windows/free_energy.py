@@ -1,11 +1,12 @@
-"""What windows have found: the mean force of each, and the free energy of all."""
+"""What windows have found: the mean force of each, the free energy of all, and how both are shown."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,13 +16,22 @@ from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
+from kcons.free_energy.profiles.pulls import Pulled
 from kcons.free_energy.windows.window import Sampler
+from kcons.steppers.files import in_one_piece, text
 from kcons.thermostats import Estimate
+from kcons.thermostats.correlated_series import FEW_INDEPENDENT
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
 UNLIKELY = 0.01
 #: Windows of a torsion do not go around a gap that is wider than any other by more than this.
 _HOLE = 2.001
+#: Of angles, of lengths, and of formulas and functions: as places are shown, and what mean forces are by.
+_SHOWN = {True: "degrees", False: "angstrom", None: "own unit"}
+_PER = {**_SHOWN, True: "radian"}
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,11 @@ class WindowResult:
     def error(self) -> FloatArray:
         return np.sqrt(np.diagonal(self.covariance))
 
+    @property
+    def independent(self) -> float:
+        """Independent samples of all sides."""
+        return sum(side.n_effective for side in self.sides.values())
+
 
 @dataclass
 class FreeEnergy:
@@ -72,12 +87,15 @@ class FreeEnergy:
         Those that are finished, in the order of their coordinates.
     failed : dict of str to str
         Windows that failed, and why.
+    angles : tuple of bool or None
+        Which coordinates are angles; None where the unit is that of a formula or a function.
     """
 
     names: tuple[str, ...]
     periods: FloatArray
     windows: list[WindowResult]
     failed: dict[str, str] = field(default_factory=dict)
+    angles: tuple[bool | None, ...] = ()
 
     @cached_property
     def profile(self) -> Profile:
@@ -142,6 +160,84 @@ class FreeEnergy:
             return False
         return bool(gaps[-1] <= gaps[:-1].max(initial=0.0) + 1e-6 * period)
 
+    # -- shown ----------------------------------------------------------------------------------
+
+    def _profile(self) -> tuple[Profile | None, str]:
+        """The profile along the only coordinate; otherwise None, and where there could be one, why there is none."""
+        if len(self.names) != 1:
+            return None, ""
+        try:
+            return self.profile, ""
+        except InputError as error:
+            return None, f"no profile: {error}"
+
+    def table(self) -> Table:
+        """The windows, one in a line; print it by rich."""
+        from rich.table import Table
+
+        made = Table(title=f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})")
+        slopes = [f"dF/d {name}" for name in self.names] if len(self.names) > 1 else ["dF/dq"]
+        for title in (
+            *(f"{name} ({_SHOWN[angle]})" for name, angle in zip(self.names, self.angles, strict=True)),
+            *slopes,
+            *("raw multiplier", "independent samples", "hysteresis p"),
+        ):
+            made.add_column(title, justify="right")
+        for window in self.windows:
+            shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, self.angles, strict=True)]
+            mark = "!" if window.hysteresis < UNLIKELY else ""
+            made.add_row(
+                *(f"{q:.4g}" for q in shown),
+                *(f"{f:.2f} ± {e:.2f}" for f, e in zip(window.force, window.error, strict=True)),
+                ", ".join(f"{raw:.2f}" for raw in window.raw),
+                f"{window.independent:.0f}",
+                "" if np.isnan(window.hysteresis) else f"{window.hysteresis:.2g}{mark}",
+            )
+        return made
+
+    def summary(self) -> str:
+        """A sentence or two."""
+        lines = [f"{len(self.windows)} windows"]
+        doubtful = [w.number for w in self.windows if w.hysteresis < UNLIKELY]
+        if doubtful:
+            lines.append(
+                f"runs from below and from above differ by more than chance in window {', '.join(map(str, doubtful))} "
+                "(marked !): something slow is not equilibrated there; sample longer, or look for the other coordinate"
+            )
+        poor = [w.number for w in self.windows if w.independent < FEW_INDEPENDENT]
+        if poor:
+            lines.append(
+                f"fewer than {FEW_INDEPENDENT} independent samples in window {', '.join(map(str, poor))}: errors there "
+                "are not to be relied on; sample longer"
+            )
+        profile, why = self._profile()
+        if why:
+            lines.append(why)
+        if profile is not None:
+            low, high = int(np.argmin(profile.F)), int(np.argmax(profile.F))
+            gap = profile.difference(float(profile.x[low]), float(profile.x[high]))
+            lines.append(f"from the lowest to the highest point {gap.value:.2f} ± {gap.error:.2f} kJ/mol")
+        lines += [f"{name} failed: {why}" for name, why in self.failed.items()]
+        return "\n".join(lines)
+
+    def beside(self, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
+        """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
+        best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
+        numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
+        for key in ("bar", "jarzynski", "jarzynski_backward"):
+            if getattr(pulled, key) is not None:
+                numbers[key] = [*getattr(pulled, key)]
+        numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
+        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol lost)"
+        if self._profile()[0] is not None:
+            windows = self.between(float(start[0]), float(end[0]))
+            if windows is None:
+                return numbers, f"{said}; the windows do not reach both ends"
+            numbers["windows"] = [*windows]
+            away = (best.value - windows.value) / math.hypot(best.error, windows.error)
+            said += f", windows {windows.value:.2f} ± {windows.error:.2f}: {away:+.1f} standard errors"
+        return numbers, said
+
     def numbers(self) -> dict[str, Any]:
         """All of it as plain data."""
         return {
@@ -156,15 +252,34 @@ class FreeEnergy:
                     "raw multiplier": w.raw.tolist(),
                     "hysteresis": w.hysteresis,
                     "samples": sum(side.n for side in w.sides.values()),
-                    "independent samples": sum(side.n_effective for side in w.sides.values()),
+                    "independent samples": w.independent,
                 }
                 for w in self.windows
             ],
             "failed": self.failed,
         }
 
+    def write(self, folder: Path) -> list[Path]:
+        """free_energy.json, and for one coordinate profile.csv and profile.png; returns their paths."""
+        written = [folder / "free_energy.json"]
+        with in_one_piece(written[0]) as opened:
+            opened.write(text(self.numbers()).encode())
+        profile, _ = self._profile()
+        if profile is not None:
+            from kcons.free_energy.profiles.plots import plot_profile
 
-def together(
+            (name,), (angle,) = self.names, self.angles
+            written += [folder / "profile.csv", folder / "profile.png"]
+            with in_one_piece(written[1]) as opened:
+                opened.write(f"{name} ({_PER[angle]}),F (kJ/mol),error (kJ/mol)\n".encode())
+                np.savetxt(opened, np.column_stack([profile.x, profile.F, profile.error]), fmt="%.8g", delimiter=",")
+            with in_one_piece(written[2]) as opened:
+                figure = plot_profile(profile, coordinate=f"{name} / {_PER[angle]}", energy="(kJ/mol)")
+                figure.savefig(opened, dpi=150, format="png")
+        return written
+
+
+def combine_sides(
     number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler, seconds: float
 ) -> WindowResult:
     """The mean of both sides, and how probable their difference is."""

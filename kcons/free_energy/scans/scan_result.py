@@ -1,0 +1,399 @@
+"""What a scan found, how it is shown, and its relaxations in a folder, kept one by one as they are done."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import ase.io
+import numpy as np
+from ase import Atoms, units
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from kcons import __version__
+from kcons.ase.constraints_object import Constraints
+from kcons.ase.named_calculators import described
+from kcons.constraints import Constraint
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnreadableError
+from kcons.free_energy.scans.grid import Grid, Point
+from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: One eV in kJ/mol, and the difference of energies that is told of, in kJ/mol.
+KJ, TOLD = units.mol / units.kJ, 0.1
+#: What is in a folder: what the scan is of, its relaxations, and what `Scan.write` makes of them.
+PLAN, PLACE = "plan.json", "relaxations"
+FILES = (f"{PLACE}/*.npz", "scan.json", "scan.csv", "scan.png", "scan.extxyz")
+#: Atoms of a term of the model, filled up with this.
+_NONE = -9
+
+
+@dataclass
+class Attempt:
+    """One relaxation.
+
+    Attributes
+    ----------
+    number : int
+    point : tuple of int
+    source : int or None
+        The attempt whose structure it began from; None for the structure that was given.
+    positions : ndarray, shape (n_atoms, 3)
+    energy, largest : float
+        In eV; the largest force left on an atom, in eV/angstrom.
+    evaluations : int
+    error : str or None
+        Why it failed.
+    memory, terms
+        What was learned of the curvature, see `relaxation`.
+    """
+
+    number: int
+    point: Point
+    source: int | None
+    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    energy: float = float("nan")
+    largest: float = float("nan")
+    evaluations: int = 0
+    error: str | None = None
+    memory: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    terms: list[tuple[int, ...]] = field(default_factory=list)
+
+    def fill(self, positions: FloatArray, energy: float, largest: float, evaluations: int) -> None:
+        self.positions, self.energy, self.largest, self.evaluations = positions, energy, largest, evaluations
+
+    def save(self, path: Path) -> None:
+        """Write it; the file is there as a whole, or not at all."""
+        head = {name: getattr(self, name) for name in ("point", "source", "evaluations", "error")}
+        terms = np.full((len(self.terms), 5), _NONE, dtype=np.int64)
+        for row, term in zip(terms, self.terms, strict=True):
+            row[: len(term)] = term
+        numbers = np.array([self.energy, self.largest])
+        arrays = {"positions": self.positions, "memory": self.memory, "numbers": numbers, "terms": terms}
+        with in_one_piece(path) as file:
+            np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: Path, number: int) -> Attempt:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        UnreadableError
+        """
+        try:
+            with path.open("rb") as file:
+                data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
+            head = json.loads(str(data["head"]))
+            terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
+            head |= {"point": tuple(head["point"]), "positions": data["positions"], "memory": data["memory"]}
+            energy, largest = (float(v) for v in data["numbers"])
+            return cls(number, **head, terms=terms, energy=energy, largest=largest)
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            raise UnreadableError(f"{path} cannot be read ({error}); remove it", item="folder") from error
+
+
+class Attempts:
+    """A folder of attempts; without a folder nothing is kept.
+
+    Parameters
+    ----------
+    folder : path, or None
+    atoms : ase.Atoms
+    grid : Grid
+    held : sequence of Constraint
+    settings : mapping
+
+    Raises
+    ------
+    OccupiedError
+        The folder has another scan in it, or other files of these names.
+    InputError
+        Coordinates that cannot be written to a file.
+    """
+
+    def __init__(
+        self,
+        folder: str | PathLike[str] | None,
+        atoms: Atoms,
+        grid: Grid,
+        held: Sequence[Constraint],
+        settings: Mapping[str, Any],
+    ) -> None:
+        self._results: ResultFolder | None = None
+        if folder is None:
+            return
+        plan = {
+            "symbols": str(atoms.symbols),
+            "positions": atoms.positions.tolist(),
+            "cell": atoms.cell.array.tolist(),
+            "pbc": atoms.pbc.tolist(),
+            "calculator": described(atoms.calc, atoms),
+            "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
+            "values": [axis.tolist() for axis in grid.values],
+            "held": [item.todict() for item in held],
+            "settings": dict(settings),
+        }
+        self._results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
+        self._results.refuse_others()
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Make the folder, and keep others out of it.
+
+        Raises
+        ------
+        OccupiedError
+            Another scan writes there.
+        """
+        if self._results is None:
+            yield
+            return
+        with self._results.taken():
+            (self._results.path / PLACE).mkdir(exist_ok=True)
+            yield
+
+    def _file(self, number: int) -> Path | None:
+        return None if self._results is None else self._results.path / PLACE / f"{number:05d}.npz"
+
+    def tried(self, number: int) -> Attempt | None:
+        """An attempt of an earlier run; None if there is none."""
+        path = self._file(number)
+        return None if path is None or not path.exists() else Attempt.load(path, number)
+
+    def kept(self, number: int, point: Point, source: int | None) -> Attempt | None:
+        """The attempt of an earlier run that began so; None if there is none.
+
+        Raises
+        ------
+        UnreadableError
+            Its file is damaged, or of another scan.
+        """
+        found = self.tried(number)
+        if found is not None and (found.point, found.source) != (point, source):
+            raise UnreadableError(f"{self._file(number)} is of another scan; take another folder", item="folder")
+        return found
+
+    def keep(self, attempt: Attempt) -> None:
+        path = self._file(attempt.number)
+        if path is not None:
+            attempt.save(path)
+
+
+class _Shown(Table):
+    """A table that `print` shows as a terminal does."""
+
+    def __str__(self) -> str:
+        page = io.StringIO()
+        Console(file=page, width=200, color_system=None).print(self)
+        return page.getvalue().rstrip()
+
+
+@dataclass
+class Scan:
+    """What a scan found.
+
+    Attributes
+    ----------
+    grid : Grid
+    atoms : ase.Atoms
+        As given, without calculator and constraints.
+    held : list of Constraint
+        What was held besides the coordinates.
+    attempts : list of Attempt
+        All relaxations, in the order in which they were made.
+    best : dict
+        The attempt of lowest energy of each point that was reached.
+    """
+
+    grid: Grid
+    atoms: Atoms
+    held: list[Constraint] = field(default_factory=list)
+    attempts: list[Attempt] = field(default_factory=list)
+    best: dict[Point, Attempt] = field(default_factory=dict)
+
+    @property
+    def energies(self) -> FloatArray:
+        """In eV, shape of the grid; NaN where no relaxation succeeded."""
+        return self._over_the_grid({point: attempt.energy for point, attempt in self.best.items()})
+
+    @property
+    def hysteresis(self) -> FloatArray:
+        """How much the last relaxations from the neighbors of each point differ in energy, in eV, shape of the grid.
+
+        Zero where they ended in the same minimum, or where there was one only.
+        """
+        spread: dict[Point, float] = {}
+        for point in self.best:
+            last: dict[Point | None, float] = {}
+            for attempt in self.attempts:
+                if attempt.point == point and attempt.error is None:
+                    origin = None if attempt.source is None else self.attempts[attempt.source].point
+                    last[origin] = attempt.energy
+            spread[point] = max(last.values()) - min(last.values())
+        return self._over_the_grid(spread)
+
+    @property
+    def failed(self) -> dict[Point, str]:
+        """Points that were not reached, with the last error of each."""
+        errors = {a.point: a.error for a in self.attempts if a.error is not None}
+        return {p: errors.get(p) or "no relaxation was tried" for p in self.grid.points if p not in self.best}
+
+    @property
+    def evaluations(self) -> int:
+        """Calls of energy and forces in all."""
+        return sum(attempt.evaluations for attempt in self.attempts)
+
+    def structure(self, point: Point, *, hold: bool = False) -> Atoms:
+        """The minimum at a point, its values and energy in `info`.
+
+        Parameters
+        ----------
+        point : tuple of int
+            Numbers of its values in the lists of the scan.
+        hold : bool
+            Whether the atoms get the constraints they had there: what was held besides, and the coordinates.
+
+        Raises
+        ------
+        InputError
+            The point was not reached.
+        """
+        if point not in self.best:
+            raise InputError(
+                f"there is no structure at {point}: {self.failed.get(point, 'no such point')}", item="point"
+            )
+        found = self.atoms.copy()
+        found.positions[:] = self.best[point].positions
+        found.info |= {"energy": self.best[point].energy, **self._values(point)}
+        if hold:
+            found.set_constraint(Constraints([*self.held, *self.grid.held_at(point)]))
+        return found
+
+    def _over_the_grid(self, entries: dict[Point, float]) -> FloatArray:
+        table = np.full(self.grid.shape, np.nan)
+        for point, entry in entries.items():
+            table[point] = entry
+        return table
+
+    def _values(self, point: Point) -> dict[str, float]:
+        return dict(zip(self.grid.keys, self.grid.shown(point), strict=True))
+
+    # -- shown ----------------------------------------------------------------------------------
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Of each point the values, energies, hysteresis, calls, the force left, and why it failed."""
+        energy, spread = self.energies, self.hysteresis
+        calls = dict.fromkeys(self.grid.points, 0)
+        for attempt in self.attempts:
+            calls[attempt.point] += attempt.evaluations
+        lowest = float(np.nanmin(energy)) if self.best else float("nan")
+        return [
+            {
+                **self._values(point),
+                "energy_eV": float(energy[point]) if point in self.best else None,
+                "energy_kJ_mol": float(energy[point] - lowest) * KJ,
+                "hysteresis_kJ_mol": float(spread[point]) * KJ,
+                "calls": calls[point],
+                "force_left_eV_A": self.best[point].largest if point in self.best else float("nan"),
+                "error": self.failed.get(point),
+            }
+            for point in self.grid.points
+        ]
+
+    def summary(self) -> str:
+        """What was done, and what failed."""
+        lowest = float(np.nanmin(self.energies)) if self.best else float("nan")
+        lines = [
+            f"{len(self.best)} of {len(self.grid.points)} points, {len(self.attempts)} relaxations, "
+            f"{self.evaluations} calls of energy and forces; lowest energy {lowest:.6f} eV"
+        ]
+        spread = self.hysteresis * KJ
+        if self.best and np.nanmax(spread) >= TOLD:
+            worst = tuple(int(n) for n in np.unravel_index(np.nanargmax(spread), spread.shape))
+            lines.append(
+                f"from different neighbors the energy differs by up to {spread[worst]:.2f} kJ/mol, at "
+                f"{self.grid.said(worst)}; the lower one is kept"
+            )
+        return "\n".join([*lines, *(f"failed: {why}" for why in self.failed.values())])
+
+    def table(self) -> Table:
+        """A row a point; energies above the lowest one. Print it."""
+        shown = _Shown(box=box.SIMPLE_HEAD, padding=(0, 1))
+        for name, unit in zip(self.grid.names, self.grid.units, strict=True):
+            shown.add_column(f"{name}\n{unit}", justify="right")
+        for heading in ("energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"):
+            shown.add_column(heading, justify="right")
+        for point, row in zip(self.grid.points, self.rows(), strict=True):
+            turns = zip(self.grid.shown(point), self.grid.in_degrees, strict=True)
+            cells = [f"{v:.2f}" if turn else f"{v:.4f}" for v, turn in turns]
+            reached = point in self.best
+            cells += [f"{row['energy_kJ_mol']:.3f}", f"{row['hysteresis_kJ_mol']:.3f}"] if reached else ["failed", ""]
+            shown.add_row(*cells, str(row["calls"]), f"{row['force_left_eV_A']:.4f}" if reached else "")
+        return shown
+
+    def plot(self) -> Figure:
+        """Energy along one coordinate, or over two; points that failed are crosses."""
+        from matplotlib.figure import Figure
+
+        grid, lowest = self.grid, float(np.nanmin(self.energies)) if self.best else float("nan")
+        energy, spread = (self.energies - lowest) * KJ, self.hysteresis * KJ
+        figure = Figure(figsize=(7, 4.5), layout="constrained")
+        axes = figure.subplots()
+        labels = [f"{name} / {unit}" for name, unit in zip(grid.names, grid.units, strict=True)]
+        axes.set_xlabel(labels[0])
+        failed = np.array([grid.shown(point) for point in grid.points if point not in self.best])
+        x, *y = (np.degrees(v) if turn else v for v, turn in zip(grid.values, grid.in_degrees, strict=True))
+        if y:
+            drawn = axes.pcolormesh(x, y[0], np.ma.masked_invalid(energy.T), shading="nearest", cmap="viridis")
+            figure.colorbar(drawn, ax=axes, label="energy / (kJ/mol)")
+            axes.set_ylabel(labels[1])
+        else:
+            axes.plot(x, energy, marker="o", markersize=4, color="#0072B2", label="lowest")
+            if np.nanmax(spread, initial=0.0) >= TOLD:
+                higher = "highest from another neighbor"
+                axes.plot(x, energy + spread, linestyle="--", color="#D55E00", label=higher)
+                axes.legend(fontsize=8)
+            axes.set_ylabel("energy / (kJ/mol)")
+        if len(failed):
+            axes.plot(failed[:, 0], failed[:, 1] if y else np.zeros(len(failed)), "x", color="black")
+        return figure
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Put scan.json, .csv, .png and .extxyz (the minima, as in the grid) into a folder; the paths written."""
+        place, rows = Path(folder), self.rows()
+        place.mkdir(parents=True, exist_ok=True)
+        numbers: dict[str, Any] = {
+            "kcons": __version__,
+            "coordinates": dict(zip(self.grid.keys, self.grid.units, strict=True)),
+            "points": rows,
+            "relaxations": len(self.attempts),
+            "calls": self.evaluations,
+        }
+        lines, frames, picture = io.StringIO(newline=""), io.StringIO(), io.BytesIO()
+        writer = csv.DictWriter(lines, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+        for point in self.grid.points:
+            if point in self.best:
+                ase.io.write(frames, self.structure(point), format="extxyz")
+        self.plot().savefig(picture, dpi=150, format="png")
+        written = [place / f"scan.{kind}" for kind in ("json", "csv", "png", "extxyz")]
+        contents = [text(numbers).encode(), lines.getvalue().encode(), picture.getvalue(), frames.getvalue().encode()]
+        for path, content in zip(written, contents, strict=True):
+            with in_one_piece(path) as file:
+                file.write(content)
+        return written

@@ -1,0 +1,454 @@
+"""Windows as an input file describes them, in TOML.
+
+A table of the file is a dataclass below, a key one of its fields. What may be given is said by the annotation,
+`Annotated[type, Rule]`, with words for the error. A key without a default has to be there.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tomllib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from dataclasses import MISSING, dataclass, field, fields
+from functools import partial
+from itertools import product
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as short
+from typing import Annotated, Any, NamedTuple, TypeAlias, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms
+from kcons.constraints.arguments import whole_number
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError, did_you_mean
+from kcons.free_energy.windows.window import Sampler, Settings
+from kcons.steppers.files import as_path
+
+#: Windows of an input file, at most.
+MOST_WINDOWS = 100_000
+FAMILIES: dict[str, type[Constraint]] = {"distance": Distance, "angle": Angle, "dihedral": Dihedral}
+
+
+class Rule(NamedTuple):
+    """What a value of TOML must be, in words and as a test."""
+
+    words: str
+    test: Callable[[Any], bool]
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int) and _number(value)
+
+
+def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and bool(value) and all(map(test, value))
+
+
+_NUMBERS, _ATOMS = _list(_number), _list(_whole)
+Text: TypeAlias = Annotated[str, Rule("a text", lambda v: isinstance(v, str))]
+Table: TypeAlias = Annotated[dict, Rule("a table", lambda v: isinstance(v, dict))]
+Truth: TypeAlias = Annotated[bool, Rule("true or false", lambda v: isinstance(v, bool))]
+Number: TypeAlias = Annotated[float, Rule("a number", _number)]
+Positive: TypeAlias = Annotated[float, Rule("a number above 0", lambda v: _number(v) and v > 0)]
+Count: TypeAlias = Annotated[int, Rule("a whole number above 0", lambda v: _whole(v) and v > 0)]
+ZeroOrOne: TypeAlias = Annotated[int, Rule("0 or 1", lambda v: _whole(v) and v in (0, 1))]
+Numbers: TypeAlias = Annotated[list, Rule("numbers", _NUMBERS)]
+NumberOrNumbers: TypeAlias = Annotated[Any, Rule("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
+Atoms: TypeAlias = Annotated[list, Rule("whole numbers", _ATOMS)]
+Pairs: TypeAlias = Annotated[list, Rule("pairs of whole numbers", _list(lambda pair: _ATOMS(pair) and len(pair) == 2))]
+#: Of which `Settings` say more.
+Single: TypeAlias = Annotated[Any, Rule("one value", lambda v: not isinstance(v, dict | list))]
+
+
+@dataclass(kw_only=True)
+class Structure:
+    file: Text
+    count_from: ZeroOrOne = 0
+
+
+@dataclass(kw_only=True)
+class Forces:
+    calculator: Text | None = None
+    settings: Table | None = None
+    system: Text | None = None
+    platform: Text | None = None
+    properties: Table | None = None
+
+
+@dataclass(kw_only=True)
+class Coordinate:
+    name: Text | None = None
+    distance: Atoms | None = None
+    angle: Atoms | None = None
+    dihedral: Atoms | None = None
+    begin: Number | None = field(default=None, metadata={"key": "from"})
+    to: Number | None = None
+    windows: Count | None = None
+    values: Numbers | None = None
+
+    def __post_init__(self) -> None:
+        self.families = [family for family in FAMILIES if getattr(self, family) is not None]
+        atoms = getattr(self, self.families[0]) if self.families else []
+        self.called = self.name or "-".join([*self.families, *map(str, atoms)])
+        if len(self.families) != 1:
+            raise InputError(
+                f"coordinate {self.called} is {' and '.join(self.families) or 'nothing'}; give the atoms of a "
+                f"{', '.join(FAMILIES)}",
+                item="coordinate",
+            )
+
+    def constraint(self, first: int) -> Constraint:
+        (family,) = self.families
+        return FAMILIES[family]([counted(getattr(self, family), first)])
+
+    def places(self) -> FloatArray:
+        """Where windows are, in angstrom and radian."""
+        name, (family,), ends = self.called, self.families, (self.begin, self.to, self.windows)
+        if self.values is not None:
+            given = [key for key, value in zip(("from", "to", "windows"), ends, strict=True) if value is not None]
+            if given:
+                raise InputError(f"coordinate {name} has values and {given[0]}; give one of them", item="coordinate")
+            places = np.array(self.values, dtype=np.float64)
+        elif self.begin is not None and self.to is not None and self.windows is not None:
+            _refuse_more(self.windows, "windows")
+            turn = family == "dihedral" and abs(self.to - self.begin) >= 360 - 1e-9
+            places = np.linspace(self.begin, self.to, self.windows, endpoint=not turn)
+        else:
+            raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")
+        low, high = {"distance": (0.0, math.inf), "angle": (0.0, 180.0), "dihedral": (-math.inf, math.inf)}[family]
+        for place in places[(places <= low) | (places >= high)].tolist():
+            raise InputError(f"there is no {family} of {place:g} to hold {name} at; leave it out", item="coordinate")
+        return places if family == "distance" else np.radians(places)
+
+
+@dataclass(kw_only=True)
+class HeldRows:
+    constrain: Text | None = None
+    fixed: Atoms | None = None
+    distances: Pairs | None = None
+
+    def rows(self, atoms: Any, first: int) -> list[Constraint]:
+        from kcons.ase import constraints_of
+
+        found: list[Constraint] = [] if self.fixed is None else [FixedAtoms(counted(self.fixed, first))]
+        if self.distances is not None:
+            found.append(Distance([counted(pair, first) for pair in self.distances]))
+        return found if self.constrain is None else [*found, *constraints_of(atoms, self.constrain, guess_bonds=True)]
+
+
+@dataclass(kw_only=True)
+class Improve:
+    error: Positive
+    most: Count
+    below: Positive | None = None
+    at_once: Count = 1
+
+
+@dataclass(kw_only=True)
+class Pulls:
+    begin: NumberOrNumbers | None = field(default=None, metadata={"key": "from"})
+    to: NumberOrNumbers | None = None
+    count: Single = 20
+    steps: Single = 20_000
+    both_ways: Truth = True
+
+
+@dataclass(kw_only=True)
+class Workers:
+    processes: Count | None = None
+    scheduler: Text | None = None
+
+
+#: Keys of [sampling]: those of `Settings`, and arguments of `Windows`.
+_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "seed": Single}
+_SAMPLING = {f.name: Single for f in fields(Settings)} | _OF_WINDOWS
+#: Tables that may be left out.
+_OPTIONAL = {"forces": Forces, "held": HeldRows, "improve": Improve, "pulls": Pulls, "workers": Workers}
+_TABLES = ("structure", "forces", "coordinate", "held", "sampling", "improve", "pulls", "workers")
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """An input file that was read.
+
+    Attributes
+    ----------
+    sampler : Sampler
+    settings : Settings
+    targets : ndarray, shape (n, d)
+        In angstrom and radian.
+    options : dict
+        Of `Windows`: both_sides, approach, seed.
+    improve : dict or None
+        Of `Windows.improve`.
+    pulls : dict or None
+        Of `Windows.pull`: start and end in angstrom and radian, count, both_ways.
+    pull_steps : int
+        Steps of each of these.
+    processes : int or None
+    scheduler : str or None
+        Address of a scheduler of Dask.
+    """
+
+    sampler: Sampler
+    settings: Settings
+    targets: FloatArray
+    options: dict[str, Any]
+    improve: dict[str, Any] | None
+    pulls: dict[str, Any] | None
+    pull_steps: int
+    processes: int | None
+    scheduler: str | None
+
+    def executor(self) -> AbstractContextManager[Executor | None]:
+        """Where the windows run; None for processes of this machine.
+
+        Raises
+        ------
+        InputError
+            No scheduler answers.
+        UnsupportedError
+            Dask is not installed.
+        """
+        if self.scheduler is None:
+            return nullcontext()
+        try:
+            from distributed import Client
+        except ModuleNotFoundError:
+            raise UnsupportedError(
+                "a scheduler is one of Dask, which is not installed: python -m pip install 'dask[distributed]'"
+            ) from None
+        try:
+            client = Client(self.scheduler, timeout="10s")
+        except (OSError, ValueError) as error:
+            raise InputError(f"no scheduler of Dask answers at {self.scheduler}: {error}", item="scheduler") from error
+
+        @contextmanager
+        def cluster() -> Any:
+            with closing(client):
+                yield client.get_executor(pure=False)
+
+        return cluster()
+
+
+def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -> InputFile:
+    """Read an input file; its paths count from where it lies.
+
+    Nothing of what it names is imported or called, but for the calculators of `LISTED`, to look at their settings.
+
+    Parameters
+    ----------
+    file : path
+    allow_modules : collection of str
+        Python modules of which it may take a calculator, and run their code.
+
+    Raises
+    ------
+    InputError
+        No TOML, unknown or missing keys, files that are not there, coordinates without values, more than 100,000
+        windows; a calculator that is neither in `kcons.ase.named_calculators.LISTED` nor of one of these modules.
+    """
+    path = as_path(file, "file")
+    data = _toml(path)
+    for name, content in data.items():
+        _refuse_unknown(name, _TABLES, "the input file")
+        if (name == "coordinate") != isinstance(content, list):
+            brackets = "[[coordinate]], once for each" if name == "coordinate" else f"[{name}], once"
+            raise InputError(f"write {brackets}", item=name)
+    sampling = _checked("sampling", data.get("sampling", {}), _SAMPLING)
+    if "structure" not in data:
+        raise InputError("the input file has no structure; write [structure] with file = ...", item="structure")
+    structure = _read(Structure, "structure", data["structure"])
+    tables = {name: _read(kind, name, data.get(name, {})) for name, kind in _OPTIONAL.items() if name in data}
+    entries = [_read(Coordinate, "coordinate", entry) for entry in data.get("coordinate", [])]
+    if not entries:
+        raise InputError("the input file has no [[coordinate]]", item="coordinate")
+    coordinates: dict[str, Constraint] = {}
+    for entry in entries:
+        if entry.called in coordinates:
+            raise InputError(f"two coordinates have the name {entry.called}; give each its own", item="coordinate")
+        coordinates[entry.called] = entry.constraint(structure.count_from)
+    places = [entry.places() for entry in entries]
+    _refuse_more(math.prod(map(len, places)), "coordinate")
+    targets = np.array(list(product(*places)))
+    options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
+    if "approach" in options:
+        options["approach"] = _in_radian("approach", options["approach"], coordinates)
+    improve, pulls, workers = tables.get("improve"), tables.get("pulls", Pulls()), tables.get("workers", Workers())
+    if improve is not None and (len(coordinates) > 1 or len(targets) < 3):
+        raise InputError(
+            f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
+            f"{len(targets)} windows: leave it out, or begin with 3 windows or more along one",
+            item="improve",
+        )
+    return InputFile(
+        _sampler(path.parent, structure, tables, coordinates, allow_modules),
+        Settings(**sampling),
+        targets,
+        options,
+        dict(data["improve"]) if improve else None,
+        _pulls(pulls, coordinates, targets) if "pulls" in tables else None,
+        pulls.steps,
+        workers.processes,
+        workers.scheduler,
+    )
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"there is no file {path}", item="file") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error}", item="file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML: {error}", item="file") from error
+    except RecursionError:
+        raise InputError(
+            f"{path}: lists or tables are too deep in each other; an input file needs two levels", item="file"
+        ) from None
+
+
+def _read(kind: type[Any], name: str, entry: Any) -> Any:
+    """A table as an object of a dataclass."""
+    hints = get_type_hints(kind, include_extras=True)
+    known = {each.metadata.get("key", each.name): each for each in fields(kind)}
+    given = _checked(name, entry, {key: hints[each.name] for key, each in known.items()})
+    for key, each in known.items():
+        if key not in given and each.default is MISSING:
+            raise InputError(f"[{name}] has no {key}; give {_rule(hints[each.name]).words}", item=key)
+    return kind(**{known[key].name: value for key, value in given.items()})
+
+
+def _checked(name: str, entry: Any, hints: Mapping[str, Any]) -> dict[str, Any]:
+    """A table whose keys are known and whose values are what their annotations say."""
+    if not isinstance(entry, dict):
+        raise InputError(f"{name} is {short(entry)}; write [{name}] and its keys below", item=name)
+    for key, value in entry.items():
+        _refuse_unknown(key, hints, f"[{name}]")
+        rule = _rule(hints[key])
+        if not rule.test(value):
+            raise InputError(f"{key} of [{name}] is {short(value)}; give {rule.words}", item=key)
+    return dict(entry)
+
+
+def _rule(hint: Any) -> Rule:
+    """The rule of an annotation, or of the part of it that is not None."""
+    for part in (hint, *getattr(hint, "__args__", ())):
+        for extra in getattr(part, "__metadata__", ()):
+            if isinstance(extra, Rule):
+                return extra
+    raise TypeError(f"{hint} has no rule")
+
+
+def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
+    if key not in known:
+        hint = did_you_mean(key, known)
+        raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
+
+
+def _refuse_more(windows: int, item: str) -> None:
+    if windows > MOST_WINDOWS:
+        raise InputError(f"the input file has {windows:,} windows; give at most {MOST_WINDOWS:,}", item=item)
+
+
+def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
+    """Arguments of `Windows.pull`; by default from the first window to the last."""
+    for key, low in (("count", 5), ("steps", 1)):
+        whole_number(getattr(entry, key), f"{key} of [pulls]", low)
+    start, end = (
+        place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
+        for key, given, place in (("from", entry.begin, targets[0]), ("to", entry.to, targets[-1]))
+    )
+    if np.array_equal(start, end):
+        raise InputError("[pulls] begin where they end; give from and to", item="pulls")
+    return {"start": start, "end": end, "count": entry.count, "both_ways": entry.both_ways}
+
+
+def counted(atoms: Sequence[int], first: int) -> list[int]:
+    """Numbers from 0 of atoms that are counted from `first`.
+
+    Raises
+    ------
+    InputError
+        One below the first.
+    """
+    if len(atoms) and min(atoms) < first:
+        raise InputError(f"there is no atom {min(atoms)}; atoms are counted from {first}", item="atoms")
+    return [atom - first for atom in atoms]
+
+
+def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]) -> FloatArray:
+    """Values of the coordinates, or one for all of them, angles of degrees in radian."""
+    values = np.array(given, dtype=np.float64)
+    if values.shape not in ((), (len(coordinates),)):
+        raise InputError(
+            f"{key} has {values.size} values; give one for each of {', '.join(coordinates)}", item=key.split()[0]
+        )
+    return np.where([isinstance(item, Distance) for item in coordinates.values()], values, np.radians(values))
+
+
+def _sampler(
+    folder: Path,
+    structure: Structure,
+    tables: Mapping[str, Any],
+    coordinates: Mapping[str, Constraint],
+    allow_modules: Collection[str],
+) -> Sampler:
+    forces, place = tables.get("forces", Forces()), folder / structure.file
+    if not place.is_file():
+        raise InputError(f"there is no file {place}", item="structure")
+    if (forces.calculator is None) == (forces.system is None):
+        raise InputError(
+            "give calculator or system in [forces]: a calculator of ASE, or the XML file of a System of OpenMM",
+            item="forces",
+        )
+    for key, other in (("settings", "system"), ("platform", "calculator"), ("properties", "calculator")):
+        if getattr(forces, key) is not None and getattr(forces, other) is not None:
+            raise InputError(f"{key} of [forces] says nothing to a {other}; leave it out", item=key)
+    if forces.system is not None:
+        if "held" in tables:
+            raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
+        return _of_openmm(place, folder / forces.system, forces, coordinates)
+    import ase.io
+
+    from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
+    from kcons.free_energy.windows.ase_windows import AseWindows
+
+    try:
+        atoms: Any = ase.io.read(place)
+    except Exception as error:
+        raise InputError(f"ASE cannot read {place}: {type(error).__name__}: {error}", item="structure") from error
+    rows = tables.get("held", HeldRows()).rows(atoms, structure.count_from)
+    refuse_unlisted(forces.calculator, allow_modules)
+    make = partial(named_calculator, forces.calculator, forces.settings or {})
+    if forces.calculator in LISTED:
+        make()  # complain of settings
+    return AseWindows(atoms, make, coordinates, rows)
+
+
+def _of_openmm(structure: Path, system: Path, forces: Forces, coordinates: Mapping[str, Constraint]) -> Sampler:
+    from openmm import app
+
+    from kcons.free_energy.scans.system_calculator import read_system
+    from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+
+    made = read_system(system, "system")
+    try:
+        pdb = app.PDBxFile(str(structure)) if structure.suffix == ".cif" else app.PDBFile(str(structure))
+    except Exception as error:
+        raise InputError(
+            f"OpenMM cannot read {structure}: {type(error).__name__}: {error}", item="structure"
+        ) from error
+    x, where = pdb.positions, forces.platform
+    return OpenMMWindows(pdb.topology, made, x, coordinates, platform=where, properties=forces.properties)

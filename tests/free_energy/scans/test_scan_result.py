@@ -1,0 +1,168 @@
+"""What a scan found in tables, plots and files; its relaxations in files, whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import cache
+
+import ase.io
+import numpy as np
+import pytest
+from ase.calculators.lj import LennardJones
+from scan_systems import chain, threefold, two_wells
+
+from kcons.cli.terminal import rendered
+from kcons.constraints import Custom, Dihedral, Distance
+from kcons.errors import InputError, OccupiedError, UnreadableError
+from kcons.free_energy import scan
+from kcons.free_energy.scans.grid import Grid
+from kcons.free_energy.scans.scan_result import KJ, PLACE, PLAN, Attempt, Attempts
+
+TURN = Dihedral([[0, 1, 2, 3]])
+
+
+@cache
+def line():
+    """Four values, the second of which fails."""
+    atoms = chain(4, threefold, lambda phi: RuntimeError("no") if 0.9 < phi[0] < 1.1 else None, turns=[0.5])
+    return scan(atoms, TURN, [0.5, 1.0, 1.5, 2.0])
+
+
+@cache
+def surface():
+    return scan(chain(4, threefold), [TURN, Distance([[1, 2]])], [np.radians([40, 60]), [1.3, 1.4, 1.5]])
+
+
+def test_table_and_summary():
+    shown = rendered(line().table())
+    rows = [row.split() for row in shown.splitlines()]
+    energies = 0.2 * (1 + np.cos(3 * np.array([0.5, 1.5, 2.0]))) * KJ
+    assert next(row for row in rows if row and row[0] == "57.30")[:2] == ["57.30", "failed"]
+    last = next(row for row in rows if row and row[0] == "114.59")
+    assert float(last[1]) == pytest.approx(energies[2] - energies.min(), abs=2e-3)
+    said = line().summary()
+    assert said.startswith("3 of 4 points") and "failed: Dihedral(0, 1, 2, 3) = 57.2958: CalculatorError" in said
+    assert str(line().table()).splitlines()[1].split()[0] == rows[1][0]  # what print shows
+    two = rendered(surface().table())
+    assert "Distance(1, 2)" in two and "1.3000" in two and "40.00" in two
+
+
+def test_what_differs_by_the_way_is_said():
+    atoms = chain(5, two_wells, turns=[np.radians(-150), 0.3])
+    found = scan(atoms, TURN, np.radians(np.arange(-165, 180, 30)))
+    assert "from different neighbors the energy differs by up to" in found.summary()
+    assert len(found.plot().axes[0].lines) == 2
+
+
+def test_plots():
+    axes = line().plot().axes[0]
+    assert axes.get_xlabel() == "Dihedral(0, 1, 2, 3) / degrees"
+    x, y = axes.lines[0].get_data()
+    assert x[0] == pytest.approx(np.degrees(0.5)) and np.isnan(y[1]) and np.nanmin(y) == 0
+    assert axes.lines[1].get_xdata() == pytest.approx([np.degrees(1.0)])  # the cross of the point that failed
+    drawn, bar = surface().plot().axes
+    assert drawn.get_ylabel() == "Distance(1, 2) / angstrom" and bar.get_ylabel() == "energy / (kJ/mol)"
+    assert drawn.collections[0].get_array().shape == (3, 2)
+
+
+def test_files(tmp_path):
+    written = line().write(tmp_path / "new")
+    assert [path.name for path in written] == ["scan.json", "scan.csv", "scan.png", "scan.extxyz"]
+    numbers = json.loads(written[0].read_text())
+    assert numbers["coordinates"] == {"dihedral_0_1_2_3": "degrees"} and numbers["calls"] == line().evaluations
+    assert [point["energy_eV"] is None for point in numbers["points"]] == [False, True, False, False]
+    assert "CalculatorError" in numbers["points"][1]["error"]
+    rows = list(csv.DictReader(written[1].read_text().splitlines()))
+    assert float(rows[2]["energy_eV"]) == line().energies[2] and rows[1]["energy_eV"] == ""
+    frames = ase.io.read(written[3], ":")
+    assert len(frames) == 3
+    for frame, point in zip(frames, [(0,), (2,), (3,)], strict=True):
+        assert frame.get_potential_energy() == line().energies[point]
+        assert frame.info["dihedral_0_1_2_3"] == pytest.approx(np.degrees(line().grid.at(point)[0]))
+        assert np.abs(frame.positions - line().best[point].positions).max() < 1e-7
+    assert written[2].read_bytes().startswith(b"\x89PNG")
+
+
+def made(folder, settings=None):
+    atoms = chain(4, threefold)
+    return begun(folder, atoms, Grid([TURN], [[0.1, 0.2]]), [], settings or {"fmax": 0.01})
+
+
+def begun(*arguments):
+    """Attempts whose folder is there."""
+    attempts = Attempts(*arguments)
+    with attempts.taken():
+        return attempts
+
+
+def test_an_attempt_comes_back(tmp_path):
+    rng = np.random.default_rng(1)
+    attempt = Attempt(3, (1,), 2, memory=rng.normal(size=(2, 2, 3)), terms=[(0, 1), (0, 1, 2), (1, 2, 3, -1, 0)])
+    attempt.fill(rng.normal(size=(4, 3)), -1.5, 0.003, 7)
+    made(tmp_path).keep(attempt)
+    again = made(tmp_path).kept(3, (1,), 2)
+    assert np.array_equal(again.positions, attempt.positions) and np.array_equal(again.memory, attempt.memory)
+    assert (again.energy, again.largest, again.evaluations, again.error) == (-1.5, 0.003, 7, None)
+    assert again.terms == attempt.terms
+    assert made(tmp_path).kept(4, (1,), 2) is None
+    failed = Attempt(5, (0,), None, error="no")
+    made(tmp_path).keep(failed)
+    assert made(tmp_path).kept(5, (0,), None).error == "no"
+
+
+def test_nothing_half_written_is_read(tmp_path):
+    attempts = made(tmp_path)
+    (tmp_path / PLACE / "00000.npz.unfinished").write_bytes(b"PK\x03\x04")
+    assert attempts.kept(0, (0,), None) is None
+    (tmp_path / PLACE / "00000.npz").write_bytes(b"PK\x03\x04")
+    with pytest.raises(UnreadableError, match=r"00000\.npz cannot be read .*; remove it"):
+        attempts.kept(0, (0,), None)
+
+
+def test_an_attempt_of_another_scan_is_refused(tmp_path):
+    made(tmp_path).keep(Attempt(0, (0,), None))
+    with pytest.raises(UnreadableError, match="of another scan"):
+        made(tmp_path).kept(0, (1,), None)
+
+
+def test_the_plan_has_to_be_the_same(tmp_path):
+    made(tmp_path)
+    with pytest.raises(OccupiedError, match=r"has a scan of other settings; give another folder \(--out\)"):
+        made(tmp_path, {"fmax": 0.02})
+    plan = json.loads((tmp_path / PLAN).read_text())
+    (tmp_path / PLAN).write_text(json.dumps({**plan, "colour": 1}))
+    with pytest.raises(OccupiedError, match="a scan of other colour"):
+        made(tmp_path)
+    for content in ("{", "[]"):
+        (tmp_path / PLAN).write_text(content)
+        with pytest.raises(OccupiedError, match=r"other files called plan\.json"):
+            made(tmp_path)
+
+
+def test_without_a_folder_nothing_is_kept():
+    attempts = made(None)
+    attempts.keep(Attempt(0, (0,), None))
+    assert attempts.kept(0, (0,), None) is None
+
+
+def test_python_functions_need_no_folder(tmp_path):
+    row = Custom([[0]], lambda r: r[0, 0], lambda r: np.array([[1.0, 0, 0]]))
+    grid = Grid([row], [[0.1]])
+    Attempts(None, chain(4, threefold), grid, [], {})
+    with pytest.raises(InputError, match="Python function"):
+        Attempts(tmp_path / "new", chain(4, threefold), grid, [], {})
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_calculator_has_to_be_the_same(tmp_path):
+    """Not only of the same kind."""
+    atoms = chain(4, threefold)
+    grid = Grid([TURN], [[0.1, 0.2]])
+    for epsilon in (0.1, 0.1, 0.2):
+        atoms.calc = LennardJones(epsilon=epsilon)
+        if epsilon == 0.2:
+            with pytest.raises(OccupiedError, match=r"of other calculator;"):
+                begun(tmp_path, atoms, grid, [], {})
+        else:
+            begun(tmp_path, atoms, grid, [], {})

@@ -1,0 +1,326 @@
+"""What free energies and scans refuse: the call, the argument it names, what it says; the error if no `InputError`."""
+
+from __future__ import annotations
+
+import io
+from functools import partial
+
+import numpy as np
+import openmm
+import pytest
+from ase import Atoms, units
+from ase.build import molecule
+from ase.calculators.lj import LennardJones
+from ase.md.verlet import VelocityVerlet
+from scan_systems import chain, threefold
+
+from kcons import ConstraintSet
+from kcons.ase import Constraints
+from kcons.constraints import Angle, CenterDistance, CustomVelocity, Dihedral, Distance, FixedAtoms, KnifeEdge, Plane
+from kcons.errors import ConstraintError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.free_energy import (
+    AseRecorder,
+    AseWindows,
+    HeldCoordinates,
+    HeldCoordinatesReporter,
+    OpenMMWindows,
+    Sample,
+    Series,
+    Settings,
+    agreement,
+    fit_surface,
+    integrate,
+    mean_force,
+    pull_free_energy,
+    scan,
+    weighted_mean,
+    work_along,
+    work_profile,
+)
+from kcons.free_energy.scans.grid import Grid
+
+TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
+CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)
+
+# -- settings of windows, and who samples them --
+
+_SETTINGS = [
+    *(("temperature", value) for value in (-1.0, "x", "300")),
+    *(("friction", value) for value in ([1, 2], True)),
+    *(("every", value) for value in (0, None)),
+    *(("timestep", 0.0), ("relax", -1), ("pull", 0.5)),
+]
+SETTINGS = [
+    *((partial(Settings, **{name: value}), name, f"{name} is") for name, value in _SETTINGS),
+    (lambda: Settings(thermostat="andersen"), "thermostat", "no thermostat 'andersen'"),
+    (lambda: Settings(production=300, every=10), "production", r"fewer than 32 samples; .* a smaller `every`"),
+]
+
+
+def methanol(coordinates, calculator=CALCULATOR):
+    return AseWindows(molecule("CH3OH"), calculator, coordinates)
+
+
+def recorder(name, row, held=()):
+    atoms = molecule("CH3OH")
+    atoms.calc = CALCULATOR()
+    if held:
+        atoms.set_constraint(Constraints(held))
+    return AseRecorder(VelocityVerlet(atoms, units.fs), {name: row})
+
+
+def two_particles(coordinates, atoms=2):
+    """In OpenMM."""
+    made, topology = openmm.System(), openmm.app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for _ in range(2):
+        made.addParticle(1.0)
+    for _ in range(atoms):
+        topology.addAtom("X", None, residue)
+    return OpenMMWindows(topology, made, np.eye(3)[:2], coordinates)
+
+
+_OH = Distance([[1, 3]])
+_UNKEPT = "which extended XYZ files cannot keep"
+SAMPLERS = [
+    (lambda: methanol({"t": TURN}, CALCULATOR()), "calculator", r"calculator is .*; give what makes one"),
+    (lambda: methanol(TURN), "coordinates", "no coordinates are named"),
+    (lambda: methanol({"turn": 90}), "turn", "'turn' is 90, and no kcons constraint"),
+    (
+        lambda: methanol({"bonds": Distance([[0, 1], [1, 3]])}).begin(),
+        None,
+        r"bonds is .*one row that holds positions",
+        UnsupportedError,
+    ),
+    (
+        lambda: methanol({"edge": KnifeEdge(0, 1, (0, 0, 1))}).begin(),
+        None,
+        r"edge is .*one row that holds positions",
+        UnsupportedError,
+    ),
+    (
+        lambda: AseWindows(molecule("C2H2"), CALCULATOR, {"t": Dihedral([[2, 0, 1, 3]])}).begin(),
+        None,
+        "collinear|undefined",
+        SingularGeometryError,
+    ),
+    (lambda: two_particles({"p": Plane([0], (0, 0, 1))}), None, r"p is <Plane.*a Dihedral or a For", UnsupportedError),
+    (lambda: two_particles({"r": Distance([[0, 1], [1, 0]])}), None, r"r is .*one row", UnsupportedError),
+    (lambda: two_particles({"r": Distance([[0, 9]])}).begin(), "atoms", "no atom 9; the System has 2 part"),
+    (lambda: two_particles({"r": LENGTH}, 0), "topology", "Topology has 0 atoms and the System 2 particle"),
+    (lambda: recorder("t", TURN), "dynamics", r"no kcons\.ase\.Constraints objects"),
+    (lambda: recorder("t", TURN, [_OH]), "t", r"t, Dihedral\(0, 1, 2, 3\), is not among"),
+    # Of extended XYZ: an error of ASE, nothing, and a = "b=1.5".
+    *((partial(recorder, name, _OH, [_OH]), name, _UNKEPT) for name in ("energy", "pbc", "a=b")),
+    (lambda: HeldCoordinatesReporter(io.StringIO(), 0, {"t": TURN}), "reportInterval", "reportInterval is"),
+    (lambda: HeldCoordinatesReporter(io.StringIO(), 1, None), "coordinates", "no coordinates are named; g"),
+]
+
+# -- held coordinates: six atoms of a chain, and two more on a skate --
+
+X = np.array(
+    [[0, 0.1, 0.2], [1.1, 0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [2.2, -0.5, 2.4]]
+    + [[9, 9.1, 9.2], [10.1, 9, 8.9]]
+)
+R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), KnifeEdge(6, 7, (0, 0, 1))
+SET, STILL = ConstraintSet([R, CENTER, EDGE], X, np.ones(8)), np.zeros((8, 3))
+BROKEN = STILL.copy()
+BROKEN[0, 1] = np.inf
+
+
+def held(coordinates, rows=None, x=X):
+    return HeldCoordinates(SET if rows is None else ConstraintSet(rows, x, np.ones(8)), coordinates, x)
+
+
+TWO, THIRD = Distance([[0, 1], [1, 2]]), Distance([[2, 3]])
+#: Three planes through one line.
+PLANES = {k: Plane([0], n) for k, n in zip("abc", [(0, 0, 1.0), (0, 0.6, 0.8), (0, 1.0, 0)], strict=True)}
+LONG = [TWO, Angle([[0, 1, 2]]), Distance([[0, 2]])]
+HELD = [
+    (lambda: held({}), "coordinates", "no coordinates"),
+    (lambda: held({"a": 3}), "a", "no kcons constraint"),
+    (lambda: held({"a": R, "b": Distance([[3, 0]])}), "a", "a and b are the same row 0"),
+    (lambda: held({"a": Distance([[0, 4]])}), "a", r"a, Distance\(0, 4\), is not among the 3 rows"),
+    (lambda: held({"a": TURN}), "a", "not among"),
+    (lambda: held({"e": EDGE}), "e", "velocity constraint.*holds no coordinate"),
+    (lambda: held({"d": TWO, "d[0]": THIRD}, [TWO, THIRD]), "d[0]", r"two coordinates have the name 'd\[0\]'"),
+    (lambda: held({"r": LONG[2]}, LONG), None, r"r depends on the other.*Z = 0.*take out", SingularGeometryError),
+    (lambda: held(PLANES, [LENGTH, *PLANES.values()]), None, "a and b and c depend", SingularGeometryError),
+    (
+        lambda: held({"r": Distance([[5, 6]])}, [Distance([[5, 6]]), EDGE]),
+        None,
+        r"r share.* velocity constraints.*Motion\.multipliers",
+        UnsupportedError,
+    ),
+    (lambda: held({"r": R}).sample(X, STILL, STILL[:4]), "forces", "forces must have shape"),
+    (lambda: held({"r": R}).sample(X * np.nan, STILL, STILL), "positions", "positions of atom 0", NonFiniteError),
+    (lambda: held({"r": R}).sample(X, BROKEN, STILL), "velocities", "velocities of atom 0", NonFiniteError),
+    (lambda: held({"r": R}).sample(X, STILL, BROKEN), "forces", "forces of atom 0", NonFiniteError),
+]
+
+# -- series, means, mean forces --
+
+
+def series(values):
+    found, zero = Series(["r"]), np.zeros(1)
+    for k, value in enumerate(values):
+        found.append(Sample(float(k), np.array([value]), zero + k % 3, zero, 0.0, zero, 0.0, zero + np.nan, zero))
+    return found
+
+
+N20, ONE = np.arange(20.0), np.diag([1.0, 0.0])
+MEANS = [
+    (lambda: series([1.0]).of("angle"), "name", "no coordinate 'angle'; there are r"),
+    (lambda: mean_force(N20, 1.0), "series", r"give a kcons\.free_energy\.Series"),
+    (lambda: mean_force(series([1.0] * 20), 0.0), "kT", "kT is 0.0; give a positive number"),
+    *((lambda n=n: mean_force(series([1.0] * 20), 1.0, discard=n), "discard", "discard") for n in (-1, 20, 0.5)),
+    (lambda: mean_force(series([1.0] * 9), 1.0), "values", "too few"),
+    (lambda: mean_force(series([1.0] * 9 + [1.1] * 9), 1.0), "r", r"r moved by 0\.1"),
+    (lambda: mean_force(series([1.0] * 19 + [np.nan]), 1.0), "r", "values of r are not finite"),
+    (lambda: weighted_mean(np.zeros(15)), "values", "too few"),
+    (lambda: weighted_mean(np.zeros((20, 0))), "values", "too few"),
+    (lambda: weighted_mean([1.0] * 19 + [np.nan]), "values", "sample 19"),
+    (lambda: weighted_mean(N20, np.ones(19)), "weights", r"shape \(20,\)"),
+    (lambda: weighted_mean(N20, np.full(20, np.inf)), "weights", "sample 0"),
+    (lambda: weighted_mean(N20, -np.ones(20)), "weights", "negative"),
+    (lambda: weighted_mean(N20, np.zeros(20)), "weights", "positive"),
+    (lambda: weighted_mean(N20, np.eye(20)[3]), "weights", "sample 3 has all of the weight"),
+    (lambda: weighted_mean(N20, np.ones(20), log_weights=N20), "log_weights", "one of them"),
+    (lambda: agreement([0.0, 1.0], ONE, [0.0], [[1.0]]), "covariance", "two means of 2"),
+    (lambda: agreement([0.0], ONE, [0.0], ONE), "covariance", "two means of 1"),
+    (lambda: agreement([np.nan], [[1.0]], [0.0], [[1.0]]), "covariance", "not finite"),
+    (lambda: agreement(1.0, -1.0, 2.0, 2.0), "covariance", "negative"),
+]
+
+# -- profiles, surfaces, works --
+
+N3, N4 = [0.0, 1.0, 2.0], [0.0, 1.0, 1.0, 2.0]
+GRID = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+
+
+def profile(**of):
+    return integrate([-1.0, 0.5, 1.0, 2.0], [0.0, 1.0, 0.0, 0.0], [0.1] * 4, **of)
+
+
+def surface(**change):
+    return fit_surface(**{"x": GRID, "f": GRID, "errors": np.ones((9, 2)), **change})
+
+
+PROFILES = [
+    (lambda: integrate(N3[:2], N3[:2], [1.0] * 2), "x", "too few"),
+    (lambda: integrate([0.0, 1.0, 1.0], N3, [1.0] * 3), "x", "2 different windows"),
+    (lambda: integrate(N3, [0.0, np.nan, 2.0], [1.0] * 3), "f", "window 1 is not finite"),
+    (lambda: integrate(N3, N3[:2], [1.0] * 3), "f", r"shape \(3,\)"),
+    (lambda: integrate(N3, N3, [1.0, 1.0, -1.0]), "e", "window 2 is negative"),
+    (lambda: integrate(N3, N3, [1.0] * 3, method="simpson"), "method", "unknown method"),
+    (lambda: integrate(N3, N3, [1.0] * 3, zero=3.0), "zero", "beyond the windows"),
+    (lambda: integrate(N3, N3, [1.0] * 3, at=[-1.0]), "at", "beyond the windows"),
+    (lambda: integrate(N3, N3, [1.0] * 3, period=-1.0), "period", "positive"),
+    (lambda: integrate(N3, N3, [1.0] * 3, period="360"), "period", "positive"),
+    (lambda: integrate(N4, [0.0, 1.0, 2.0, 2.0], [0.0] * 4), "e", "windows at 1 have mean forces from 1 to"),
+    (lambda: integrate([0.0, 90.0, 180.0], N3, [1.0] * 3, period=6.28), "period", "units"),
+    *((lambda n=n: profile().next_windows(n), "count", "count is") for n in (-1, 0, 1.5)),
+    *((lambda b=b: profile().next_window(below=b), "below", "below is") for b in (-1.0, np.nan)),
+    (lambda: profile().next_window(below=5.0, between=(0.0, 1.0)), "below", "below is"),
+    (lambda: profile().next_window(between=(0.0, 5.0)), "between", "between"),
+    (lambda: profile().without_jacobian("distance", 1.0), "jacobian", "no distance of -1"),
+    (lambda: profile().without_jacobian("length", 1.0), "jacobian", "unknown jacobian"),
+    (lambda: profile().without_jacobian(lambda x: x - 1.0, 1.0), "jacobian", "not positive at -1"),
+    (lambda: profile().without_jacobian(np.cosh, "1"), "thermal_energy", "thermal_energy is '1'"),
+    (lambda: profile().without_jacobian(np.cosh, 0.0), "thermal_energy", "positive number"),
+    (lambda: profile().without_jacobian(np.cosh, 1.0).without_jacobian(np.cosh, 1.0), "jacobian", "already"),
+    (lambda: surface(x=np.zeros((3, 2))), "x", r"d \+ 2 or more"),
+    (lambda: surface(x=np.ones((9, 2))), "x", "one value of coordinate 0"),
+    (lambda: surface(f=np.zeros((9, 3))), "f", r"shape \(9, 2\)"),
+    (lambda: surface(f=np.full((9, 2), np.nan)), "f", "window 0"),
+    (lambda: surface(errors=np.ones(9)), "errors", "shape"),
+    (lambda: surface(errors=-np.ones((9, 2))), "errors", "negative"),
+    (lambda: surface(errors=np.tile([[1.0, 2.0], [2.0, 1.0]], (9, 1, 1))), "errors", "not symmetric and pos"),
+    (lambda: surface(periods=(1.0,)), "periods", "2 positive"),
+    (lambda: surface(periods=("a", None)), "periods", "positive"),
+    (lambda: surface(periods=(0.5, None)), "x", "further apart than the period in coordinate 0"),
+    (lambda: surface(zero=[0.0]), "zero", "2 finite"),
+    (lambda: surface(zero=[9.0, 0.0]), "x", "beyond the windows"),
+    *(
+        (lambda b=b: surface().difference([0.0, 0.0], b), "a", "a and b must be places of 2 coordinates")
+        for b in ([0.5], 0.5, [0.5, 0.5, 0.5])
+    ),
+    (lambda: pull_free_energy([1.0] * 4, thermal_energy=1.0), "forward", "5 pulls"),
+    (lambda: pull_free_energy([1.0] * 5, [1.0] * 4, thermal_energy=1.0), "backward", "5 pulls"),
+    (lambda: pull_free_energy([1.0] * 5 + [np.inf], thermal_energy=1.0), "forward", "work 5"),
+    *(
+        (lambda kT=kT: pull_free_energy([1.0] * 5, thermal_energy=kT), "thermal_energy", "positive")
+        for kT in (-1.0, "x", "1")
+    ),
+    (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, seed="x"), "seed", "seed is 'x'"),
+    (lambda: work_along([0.0, 1.0], [0.0, 1.0, 2.0]), "force", "do not go"),
+    (lambda: work_along([0.0, 1.0], [0.0, np.nan]), "force", "finite"),
+    (lambda: work_profile(np.zeros(5), thermal_energy=1.0), "works", "shape"),
+    (lambda: work_profile(np.zeros((5, 2)), thermal_energy=1.0, log_weights=np.zeros(5)), "log_weights", "shape"),
+]
+
+# -- scans --
+
+
+def scanned(coordinates, values, **how):
+    return scan(chain(4, threefold), coordinates, values, **how)
+
+
+STRAIGHT = chain(4, threefold)
+STRAIGHT.positions[:3] = [[0, 0, 0], [1.4, 0, 0], [2.8, 0, 0]]
+_WRONG = [{"fmax": "x"}, {"fmax": 0}, {"evaluations": 2.5}, {"held": 3}, {"held": [TURN, None]}, {"folder": 3}]
+_GRIDS = [
+    ([], [], "coordinates", "one or two coordinates, not 0"),
+    ([TURN, LENGTH, TURN], [[0], [1], [0]], "coordinates", "one or two coordinates, not 3"),
+    ([TURN], [[0], [1]], "values", "1 coordinates have 2 lists of values"),
+    ([TWO], [[1]], "coordinates", "has 2 rows; a coordinate of a scan has one"),
+    *(([LENGTH], [wrong], "values", "not a list of finite numbers") for wrong in ([], [1, np.nan], [[1, 2]])),
+    ([LENGTH], [["far"]], None, "values of Distance"),
+    ([LENGTH], [[1, 2, 1]], "values", "two values of .* are the same"),
+    ([LENGTH], [[1, 3, 2]], "values", "go up and down; give them in order"),
+    ([TURN], [np.radians([-180, 0, 200])], "values", "span more than its period"),
+]
+SCANS = [
+    *((partial(Grid, rows, values), item, said) for rows, values, item, said in _GRIDS),
+    *((partial(scanned, TURN, [0.1], **how), None, next(iter(how))) for how in _WRONG),
+    (lambda: scanned(None, [0.1]), None, "coordinates has None"),
+    (lambda: scan(Atoms("C4", STRAIGHT.positions), TURN, [0.1]), "calculator", "no calculator"),
+    (
+        lambda: scan(STRAIGHT, TURN, [0.1]),
+        None,
+        "collinear; bend them, or hold a dihedral of oth",
+        SingularGeometryError,
+    ),
+    (lambda: scanned(LENGTH, [1.2], held=LENGTH), None, r"Distance\(0, 1\) depends on what else is h", ConstraintError),
+    (lambda: scanned(LONG[2], [2.2], held=LONG[:2]), None, r"Distance\(0, 2\) depends", ConstraintError),
+    (lambda: scanned(LENGTH, [1.2], held=FixedAtoms([0, 1])), None, r"Distance\(0, 1\) depends", ConstraintError),
+    (lambda: scanned([LENGTH, Distance([[1, 0]])], [[1.2], [1.2]]), None, r"Distance\(1, 0\) depends", ConstraintError),
+    (lambda: scanned(Distance([[0, 9]]), [1.2]), None, "atom 9"),
+    (lambda: scanned(LENGTH, [-1.0, 1.2]), None, "length greater than zero"),
+    (lambda: scanned(Angle([[0, 1, 2]]), [120.0]), None, "no angle between 0 and pi"),
+    (lambda: scanned(Distance([[0, 1]], lambda t: 1.0 + t), [1.2]), None, "moves with time", UnsupportedError),
+    (
+        lambda: scanned(TURN, [0.1], held=CustomVelocity([[0, 1]], lambda r: np.ones((2, 3)))),
+        None,
+        "velocities",
+        UnsupportedError,
+    ),
+]
+TABLES = {
+    "settings": SETTINGS,
+    "samplers": SAMPLERS,
+    "held": HELD,
+    "means": MEANS,
+    "profiles": PROFILES,
+    "scans": SCANS,
+}
+
+
+@pytest.mark.parametrize(
+    "row", [pytest.param(row, id=f"{name}-{k}") for name, rows in TABLES.items() for k, row in enumerate(rows)]
+)
+def test_refusals(row):
+    call, item, said, *kind = row
+    with pytest.raises(kind[0] if kind else InputError, match=said) as caught:
+        call()
+    assert item is None or caught.value.item == item
