@@ -9,13 +9,13 @@ from time import process_time
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from kcons.comparison.study.asked import picked
+from kcons.comparison.study.tables import Table, terminal
 from rich.console import Console
 
 from kcons.comparison import json_files
 from kcons.comparison.machine import environment
 from kcons.comparison.progress import Watcher
-from kcons.comparison.study.asked import picked
-from kcons.comparison.study.tables import Table, terminal
 from kcons.errors import InputError
 from kcons.thermostats.correlated_series import slope as slope
 

@@ -50,7 +50,6 @@ class Method:
     adaptive: bool
     kind: Kind
     usual: bool
-    friction: bool
     refuses_too: Refuses
     code: Code | None
 
@@ -66,8 +65,6 @@ class Method:
 
     def refuses(self, system: TestSystem) -> str | None:
         """Why it cannot run a test system, or None."""
-        if system.friction and self.holds and not self.friction:
-            return "it has no friction"
         if self.engine == "OpenMM":
             if find_spec("openmm") is None:
                 return "OpenMM is not installed; python -m pip install openmm"
@@ -98,7 +95,6 @@ def add_method(
     adaptive: bool = False,
     kind: Kind = "trajectory",
     usual: bool = True,
-    friction: bool = False,
     refuses: Refuses = lambda system: None,
     code: Code | None = None,
 ) -> Method:
@@ -122,8 +118,6 @@ def add_method(
         A baseline holds nothing, and only its cost is stated. Of a thermostat no error of a trajectory can be stated.
     usual : bool
         Whether it runs unless methods are named.
-    friction : bool
-        Whether it can run test systems with friction.
     refuses : callable, optional
         Test system to the reason why the method cannot run it, or None.
     code : callable, optional
@@ -141,7 +135,7 @@ def add_method(
     if not (isinstance(force_evaluations, int) and force_evaluations >= 1):
         raise InputError(f"force_evaluations is {force_evaluations!r}; give 1 or more", item="force_evaluations")
     METHODS[name] = made = Method(
-        name, title or name, start, engine, force_evaluations, adaptive, kind, usual, friction, refuses, code
+        name, title or name, start, engine, force_evaluations, adaptive, kind, usual, refuses, code
     )
     return made
 
@@ -222,7 +216,7 @@ _ON_ARRAYS = (
 
 def _system(system: TestSystem, held: ConstraintSet | None = None) -> System:
     motion = Motion(system.constraint_set if held is None else held, system.positions)
-    return System(motion, system.potential.forces, friction=system.friction)
+    return System(motion, system.potential.forces)
 
 
 def on_arrays(make: Callable[[float], steppers.Stepper], system: TestSystem, dt: float) -> Run:
@@ -277,7 +271,6 @@ for _name, _kind in STEPPERS.items():
         title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
         force_evaluations=_kind().force_evaluations,
         usual=_name in USUAL,
-        friction=True,
         code=partial(_code_of_stepper, _kind.__name__),
     )
 
@@ -288,7 +281,6 @@ add_method(
     title="kcons Baumgarte",
     force_evaluations=steppers.Baumgarte(rate=1.0).force_evaluations,
     usual=False,
-    friction=True,
 )
 
 
@@ -314,7 +306,6 @@ add_method(
     _extrapolated,
     title="kcons Extrapolation",
     adaptive=True,
-    friction=True,
     code=_code_of_extrapolation,
 )
 add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", kind="baseline")
@@ -354,7 +345,7 @@ class _Landing(OfSciPy):
             x = self.motion.project_positions(x, x, time=t)
             v = self.motion.project_velocities(x, v, time=t)
             # By less than the tolerance: the force known there need not be computed again.
-            f = self.last[0] - self.system.friction * self.system.masses[:, None] * v
+            f = self.last[0]
             self.solver.y = np.concatenate([x.ravel(), v.ravel()])
             self.solver.f = np.concatenate([v.ravel(), self.motion.acceleration(x, v, f, t).ravel()])
 
@@ -371,8 +362,6 @@ def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
     def rate(t: float, y: FloatArray) -> FloatArray:
         x, v = y.reshape(2, *shape)
         f = last[0] = system.potential.forces(x, t)
-        if system.friction:
-            f = f - system.friction * system.masses[:, None] * v
         return np.concatenate([y[n:], motion.acceleration(x, v, f, t).ravel()])
 
     # Errors are measured against one unit of length and the thermal speed, not against each entry.
@@ -413,10 +402,9 @@ add_method(
     partial(_dop853, False),
     title="SciPy DOP853 on eq. 105",
     adaptive=True,
-    friction=True,
     code=_code_of_dop853,
 )
-add_method("dop853-projected", partial(_dop853, True), title="kcons + DOP853, projected", adaptive=True, friction=True)
+add_method("dop853-projected", partial(_dop853, True), title="kcons + DOP853, projected", adaptive=True)
 
 
 # -- ASE --------------------------------------------------------------------------------------------
@@ -758,7 +746,7 @@ def code(system: TestSystem, name: str, setting: float, made_by: str) -> str:
     """
     method = choose([name])[0]
     steps = 0 if method.adaptive else round(system.horizon / (setting * system.units.time_unit))
-    if method.code is not None and not system.friction:
+    if method.code is not None:
         lines = method.code(system, _step(system, setting), steps)
     else:
         internal = setting if method.adaptive else setting * system.units.time_unit

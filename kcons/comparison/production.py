@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import perf_counter
 
 import numpy as np
 
-from kcons.comparison.averages.layers import of_test_systems
-from kcons.comparison.averages.long_steps import METHODS, measure
+from kcons.comparison.averages import KINDS, SAMPLERS, sample
 from kcons.comparison.progress import Watcher
+from kcons.comparison.ranking import RIGHT
 from kcons.comparison.test_systems import TestSystem
 from kcons.steppers import Rattle, State, System, run
 from kcons.thermostats.correlated_series import slope
 
-#: Temperatures that are off by so much, two standard errors included, are right enough.
-RIGHT = 0.01
 #: Seconds a force evaluation may take for each second of the budget of a step.
 CHEAP = 1e-3
 #: Records of the energy, and standard errors beyond which its slope is a climb.
@@ -67,7 +66,7 @@ class StepCheck:
 
 
 def check_steps(
-    system: TestSystem, steps: Sequence[float], budget: float, *, kelvin: float = 300.0, watcher: Watcher | None = None
+    system: TestSystem, steps: Sequence[float], budget: float, *, watcher: Watcher | None = None
 ) -> list[StepCheck]:
     """Look at steps, from the shortest on, until one is wrong.
 
@@ -79,24 +78,24 @@ def check_steps(
         In the unit of time that is shown.
     budget : float
         Seconds for each step.
-    kelvin : float
     watcher : Watcher, optional
     """
     watching, unit = watcher or Watcher(), system.units.time_unit
-    layers, found = of_test_systems(system, system, kelvin), []
+    found: list[StepCheck] = []
     for step in sorted(steps):
         with watching.piece(f"temperature of the configurations, {step:g} {system.units.time}", budget):
             try:
                 climb = _climb(system, step * unit, 0.25 * budget)
-                told = measure(layers, METHODS["langevin"], step * unit, FRICTION / unit, budget=0.75 * budget)
+                told = sample(system, SAMPLERS["langevin"], step * unit, FRICTION / unit, budget=0.75 * budget)
             except Exception as error:  # whatever forces or constraints raise ends the run, and is shown
                 found.append(StepCheck(step, np.nan, np.nan, "", np.nan, f"{type(error).__name__}: {error}"))
                 break
-        if not told.kinds:
-            found.append(StepCheck(step, np.nan, np.nan, "", climb, told.note))
+        kinds = [kind for kind in KINDS if kind in told]
+        if not kinds:
+            found.append(StepCheck(step, np.nan, np.nan, "", climb, told["note"]))
             break
-        kind = max(told.kinds, key=lambda k: abs(told.kinds[k][0]) + 2 * told.kinds[k][1])
-        found.append(StepCheck(step, *told.kinds[kind], kind, climb))
+        kind = max(kinds, key=lambda k: abs(told[k]) + 2 * told[f"{k}_error"])
+        found.append(StepCheck(step, told[kind], told[f"{kind}_error"], kind, climb))
         if found[-1].known and not found[-1].right:
             break
     return found
@@ -104,8 +103,6 @@ def check_steps(
 
 def _climb(system: TestSystem, dt: float, seconds: float) -> float:
     """Slope of the energy at constant energy, in standard errors, of a run of about so many seconds."""
-    from time import perf_counter
-
     made = System(system.motion, system.potential.forces)
     state, stepper = State(system.positions, system.velocities), Rattle()
     begun = perf_counter()

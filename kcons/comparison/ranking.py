@@ -7,7 +7,7 @@ Python, by force evaluations. Costs that differ by less than the scatter of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.errors import InputError
 
-Criterion = Literal["error", "drift"]
+Criterion = Literal["error", "drift", "temperature"]
 
 #: Columns of costs, and what they are called.
 COSTS = {"seconds": "processor time", "evaluations": "force evaluations"}
@@ -37,6 +37,8 @@ USUAL_STEP = 2.0
 #: Steps are predicted for this part of the error, since the prediction may be off; one that makes less than `WASTE` of
 #: it was too short. So many runs of one method, and so many methods, are tried.
 SAFETY, WASTE, TRIES, FINALISTS = 0.85, 0.5, 5, 4
+#: Deviation of a temperature that is right enough.
+RIGHT = 0.01
 #: Orders between which a prediction is believed, and how far it reaches beyond what was measured, as a ratio of steps.
 ORDERS, REACH = (0.5, 10.0), 30.0
 
@@ -66,10 +68,8 @@ def with_errors(table: pd.DataFrame) -> pd.DataFrame:
 def observed_orders(table: pd.DataFrame) -> dict[str, float]:
     """Title -> slope of log(error) against log(time step), at the two finest steps above the error of the reference.
 
-    Methods with fewer than two such steps are left out; so is all where the error is no distance from a trajectory.
+    Methods with fewer than two such steps are left out.
     """
-    if table.attrs["error_unit"] != table.attrs["length"]:
-        return {}
     done = with_errors(table)
     done = done[~done.adaptive.astype(bool) & (done.error > max(5 * table.attrs["reference_error"], 1e-12))]
     found = {}
@@ -148,22 +148,26 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
     ----------
     table : DataFrame
         From `kcons.comparison.compare`.
-    criterion : {'error', 'drift'}
-        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of that.
+    criterion : {'error', 'drift', 'temperature'}
+        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of that; or, for
+        a table of averages, how far the temperature of the configurations is off.
     limit : float, optional
-        The largest value that is good enough; by default what the usual method makes at its usual step.
+        The largest value that is good enough; by default what the usual method makes at its usual step, and 1 % of the
+        temperature.
     """
     about, cost = table.attrs, cost_that_decides(table)
     done = with_errors(table)
     least = resolution(table) if criterion == "error" else 0.0
-    value = done.error if criterion == "error" else done.slope.abs() + 2 * done.slope_error.fillna(0.0)
+    value = done.slope.abs() + 2 * done.slope_error.fillna(0.0) if criterion == "drift" else done.error
     done = done.assign(value=value.astype(float), cost=done[cost])
     done = done[np.isfinite(done.value)]
     if not len(done):
         return None
     limit_is, slack = "asked for", 0.0
-    if limit is None:
-        limit, limit_is = _usual(done, about["time"])
+    if limit is None and criterion == "temperature":
+        limit, limit_is = RIGHT, "two standard errors included"
+    elif limit is None:
+        limit, limit_is = _usual(done, about)
         if limit < least:
             limit, limit_is = least, "the least that the reference can tell apart"
         slack = SAME_ERROR
@@ -177,8 +181,8 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
         beyond=beyond,
         limit=limit,
         limit_is=limit_is,
-        what="error" if criterion == "error" else "drift of the energy",
-        unit=about["error_unit"] if criterion == "error" else drift,
+        what="drift of the energy" if criterion == "drift" else about.get("what", "error"),
+        unit=drift if criterion == "drift" else about["error_unit"],
         cost=cost,
         scatter=same,
     )
@@ -197,21 +201,23 @@ def _places(costs: Sequence[float], same: float) -> list[int]:
     return places
 
 
-def _usual(done: pd.DataFrame, time: str) -> tuple[float, str]:
+def _usual(done: pd.DataFrame, about: Mapping[str, Any]) -> tuple[float, str]:
     """What is usually accepted: that of the plainest method that ran, at 2 fs or at its second longest step."""
     for name in USUAL_METHODS:
         rows = done[done.method == name].sort_values("setting", ascending=False)
         if len(rows):
             row = rows.iloc[min(1, len(rows) - 1)]
-            if time == "fs":
+            if about["time"] == "fs":
                 row = rows.loc[(np.log(rows.setting.astype(float) / USUAL_STEP)).abs().idxmin()]
-            return float(row.value), f"what {row.title} makes at {shown_setting(row, time)}"
+            return float(row.value), f"what {row.title} makes at {shown_setting(row, about)}"
     return float(done.value.median()), "what half of the rows make"
 
 
-def shown_setting(row: Any, time: str) -> str:
-    """'2 fs', or 'rtol 1e-6'."""
-    return f"rtol {row.setting:.0e}" if row.adaptive else f"{row.setting:.4g} {time}"
+def shown_setting(row: Any, about: Mapping[str, Any]) -> str:
+    """'2 fs', 'rtol 1e-6', or '2 fs, 5/ps' with a friction."""
+    friction = getattr(row, "friction", 0.0)
+    rate = f", {friction:.2g}/{about['long_time']}" if friction and friction > 0 else ""
+    return f"rtol {row.setting:.0e}" if row.adaptive else f"{row.setting:.4g} {about['time']}{rate}"
 
 
 # -- a wanted error ---------------------------------------------------------------------------------

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
+from kcons.comparison.study import json_files
 from study_scripts import Kept, Watcher, picked, work_off
 
-from kcons.comparison.study import json_files
 from kcons.errors import InputError
 
 

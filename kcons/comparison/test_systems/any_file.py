@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from ase import units
 
 from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, of_calculator
@@ -197,6 +198,7 @@ def from_file(
         bonds=_distances(found.rows),
         cell=cell,
         openmm=md_engine,
+        thermal_energy=units.kB * TEMPERATURE,
         **steps_of(len(x)),
     )
 

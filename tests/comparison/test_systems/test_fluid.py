@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.calculators.tip3p import angleHOH, rOH
+from kcons.comparison.test_systems.lennard_jones import LennardJones
 
 from kcons.comparison import test_systems
 from kcons.comparison.test_systems import fluid
-from kcons.comparison.test_systems.lennard_jones import LennardJones
 from kcons.errors import InputError
 from kcons.steppers import State, run
 from kcons.thermostats import thermal_velocities

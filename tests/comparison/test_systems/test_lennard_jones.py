@@ -5,11 +5,11 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
+from kcons.comparison.test_systems.lennard_jones import LennardJones
+from kcons.comparison.test_systems.near_molecules import NearMolecules
 from scipy.spatial.transform import Rotation
 
 from kcons.comparison.test_systems import fluid, lennard_jones, near_molecules
-from kcons.comparison.test_systems.lennard_jones import LennardJones
-from kcons.comparison.test_systems.near_molecules import NearMolecules
 from kcons.errors import InputError
 
 

@@ -12,8 +12,8 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.neighborlist import natural_cutoffs, neighbor_list
 
-from kcons.comparison.test_systems.minimal import single
 from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint import IntArray
@@ -24,25 +24,8 @@ from kcons.motion.motion import Motion
 TEMPERATURE = 300.0
 
 
-def build(size: int = 1, seed: int = 1, *, forces: str = "") -> TestSystem:
-    """Ethanol.
-
-    Parameters
-    ----------
-    size : int
-        Has to be 1.
-    seed : int
-        Of the velocities.
-    forces : {'', 'xtb', 'emt'}
-        GFN2-xTB by tblite, or ASE's EMT (a toy for this molecule, but smooth); by default the first
-        where tblite is installed.
-
-    Raises
-    ------
-    InputError
-        Another size; unknown `forces`.
-    """
-    single(size, "ethanol is one molecule")
+def build(size: int, seed: int, *, forces: str = "") -> TestSystem:
+    """Forces are 'xtb' (GFN2-xTB by tblite, where it is installed) or 'emt' (a toy for this molecule, but smooth)."""
     atoms = molecule("CH3CH2OH")
     bonds, angles = topology(atoms)
     x, masses = atoms.positions.copy(), atoms.get_masses()
@@ -64,6 +47,7 @@ def build(size: int = 1, seed: int = 1, *, forces: str = "") -> TestSystem:
         bonds=pairs,
         angles=angles,
         angle_bonds=bonds,
+        thermal_energy=units.kB * TEMPERATURE,
     )
 
 
@@ -92,3 +76,13 @@ def _potential(forces: str, atoms: Any) -> Potential:
         if chosen is None:
             del os.environ["OMP_NUM_THREADS"]
     return of_calculator(atoms, TBLite(method="GFN2-xTB", accuracy=0.01, verbosity=0), "GFN2-xTB by tblite")
+
+
+add_system(
+    "ethanol",
+    build,
+    "ethanol, all bonds and angles, GFN2-xTB forces",
+    unit="molecule",
+    only=True,
+    takes=("forces",),
+)

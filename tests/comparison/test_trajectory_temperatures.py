@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import fluids
 import numpy as np
 import pytest
 import water_files as files
@@ -11,8 +12,7 @@ from ase import units
 from ase.build import molecule
 from ase.io import write
 
-from kcons.comparison import Potential, fluid
-from kcons.comparison.averages import trajectory_temperatures
+from kcons.comparison import Potential, trajectory_temperatures
 from kcons.comparison.test_systems import any_file
 from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats import Estimate, SplitTemperatures
@@ -23,7 +23,7 @@ N, FRAMES = 27, 48
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Water at 400 K by Metropolis moves, each atom wrapped by itself."""
-    folder, chosen = tmp_path_factory.mktemp("water"), fluid.water(N)
+    folder, chosen = tmp_path_factory.mktemp("water"), fluids.water(N)
     moved = chosen.shift, chosen.turn
     x = chosen.forces.metropolis(chosen.positions, chosen.thermal_energy, 1500, 10, 1, *moved)[1]
     frames = []
@@ -42,7 +42,7 @@ def named(monkeypatch):
     made = any_file.from_file
 
     def from_file(*where, **options):
-        forces = fluid.water(N).forces
+        forces = fluids.water(N).forces
         return dataclasses.replace(made(*where, **options), potential=Potential(forces.evaluate, "the fluid's"))
 
     monkeypatch.setattr(any_file, "from_file", from_file)

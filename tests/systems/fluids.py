@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 from ase import units
+from lennard_jones import LennardJones
 
-from kcons.comparison.test_systems.lennard_jones import LennardJones
 from kcons.comparison.test_systems.system import ASE_UNITS, Units
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from kcons.comparison.test_systems.minimal import integrated, single
+from kcons.comparison import add_system
+from kcons.comparison.test_systems.minimal import integrated
 from kcons.comparison.test_systems.potential import Potential, uniform_field
 from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Ellipsoid, ImplicitSurface, Plane, Torus
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 
 #: Semi-axes of the ellipse, across and along the vertical.
 ACROSS, UP = 2.0, 1.0
@@ -30,27 +30,10 @@ NO_SURFACE = "ASE has no constraint that holds an atom on {}"
 NO_TIME = "ASE tells constraints no time: they cannot move"
 
 
-def build(size: int = 1, seed: int = 1, *, on: str = "ellipse") -> TestSystem:
-    """One bead.
-
-    Parameters
-    ----------
-    size : int
-        Has to be 1.
-    seed : int
-        Without meaning: the start is fixed.
-    on : {'ellipse', 'rotating-ellipse', 'torus'}
-
-    Raises
-    ------
-    InputError
-        Another size; unknown `on`.
-    """
-    single(size, "this is one bead")
+def build(size: int, seed: int, *, on: str) -> TestSystem:
+    """One bead; its start is fixed."""
     if on == "torus":
         return _on_torus()
-    if on not in ("ellipse", "rotating-ellipse"):
-        raise InputError(f"no curve {on!r}; there are 'ellipse', 'rotating-ellipse' and 'torus'", item="on")
     return _on_ellipse(OMEGA if on == "rotating-ellipse" else 0.0)
 
 
@@ -166,3 +149,6 @@ _COMMON: dict[str, Any] = dict(
     tolerances=(1e-3, 1e-6, 1e-9),
     units=BARE,
 )
+
+for _name, _on in (("bead-ellipse", "ellipse"), ("bead-rotating", "rotating-ellipse"), ("bead-torus", "torus")):
+    add_system(_name, build, f"a bead on a curve or surface: {_on}", unit="bead", only=True, on=_on)

@@ -13,9 +13,6 @@ import numpy as np
 from ase.units import kB
 from scipy.sparse.csgraph import connected_components
 
-from kcons.comparison.averages.long_steps import DOUBT
-from kcons.comparison.averages.sampling import GOAL
-from kcons.comparison.study.asked import noted
 from kcons.comparison.test_systems import any_file
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.errors import InputError, UnsupportedError
@@ -23,7 +20,9 @@ from kcons.steppers import System
 from kcons.thermostats import Estimate, SplitTemperatures, TemperatureSplit
 
 #: Fewest frames.
-FEWEST = 32
+MIN_FRAMES = 32
+#: Standard errors up to which no difference is seen, and the relative error for which the number of frames is stated.
+DOUBT, GOAL = 3.0, 0.01
 #: Change of the box, relative, above which the forces are those of another system.
 CHANGED = 1e-3
 #: Spread of a length, relative, below which something may hold it: at 300 K bonds vibrate by 2 %, and XTC files round
@@ -54,8 +53,8 @@ def along(
     UnsupportedError
         The box changes.
     """
-    if len(frames) < FEWEST:
-        raise InputError(f"{len(frames)} frames are too few for temperatures; give {FEWEST} or more", item="frames")
+    if len(frames) < MIN_FRAMES:
+        raise InputError(f"{len(frames)} frames are too few for temperatures; give {MIN_FRAMES} or more", item="frames")
     with warnings.catch_warnings():
         # The check says so itself.
         warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
@@ -95,9 +94,10 @@ def _along(
         sums += lengths, lengths**2
     mean, squares = sums / len(frames)
     stiff = free[squares - mean**2 < (STIFF * mean) ** 2]
-    found, doubt = noted(split.result)
-    if doubt:
-        found = replace(found, left_out=(*found.left_out, doubt))
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", UserWarning)
+        found = split.result()
+    found = replace(found, left_out=(*found.left_out, *dict.fromkeys(str(doubt.message) for doubt in doubts)))
     if not len(stiff):
         return found
     i, j = stiff[0].tolist()
