@@ -77,7 +77,7 @@ def run(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return listing.of_everything()
     from kcons.cli.progress import Bars
-    from kcons.comparison import averages, report
+    from kcons.comparison import report
     from kcons.steppers.files import ResultFolder, in_one_piece
 
     temperature = _asks_for_averages(chosen)  # complain before any work
@@ -110,7 +110,7 @@ def run(chosen: argparse.Namespace) -> int:
         with in_one_piece(folder / "compare.txt") as file:
             file.write(f"{words}\n".encode())
         with in_one_piece(folder / "compare.png") as file:
-            report.figure(averages.best_frictions(table) if temperature else table).savefig(file, dpi=150, format="png")
+            report.figure(table).savefig(file, dpi=150, format="png")
     console().print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     print(f"wrote compare.csv, .png and .txt into {folder}; the whole table is in {path}")
     return 0
@@ -192,7 +192,7 @@ def _averages(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[Any,
         system, *cheap = [test_system(each, quick=chosen.quick) for each in both or [chosen]]
     given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt, "seed": chosen.seed}
     table = averages.compare_averages(system, chosen.methods, **given, **options)
-    found = ranking.rank(averages.best_frictions(table), "temperature")
+    found = ranking.rank(table, "temperature")
     code = ""
     if found is not None and len(found.table):
         best = found.table.iloc[0]

@@ -8,7 +8,6 @@ time steps use those often, and what the expensive ones are more once a step.
 from __future__ import annotations
 
 import math
-import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -17,9 +16,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from kcons.comparison.measure import COLUMNS, described, processor_clock
+from kcons.comparison.measure import COLUMNS, described, first_line, processor_clock, table_of
 from kcons.comparison.progress import Watcher
-from kcons.comparison.ranking import RIGHT
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, did_you_mean
@@ -64,6 +62,8 @@ AVERAGES = {
     "cheap": "evaluations of the cheap forces, of all steps",
     "accepted": "share of accepted moves of Monte Carlo",
 }
+
+ALL_COLUMNS = (*COLUMNS, *AVERAGES)
 
 
 @dataclass(frozen=True)
@@ -267,16 +267,15 @@ def compare_averages(
     for step in steps or ():
         if not (math.isfinite(step) and step > 0):
             raise InputError(f"time step {step:g} {system.units.time}: give a positive number", item="dt")
-    planned: list[tuple[Sampler, float, float, float]] = []
+    rates = [rate / inner for rate in FRICTIONS] if frictions is None else list(frictions)
+    planned: dict[str, list[tuple[float, float]]] = {}
     for sampler in chosen:
-        lengths = [dt * unit for dt in steps or ()] or [k * inner for k in ((1, 2, 4) if sampler.several else (1, 2))]
-        if not (steps or cheap):
-            lengths = list(system.time_steps)
-        rates = [rate / inner for rate in FRICTIONS] if frictions is None else list(frictions)
-        pairs = [(step, rate) for step in sorted(lengths) for rate in (rates if sampler.frictions else rates[:1])]
-        planned += [(sampler, *pair, budget / len(pairs)) for pair in pairs]
-    for _, step, rate, _ in planned:
-        _refuse(system, step, rate)  # before the first run, whose results would be lost
+        usual = [k * inner for k in ((1, 2, 4) if sampler.several else (1, 2))] if cheap else system.time_steps
+        lengths = sorted([dt * unit for dt in steps] if steps else usual)
+        pairs = [(step, rate) for step in lengths for rate in (rates if sampler.frictions else rates[:1])]
+        for pair in pairs:
+            _refuse(system, *pair)  # before the first run, whose results would be lost
+        planned[sampler.name] = pairs
     reference = Reference(system.positions, 0.0, "the temperature asked for")
     about = {
         **described(system, reference),
@@ -288,22 +287,16 @@ def compare_averages(
     }
     rows: list[dict[str, Any]] = [] if done is None else done.to_dict("records")
     there = {row["method"] for row in rows}
-    for sampler, step, rate, share in planned:
+    for sampler in chosen:
         if sampler.name in there:
             continue
-        with watching.piece(f"{sampler.title}, {step / unit:.3g} {system.units.time}", 1):
-            rows.append(sample(system, sampler, step, rate, cheap=cheap, budget=share, seed=seed, watcher=watching))
-        last = (sampler, step, rate, share) == [p for p in planned if p[0] is sampler][-1]
-        if keep is not None and last:
-            keep(_table(rows, about))
-    return _table(rows, about)
-
-
-def _table(rows: list[dict[str, Any]], about: dict[str, Any]) -> pd.DataFrame:
-    table = pd.DataFrame(rows, columns=[*COLUMNS, *AVERAGES])
-    table["note"] = table["note"].astype(object).fillna("")
-    table.attrs = about
-    return table
+        for step, rate in planned[sampler.name]:
+            share = budget / len(planned[sampler.name])
+            with watching.piece(f"{sampler.title}, {step / unit:.3g} {system.units.time}", 1):
+                rows.append(sample(system, sampler, step, rate, cheap=cheap, budget=share, seed=seed, watcher=watching))
+        if keep is not None:
+            keep(table_of(rows, about, ALL_COLUMNS))
+    return table_of(rows, about, ALL_COLUMNS)
 
 
 def _same_atoms(expensive: TestSystem, cheap: TestSystem) -> None:
@@ -362,29 +355,39 @@ def sample(
     for name, value in given.items():
         positive(value, name)
     _refuse(system, step, friction)
-    setting = Setting(system.thermal_energy, step, friction, inner_step(system), seed)
-    unit = system.units.time_unit
     row: dict[str, Any] = {
         "method": sampler.name,
         "title": sampler.title,
         "engine": "arrays",
         "adaptive": False,
-        "setting": step / unit,
+        "setting": step / system.units.time_unit,
         "friction": friction * system.units.long_time_unit if sampler.frictions else 0.0,
         "note": "",
         "rounds": 0,
     }
-    run = _Sampling(system, cheap, sampler, setting)
-    failure = run.through(length, budget, watcher or Watcher())
-    row |= run.told()
-    if failure:
-        return {**row, "status": "failed", "note": failure}
-    if run.samples < MIN_SAMPLES:
-        return {**row, "status": "partial", "note": f"{run.samples} samples are too few for an error"}
+    run = _Sampling(system, cheap, sampler, Setting(system.thermal_energy, step, friction, inner_step(system), seed))
+    begun, warm = run.clock(), True
+    try:
+        while True:
+            run.advance(warm)
+            spent = run.clock() - begun
+            share = run.state.time / ((1 + LEFT_OUT) * length) if length else spent / (budget or 1.0)
+            warm = warm and share < LEFT_OUT
+            if watcher is not None:
+                watcher.advance(min(1.0, share))
+            if share >= 1.0:
+                break
+    except Exception as error:  # a step that is too long for a sampler is a result, and is shown
+        note = f"step {run.state.step + 1}: {first_line(error)}"
+        return {**row, **run.told(), "status": "failed", "note": note}
+    if len(run.energies) < MIN_SAMPLES:
+        note = f"{len(run.energies)} samples are too few for an error"
+        return {**row, **run.told(), "status": "partial", "note": note}
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UserWarning)
         found = run.averages()
-    return {**row, **found, "status": "ok", "note": "; ".join(dict.fromkeys(str(w.message) for w in said))}
+    note = "; ".join(dict.fromkeys(str(w.message) for w in said))
+    return {**row, **run.told(), **found, "status": "ok", "note": note}
 
 
 class _Sampling:
@@ -400,9 +403,9 @@ class _Sampling:
             force = ForceGroups.difference(self.cheap.forces, force)
         self.stepper = sampler.make(setting)
         self.system = System(system.motion, force, potential=self.potential.energy)
+        self.state = State(system.positions, system.velocities)
         flight = isinstance(self.stepper, HamiltonianMonteCarlo)  # which is a step
         self.every = 1 if flight else max(1, round(INTERVAL * setting.inner / self.step))
-        self.state = State(system.positions, system.velocities)
         # Looked at with forces of its own, which count for nobody.
         watched = System(system.motion, lambda x, t: system.potential.watched(x)[1])
         self.split, self.energies = TemperatureSplit(watched, seed=setting.seed), list[float]()
@@ -410,38 +413,20 @@ class _Sampling:
         self.steps, self.seconds, self.before = 0, 0.0, (0, 0)
 
     @property
-    def samples(self) -> int:
-        return len(self.energies)
-
-    @property
     def counts(self) -> tuple[int, int]:
         """Evaluations of the expensive and of the cheap forces so far."""
         return self.potential.evaluations, 0 if self.cheap is None else self.cheap.evaluations
 
-    def through(self, length: float | None, budget: float | None, watcher: Watcher) -> str:
-        """Until it ends; what went wrong, if anything did."""
-        begun, warm = self.clock(), True
-        try:
-            while True:
-                then = self.clock()
-                for _ in range(self.every):
-                    self.state = self.stepper.step(self.system, self.state, self.step)
-                now = self.clock()
-                share = self.state.time / ((1 + LEFT_OUT) * length) if length else (now - begun) / (budget or 1.0)
-                if warm:
-                    warm, self.before = share < LEFT_OUT, self.counts
-                    continue
-                self.seconds += now - then
-                self.steps += self.every
-                self._look()
-                watcher.advance(min(1.0, share))
-                if share >= 1.0:
-                    return ""
-        except Exception as error:  # a step that is too long for a sampler is a result, and is shown
-            first = (str(error).strip().splitlines() or [""])[0]
-            return textwrap.shorten(f"step {self.state.step + 1}: {type(error).__name__}: {first}", 300)
-
-    def _look(self) -> None:
+    def advance(self, warm: bool) -> None:
+        """To the next sample, which is left out while the run warms up."""
+        begun = self.clock()
+        for _ in range(self.every):
+            self.state = self.stepper.step(self.system, self.state, self.step)
+        if warm:
+            self.before = self.counts
+            return
+        self.seconds += self.clock() - begun
+        self.steps += self.every
         energy = self.potential.watched(self.state.positions)[0]
         if not math.isfinite(energy):
             raise ArithmeticError("the energy is not finite")
@@ -449,7 +434,8 @@ class _Sampling:
         self.energies.append(energy)
 
     def told(self) -> dict[str, Any]:
-        found: dict[str, Any] = {"steps": self.steps, "samples": self.samples, "cheap": self.counts[1] - self.before[1]}
+        found: dict[str, Any] = {"steps": self.steps, "samples": len(self.energies)}
+        found["cheap"] = self.counts[1] - self.before[1]
         if self.steps:
             found["step_seconds"] = self.seconds / self.steps
         if isinstance(self.stepper, HamiltonianMonteCarlo):
@@ -462,21 +448,9 @@ class _Sampling:
         found: dict[str, Any] = {"energy": energy.value, "energy_error": energy.error}
         for kind, value in known.items():
             found |= {kind: value.value / self.kt - 1, f"{kind}_error": value.error / self.kt}
-        errors = [found[f"{kind}_error"] for kind in known]
-        waits = (max(errors, default=math.nan) / GOAL) ** 2
-        calls = self.counts[0] - self.before[0]
+        waits = (max((value.error / self.kt for value in known.values()), default=math.nan) / GOAL) ** 2
         found["error"] = max((abs(found[k]) + 2 * found[f"{k}_error"] for k in known), default=math.nan)
-        return {**found, "seconds": waits * self.seconds, "evaluations": waits * calls}
-
-
-def best_frictions(table: pd.DataFrame) -> pd.DataFrame:
-    """Of rows of each sampler and step the one that is right at the least cost, or else least off."""
-    late = table.assign(bad=(table.error.isna() | (table.error > RIGHT)).astype(int))
-    late["merit"] = late.seconds.where(late.bad == 0, late.error)
-    kept = late.sort_values(["bad", "merit"]).drop_duplicates(["method", "setting"]).index
-    found = table.loc[sorted(kept)]
-    found.attrs = table.attrs
-    return found
+        return {**found, "seconds": waits * self.seconds, "evaluations": waits * (self.counts[0] - self.before[0])}
 
 
 def code(system: TestSystem, name: str, setting: float, friction: float, made_by: str) -> str:

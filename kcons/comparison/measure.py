@@ -138,9 +138,9 @@ def compare(
     return table_of(rows, {**about, "margin": timing.time(rows)})
 
 
-def table_of(rows: list[dict[str, Any]], about: dict[str, Any]) -> pd.DataFrame:
+def table_of(rows: list[dict[str, Any]], about: dict[str, Any], columns: Iterable[str] = COLUMNS) -> pd.DataFrame:
     """Rows as a table with all columns."""
-    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    table = pd.DataFrame(rows, columns=list(columns))
     table["note"] = table["note"].astype(object).fillna("")
     table.attrs = about
     return table

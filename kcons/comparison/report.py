@@ -171,6 +171,8 @@ def _spent(cost: float, kind: str) -> str:
 def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     """Error against cost, axes logarithmic: curves with their names at their ends, a pale band along each front.
 
+    Of several rows of a method with one setting, such as two frictions, the one with the least error is shown.
+
     Parameters
     ----------
     table : DataFrame
@@ -181,6 +183,7 @@ def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     from matplotlib.figure import Figure
 
     about, cost = table.attrs, cost_that_decides(table)
+    table = table.loc[sorted(table.sort_values("error").drop_duplicates(["method", "setting"]).index)]
     drawn = Figure(figsize=(width, 5.0))
     FigureCanvasAgg(drawn)
     axes = drawn.subplots()

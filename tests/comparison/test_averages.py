@@ -23,7 +23,7 @@ from kcons.comparison import (
     test_systems,
     text,
 )
-from kcons.comparison.averages import AVERAGES, best_frictions, choose_samplers, code, sample
+from kcons.comparison.averages import AVERAGES, choose_samplers, code, sample
 from kcons.comparison.measure import COLUMNS
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
@@ -158,15 +158,15 @@ def test_the_cheapest_that_is_right_is_named():
     assert "No run can tell the deviation" in text(made({**row("x", 0.1, 1.0), "status": "partial"}), None)
 
 
-def test_the_best_friction():
-    """Of each sampler and step: the least cost of those that are right, else the least deviation."""
-    rows = made(row("a", 0.05, 1.0, friction=1.0), row("a", 0.02, 9.0, friction=2.0), row("a", 0.005, 5.0, 4.0, 1.0),
-                row("a", 0.009, 2.0, 4.0, 2.0))  # fmt: skip
-    assert list(best_frictions(rows).friction) == [2.0, 2.0]
+def test_of_two_frictions_the_cheaper_one_that_is_right_is_ranked_and_the_better_one_drawn():
+    rows = made(row("a", 0.005, 5.0, friction=1.0), row("a", 0.009, 2.0, friction=2.0), row("a", 0.02, 1.0, friction=3))
+    assert list(rank(rows, "temperature").table.friction) == [2.0]
+    (curve,) = (line for line in figure(rows).axes[0].lines if line.get_markerfacecolor() == "none")
+    assert list(curve.get_ydata()) == [0.005]
 
 
 def test_a_figure_of_averages_is_not_cut():
-    drawn = figure(best_frictions(table()), 7.0)
+    drawn = figure(table(), 7.0)
     drawn.canvas.draw()
     (axes,) = drawn.axes
     for label in (axes.xaxis.label, axes.yaxis.label, *axes.texts):

@@ -1,0 +1,297 @@
+"""Relaxed torsion scans: the profile of a molecule, and what it costs beside geomeTRIC and Sella.
+
+    python relaxed_scan.py                 seconds: H2O2 by EMT, both ways
+    python relaxed_scan.py --full --out F  minutes: 20 molecules by GFN2-xTB, what docs/scans.md shows
+    python relaxed_scan.py --show F        the tables of an earlier result
+
+With --full (needs tblite, geometric and sella, from the package index) every torsion is scanned at 24 values. Each of
+the three programs relaxes each point from the same structure, that of the neighbouring point with the group beyond the
+bond turned, until no force along the constraint is larger than FMAX on any atom; geomeTRIC's other criteria are off,
+all else is left as its authors set it. Counted are calls of energy and forces. Energies are compared with those that
+geomeTRIC comes to from there with a criterion ten times sharper. geomeTRIC also runs a scan of its own, in which each
+point begins from the last one. Counts and energies depend on the machine by rounding only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from importlib import metadata
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import study_scripts as scripts
+from ase import Atoms, units
+from ase.build import molecule
+from ase.calculators.emt import EMT
+
+from kcons.ase import Constraints
+from kcons.comparison import environment
+from kcons.constraints import Dihedral
+from kcons.free_energy import Scan, scan
+
+#: The largest force left on an atom, eV/angstrom.
+FMAX = 0.005
+KJ = units.mol / units.kJ
+POINTS = 24
+#: What the scan that geomeTRIC makes by itself is called.
+SCAN = "geomeTRIC's scan"
+#: Molecules of ASE's G2 set, and the torsion of each.
+MOLECULES: dict[str, tuple[int, int, int, int]] = {
+    "H2O2": (2, 0, 1, 3),
+    "C2H6": (2, 0, 1, 5),
+    "CH3OH": (2, 0, 1, 3),
+    "CH3CH2OH": (0, 1, 2, 3),
+    "C3H8": (1, 0, 2, 6),
+    "trans-butane": (0, 1, 2, 3),
+    "isobutane": (3, 2, 0, 1),
+    "CH3CHO": (0, 1, 3, 4),
+    "HCOOH": (3, 0, 1, 2),
+    "CH3COOH": (1, 0, 2, 3),
+    "H3CNH2": (2, 0, 1, 3),
+    "N2H4": (2, 0, 1, 4),
+    "OCHCHO": (2, 0, 1, 4),
+    "CH3COCH3": (0, 1, 2, 4),
+    "CH3OCH3": (2, 1, 0, 3),
+    "CH3SH": (3, 0, 1, 2),
+    "butadiene": (0, 1, 2, 3),
+    "CH3NO2": (2, 0, 1, 5),
+    "HCOOCH3": (1, 0, 2, 4),
+    "CH3ONO": (0, 1, 5, 6),
+}
+
+
+class Counted:
+    """Energy and forces of a structure by GFN2-xTB, and how often they were asked for."""
+
+    def __init__(self, atoms: Atoms) -> None:
+        from tblite.ase import TBLite
+
+        self.atoms = atoms.copy()
+        self.atoms.calc = TBLite(method="GFN2-xTB", verbosity=0)
+        self.calls = 0
+        calculate = self.atoms.calc.calculate
+
+        def counted(*given: Any, **named: Any) -> None:
+            self.calls += 1
+            calculate(*given, **named)
+
+        self.atoms.calc.calculate = counted
+
+
+def start(atoms: Atoms, quad: tuple[int, int, int, int], value: float, positions: np.ndarray) -> np.ndarray:
+    """A structure with its torsion turned to a value."""
+    turned = atoms.copy()
+    turned.positions[:] = positions
+    held = Constraints([Dihedral([quad], value)])
+    turned.set_constraint(held)
+    held.restore(turned)
+    return turned.positions.copy()
+
+
+def engine(counted: Counted, frame: Any) -> Any:
+    """What geomeTRIC asks for energies."""
+    from geometric.engine import Engine
+
+    class OfAtoms(Engine):
+        def calc_new(self, coords: np.ndarray, dirname: str) -> dict[str, Any]:
+            counted.atoms.positions[:] = coords.reshape(-1, 3) * units.Bohr
+            counted.calls += 1
+            energy = counted.atoms.get_potential_energy() / units.Hartree
+            gradient = -counted.atoms.get_forces().ravel() / units.Hartree * units.Bohr
+            counted.calls -= 1  # the calculator counts
+            return {"energy": energy, "gradient": gradient}
+
+    return OfAtoms(frame)
+
+
+def criteria(fmax: float) -> dict[str, float]:
+    """Of geomeTRIC: the largest force on an atom, and nothing else."""
+    others = dict.fromkeys(("energy", "grms", "drms", "dmax"), 1e3)
+    return {f"convergence_{name}": v for name, v in {**others, "gmax": fmax / units.Hartree * units.Bohr}.items()}
+
+
+def by_geometric(
+    atoms: Atoms, quad: tuple[int, ...], value: float, positions: np.ndarray, fmax: float = FMAX
+) -> tuple[float, int]:
+    """Energy in eV, and calls."""
+    from geometric.internal import DelocalizedInternalCoordinates
+    from geometric.molecule import Molecule
+    from geometric.optimize import Optimize
+    from geometric.params import OptParams
+    from geometric.prepare import parse_constraints
+
+    frame = Molecule()
+    frame.elem, frame.xyzs, frame.comms = list(atoms.symbols), [positions.copy()], [""]
+    frame.build_topology()
+    numbers = " ".join(str(a + 1) for a in quad)
+    names, values = parse_constraints(frame, f"$set\ndihedral {numbers} {np.degrees(value):.12f}\n")
+    internals = DelocalizedInternalCoordinates(
+        frame, build=True, connect=False, addcart=False, constraints=names, cvals=values[0]
+    )
+    counted = Counted(atoms)
+    with tempfile.TemporaryDirectory() as folder:
+        found = Optimize(
+            positions.ravel() / units.Bohr, frame, internals, engine(counted, frame), folder,
+            OptParams(**criteria(fmax)), print_info=False,
+        )  # fmt: skip
+    return float(found.qm_energies[-1]) * units.Hartree, counted.calls
+
+
+def scanned_by_geometric(atoms: Atoms, quad: tuple[int, ...], first: float, positions: np.ndarray) -> int:
+    """Calls of its own scan once around, in the steps of this one."""
+    from geometric.molecule import Molecule
+    from geometric.optimize import run_optimizer
+
+    frame = Molecule()
+    frame.elem, frame.xyzs, frame.comms = list(atoms.symbols), [positions.copy()], [""]
+    frame.build_topology()
+    counted = Counted(atoms)
+    begin = np.degrees(first)
+    end = begin + 360.0 * (POINTS - 1) / POINTS
+    home = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            numbers = " ".join(str(a + 1) for a in quad)
+            Path("scan.txt").write_text(f"$scan\ndihedral {numbers} {begin:.10f} {end:.10f} {POINTS}\n")
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                run_optimizer(
+                    customengine=engine(counted, frame), input="scan.in", prefix="scan", constraints="scan.txt",
+                    check=0, **criteria(FMAX),
+                )  # fmt: skip
+        finally:
+            os.chdir(home)
+    return counted.calls
+
+
+def by_sella(atoms: Atoms, quad: tuple[int, ...], value: float, positions: np.ndarray) -> tuple[float, int]:
+    """Energy in eV, and calls."""
+    from sella import Constraints as Held
+    from sella import Sella
+
+    counted = Counted(atoms)
+    counted.atoms.positions[:] = positions
+    held = Held(counted.atoms)
+    held.fix_dihedral(tuple(quad), target=float(np.degrees(value)))
+    search = Sella(counted.atoms, constraints=held, internal=True, order=0, logfile=None)
+    search.run(fmax=FMAX, steps=200)
+    if not search.converged():
+        raise RuntimeError("not converged")
+    return counted.atoms.get_potential_energy(), counted.calls
+
+
+def compared(name: str) -> dict[str, Any]:
+    """One molecule: calls of each program, and how far its energies are from the sharp ones, in kJ/mol."""
+    logging.disable(logging.CRITICAL)
+    warnings.simplefilter("ignore")
+    quad = MOLECULES[name]
+    atoms = molecule(name)
+    counted = Counted(atoms)
+    turn = Dihedral([quad])
+    begin = float(turn.measure(atoms.positions[None, list(quad)], 0.0)[0])
+    values = begin + 2 * np.pi * np.arange(POINTS) / POINTS
+    found = scan(counted.atoms, turn, values, fmax=FMAX, both_ways=False)
+    both = scan(counted.atoms, turn, values, fmax=FMAX)
+    result: dict[str, Any] = {
+        "molecule": name,
+        "torsion": list(quad),
+        "barrier": float(np.ptp(both.energies)) * KJ,
+        "failures": len(found.failed) + len(both.failed),
+        "calls": {"kcons": found.evaluations},
+        "points": {"kcons": [attempt.evaluations for attempt in found.attempts]},
+        "both ways": {
+            "relaxations": len(both.attempts),
+            "calls": both.evaluations,
+            "hysteresis": float(np.nanmax(both.hysteresis)) * KJ,
+            "lower": float(np.max(found.energies - both.energies)) * KJ,
+        },
+        "off": {},
+    }
+    starts = [
+        start(
+            atoms,
+            quad,
+            found.grid.at(a.point)[0],
+            atoms.positions if a.source is None else found.attempts[a.source].positions,
+        )
+        for a in found.attempts
+    ]
+    angles = [found.grid.at(attempt.point)[0] for attempt in found.attempts]
+    sharp = np.array([by_geometric(atoms, quad, v, x, FMAX / 10)[0] for v, x in zip(angles, starts, strict=True)])
+    result["off"]["kcons"] = float(np.max(np.abs([attempt.energy for attempt in found.attempts] - sharp))) * KJ
+    programs: dict[str, Callable[..., tuple[float, int]]] = {"geomeTRIC": by_geometric, "Sella": by_sella}
+    for program, relaxed in programs.items():
+        energies, calls = zip(*(relaxed(atoms, quad, v, x) for v, x in zip(angles, starts, strict=True)), strict=True)
+        result["calls"][program], result["points"][program] = sum(calls), list(calls)
+        result["off"][program] = float(np.max(np.abs(np.array(energies) - sharp))) * KJ
+    result["calls"][SCAN] = scanned_by_geometric(atoms, quad, begin, atoms.positions)
+    return result
+
+
+def profile() -> dict[str, Any]:
+    """H2O2 by EMT."""
+    atoms = molecule("H2O2")
+    atoms.calc = EMT()
+    found: Scan = scan(atoms, Dihedral([[2, 0, 1, 3]]), np.radians(np.arange(0, 360, 30)), fmax=FMAX)
+    energies = (found.energies - found.energies.min()) * KJ
+    return {
+        "degrees": [found.grid.shown(point)[0] for point in found.grid.points],
+        "energies": energies.tolist(),
+        "calls": found.evaluations,
+        "relaxations": len(found.attempts),
+    }
+
+
+def run(full: bool, workers: int) -> dict[str, Any]:
+    result: dict[str, Any] = {"full": full, "machine": environment(), "fmax": FMAX, "points": POINTS}
+    if not full:
+        return {**result, "profile": profile()}
+    result["versions"] = {name: metadata.version(name) for name in ("tblite", "geometric", "sella")}
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        result["molecules"] = list(pool.map(compared, MOLECULES))
+    return result
+
+
+def show(result: dict[str, Any]) -> None:
+    if "profile" in result:
+        found = result["profile"]
+        print(f"H2O2 by EMT: {found['relaxations']} relaxations, {found['calls']} calls of energy and forces")
+        for angle, energy in zip(found["degrees"], found["energies"], strict=True):
+            print(f"{angle:6.0f} degrees {energy:9.3f} kJ/mol")
+        return
+    print(f"{result['points']} points, forces to {result['fmax']} eV/angstrom; calls of energy and forces by GFN2-xTB,")
+    print("and how far energies are off, in kJ/mol: kcons, geomeTRIC, Sella")
+    print("molecule       barrier  kcons  geomeTRIC  Sella  its scan   off                     both ways")
+    for r in result["molecules"]:
+        calls = r["calls"]
+        off = " ".join(f"{r['off'][name]:7.4f}" for name in ("kcons", "geomeTRIC", "Sella"))
+        print(
+            f"{r['molecule']:13s} {r['barrier']:8.2f} {calls['kcons']:6d} {calls['geomeTRIC']:10d} {calls['Sella']:6d} "
+            f"{calls[SCAN]:9d} {off} {r['both ways']['calls']:8d}"
+        )
+    totals = {
+        name: sum(r["calls"][name] for r in result["molecules"]) for name in ("kcons", "geomeTRIC", "Sella", SCAN)
+    }
+    print(f"all: {totals}")
+    print(f"{result['machine']['date']}, {result['versions']}")
+
+
+def main() -> None:
+    parser = scripts.options(__doc__, full="20 molecules, beside geomeTRIC and Sella")
+    parser.add_argument("--workers", type=int, default=1, help="molecules at a time (default 1)")
+    scripts.script(parser, lambda options: run(options.full, options.workers), show)
+
+
+if __name__ == "__main__":
+    main()
