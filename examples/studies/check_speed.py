@@ -23,9 +23,10 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import MDAnalysis as mda
 
-from kcons.comparison import environment, json_files
+from kcons.comparison import environment
 from kcons.constraints import Distance
 from kcons.mdanalysis import ConstraintCheck
+from kcons.steppers.files import text
 
 OXYGEN_HYDROGEN, ANGLE = 0.9572, np.radians(104.52)
 READ = """
@@ -197,9 +198,9 @@ def main() -> None:
                 path = str(Path(place) / f"water.{ending}")
                 results += first_checks(path, molecules, make(path, molecules, size))
         if chosen.out:
-            data = json_files.read(chosen.out) if chosen.out.exists() else {}
+            data = json.loads(chosen.out.read_text()) if chosen.out.exists() else {}
             data["cold"] = {"environment": environment() | {"mdanalysis": mda.__version__}, "cases": results}
-            json_files.write(chosen.out, data)
+            chosen.out.write_text(text(data, 1) + "\n")
         return
     for ending, molecules in cases:
         with tempfile.TemporaryDirectory() as folder:
@@ -241,8 +242,8 @@ def main() -> None:
         data = {"environment": machine, "cases": results}
         if chosen.out.exists():
             # Memory of first checks is measured by itself.
-            data |= {key: value for key, value in json_files.read(chosen.out).items() if key == "cold"}
-        json_files.write(chosen.out, data)
+            data |= {key: value for key, value in json.loads(chosen.out.read_text()).items() if key == "cold"}
+        chosen.out.write_text(text(data, 1) + "\n")
         print(f"wrote {chosen.out}")
 
 

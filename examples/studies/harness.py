@@ -117,7 +117,8 @@ def main(
     path = chosen.out / f"{name}.csv"
     table = run(path, pieces(chosen), **{key: value for key, value in vars(chosen).items() if key != "out"})
     for title, found in tables(table).items():
-        print(f"{title}\n{found.to_string(index=False)}\n")
+        if len(found):
+            print(f"{title}\n{found.to_string(index=False)}\n")
     head, _ = read(path)
     print(f"{head['machine']}; commit {head['commit'][:10]}, {head['date']}; {path}")
 

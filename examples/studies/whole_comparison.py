@@ -118,7 +118,6 @@ PARTS: dict[str, Part] = {
     "triple-pendulum": Part("Triple pendulum", "triple-pendulum"),
     "rotor": Part("Asymmetric top", "rotor"),
     "dumbbells": Part("Two colliding dumbbells", "dumbbells"),
-    "fekete": Part("Fekete points on a sphere", "fekete"),
     "ethanol": Part("Ethanol, GFN2-xTB", "ethanol", needs="tblite", budget=20),
     "water-216": Part("Water, 216 molecules", "water", 216, budget=20, quick=False),
     "water-900": Part("Water, 900 molecules", "water", 900, without=(*LONG, *FEW), budget=20, quick=False),
