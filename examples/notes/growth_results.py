@@ -22,7 +22,6 @@ from scipy.integrate import solve_ivp
 
 from kcons.comparison import environment, processor_of
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
-from kcons.steppers.files import text
 
 KINDS = ("a", "b", "c")
 MEANING = {"a": "fixed total", "b": "entropy produced", "c": "none produced"}
@@ -364,7 +363,7 @@ def main() -> None:
     else:
         result = {"machine": environment(), "full": full} | {name: part() for name, part in parts.items()}
     if options.out:
-        options.out.write_text(text(result, 1) + "\n", encoding="utf-8")
+        options.out.write_text(json.dumps(result, indent=1, default=float) + "\n", encoding="utf-8")
     show(result)
 
 
