@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -90,19 +89,6 @@ def pareto(rows: pd.DataFrame, cost: str, least: float = 0.0) -> pd.DataFrame:
             kept.append(index)
             last = error
     return ordered.loc[kept]
-
-
-def cost_at(rows: pd.DataFrame, cost: str, error: float) -> float:
-    """What one method costs at an error: at its points, or on the line of the logarithms between two neighbors; inf
-    below its smallest error.
-    """
-    known = [(math.log(max(e, 1e-300)), math.log(c)) for e, c in zip(rows.error, rows[cost], strict=True)]
-    wanted = math.log(max(error, 1e-300))
-    found = [c for e, c in known if e <= wanted]
-    for (e0, c0), (e1, c1) in pairwise(known):
-        if min(e0, e1) <= wanted <= max(e0, e1) and e0 != e1:
-            found.append(c0 + (c1 - c0) * (wanted - e0) / (e1 - e0))
-    return math.exp(min(found)) if found else math.inf
 
 
 # -- the ranking ------------------------------------------------------------------------------------
@@ -223,19 +209,8 @@ def shown_setting(row: Any, about: Mapping[str, Any]) -> str:
 # -- a wanted error ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Where one method is expected to make an error, and what that costs a long unit of time."""
-
-    method: str
-    setting: float
-    order: float
-    seconds: float
-    evaluations: float
-
-
-def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> Prediction | None:
-    """The setting of one method for an error, from its rows, by the slope next to it.
+def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> dict[str, Any] | None:
+    """The setting of one method for an error, from its rows, by the slope next to it; with the order and the costs.
 
     None where fewer than two errors are above `least`, or the error does not fall with the setting.
     """
@@ -253,12 +228,11 @@ def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> Prediction 
     ratio = math.log(error / near.error) / order
     if abs(ratio) > math.log(REACH):
         return None
-
-    def at(cost: str) -> float:
+    found = {"method": near.method, "setting": near.setting * math.exp(ratio), "order": order}
+    for cost in COSTS:
         slope = math.log(first[cost] / second[cost]) / step if near.adaptive else -1.0
-        return float(near[cost] * math.exp(slope * ratio))
-
-    return Prediction(near.method, near.setting * math.exp(ratio), order, at("seconds"), at("evaluations"))
+        found[cost] = float(near[cost] * math.exp(slope * ratio))
+    return found
 
 
 def find_steps(
@@ -301,57 +275,51 @@ def find_steps(
     if target < least:
         return []
     predicted = (predict(rows, SAFETY * target, least) for _, rows in with_errors(table).groupby("method"))
-    promising = sorted((p for p in predicted if p is not None), key=lambda p: getattr(p, cost))
+    promising = sorted((p for p in predicted if p is not None), key=lambda p: float(p[cost]))
     found: list[dict[str, Any]] = []
-    for prediction in promising[:FINALISTS]:
+    for promise in promising[:FINALISTS]:
         best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
-        seconds = prediction.seconds * system.horizon / system.units.long_time_unit
-        if getattr(prediction, cost) < 1.5 * best and seconds <= budget:
-            found += _search(system, prediction, target, reference, budget, watcher)
+        seconds = promise["seconds"] * system.horizon / system.units.long_time_unit
+        if promise[cost] < 1.5 * best and seconds <= budget:
+            method = METHODS[promise["method"]]
+            found += _search(system, method, promise["setting"], promise["order"], target, reference, budget, watcher)
     return found
 
 
 def _search(
     system: TestSystem,
-    prediction: Prediction,
+    method: Method,
+    setting: float,
+    order: float,
     target: float,
     reference: Reference,
     budget: float,
     watcher: Watcher | None,
 ) -> list[dict[str, Any]]:
     """Runs of one method at the predicted step and near it, until its longest step that makes the error is known."""
-    method = METHODS[prediction.method]
-    setting, found = prediction.setting, []
+    found: list[dict[str, Any]] = []
     good, bad, smallest = 0.0, math.inf, math.inf  # the longest step that reaches the error, the shortest that does not
+    horizon = system.horizon / system.units.time_unit
     for _ in range(TRIES):
-        setting = _dividing(system, method, setting, bad)
+        if not method.adaptive:  # the longest step that divides the horizon and is not longer, shorter than a bad one
+            count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
+            setting = horizon / (count + (horizon / count >= bad * (1 - 1e-9)))
         if setting <= good or setting >= bad:
             break
         internal = setting if method.adaptive else setting * system.units.time_unit
         row = measure(system, method, internal, reference, budget, watcher=watcher)
         found.append(row)
+        error = row.get("error", math.inf)
         if row["status"] not in ("ok", "failed"):
             break
-        error = row.get("error", math.inf)
         if error <= target:
             good = setting
             if error >= WASTE * target or error == 0:
                 break
+        elif math.isfinite(bad) and error > 0.9 * smallest:
+            break  # shorter steps do not help: something else than the step decides
         else:
-            if math.isfinite(bad) and error > 0.9 * smallest:
-                break  # shorter steps do not help: something else than the step decides
             bad, smallest = setting, min(error, smallest)
-        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / prediction.order)
+        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / order)
         setting *= min(max(ratio, 0.3), 3.0)
     return found
-
-
-def _dividing(system: TestSystem, method: Method, setting: float, bad: float) -> float:
-    """The longest step that divides the horizon and is not longer than `setting`, shorter than one known to be bad."""
-    if method.adaptive:
-        return setting
-    horizon = system.horizon / system.units.time_unit
-    count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
-    if horizon / count >= bad * (1 - 1e-9):
-        count += 1
-    return horizon / count

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,10 +63,6 @@ class Run(ABC):
         """Go back to the start; the steps go on counting."""
         raise NotImplementedError
 
-    def put(self, x: FloatArray) -> None:
-        """Other positions, such as those wrapped into a cell, and the velocities as they are."""
-        raise NotImplementedError
-
 
 class OnArrays(Run):
     """A stepper of kcons, arrays in and arrays out."""
@@ -90,9 +85,6 @@ class OnArrays(Run):
 
     def rewind(self) -> None:
         self.state = self.start
-
-    def put(self, x: FloatArray) -> None:
-        self.state = replace(self.state, positions=x)
 
 
 class OfStates(Run):
@@ -159,10 +151,6 @@ class InAse(Run):
         # Constraints would change them by what rounding leaves.
         self.atoms.set_momenta(p, apply_constraint=False)
 
-    def put(self, x: FloatArray) -> None:
-        # As atoms.wrap() does it: not through the constraints.
-        self.atoms.arrays["positions"][:] = x
-
 
 class InOpenMM(Run):
     """A Context of OpenMM at its start.
@@ -216,9 +204,6 @@ class InOpenMM(Run):
         x, v = self._start
         self.context.setPositions(x)
         self.context.setVelocities(v)
-
-    def put(self, x: FloatArray) -> None:
-        self.context.setPositions(x * self.length)
 
 
 def seen(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
