@@ -7,7 +7,6 @@
 - `ranking`, `report`: what follows from the table, and what is shown of it
 - `averages`: a test system through thermostats and long steps, a row a run
 - `production`: which step is right for averages
-- `extrapolation`: averages at step zero
 - `trajectory_temperatures`: temperatures of configurations along a trajectory of any engine
 """
 
@@ -19,7 +18,6 @@ from kcons.errors import with_extra
 #: Names by the module that has them; imported when they are asked for.
 _NAMES = {
     "averages": ("AVERAGES", "SAMPLERS", "add_sampler", "compare_averages"),
-    "extrapolation": ("extrapolate",),
     "machine": ("environment", "processor_of"),
     "measure": ("COLUMNS", "compare"),
     "methods": ("METHODS", "Method", "add_method", "code"),
