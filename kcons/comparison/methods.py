@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from kcons import steppers
-from kcons.comparison.runs import InAse, InOpenMM, OfSciPy, OfStates, OnArrays, Run, ase_constraints
+from kcons.comparison.runs import InAse, InOpenMM, OfSciPy, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -385,20 +385,26 @@ def _kcons_in_ase(system: TestSystem) -> Sequence[Any]:
 
 def _bond_lengths(system: TestSystem) -> Sequence[Any]:
     """FixBondLengths at its own tolerance, angles held by their end distances."""
-    return ase_constraints(system.fixed, system.bonds, _distances(system, system.bonds), internals=False)
+    from ase.constraints import FixBondLengths
+
+    return [*_fixed(system), FixBondLengths(system.bonds)]
 
 
 def _internals(system: TestSystem) -> Sequence[Any]:
     """FixInternals at its own tolerance."""
-    bonds = system.bonds if system.angle_bonds is None else system.angle_bonds
-    degrees = [system.atoms().get_angle(*triple) for triple in system.angles]
-    lengths = _distances(system, bonds)
-    return ase_constraints(system.fixed, bonds, lengths, system.angles, degrees, internals=True)
+    from ase.constraints import FixInternals
+
+    atoms = system.atoms()
+    pairs = system.bonds if system.angle_bonds is None else system.angle_bonds
+    bonds = [[float(atoms.get_distance(*pair)), pair] for pair in np.asarray(pairs).tolist()]
+    angles = [[float(atoms.get_angle(*triple)), triple] for triple in system.angles.tolist()]
+    return [*_fixed(system), FixInternals(bonds=bonds or None, angles_deg=angles or None)]
 
 
-def _distances(system: TestSystem, pairs: Any) -> FloatArray:
-    x = system.positions
-    return np.asarray(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1))
+def _fixed(system: TestSystem) -> list[Any]:
+    from ase.constraints import FixAtoms
+
+    return [FixAtoms(system.fixed.tolist())] if len(system.fixed) else []
 
 
 def _distances_only(system: TestSystem) -> str | None:

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ase.constraints import FixAtoms, FixBondLengths, FixInternals
-from numpy.typing import ArrayLike
 
 from kcons import steppers
 from kcons.constraints.target import FloatArray
@@ -213,36 +211,3 @@ def seen(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
         np.array(state.getPositions(asNumpy=True)._value),
         np.array(state.getVelocities(asNumpy=True)._value),
     )
-
-
-def ase_constraints(
-    fixed: ArrayLike,
-    pairs: Any,
-    lengths: Any,
-    triples: Any = (),
-    degrees: Any = (),
-    *,
-    internals: bool,
-    **options: Any,
-) -> list[Any]:
-    """ASE's constraint objects: FixAtoms, and FixInternals or FixBondLengths.
-
-    Parameters
-    ----------
-    fixed : array_like of int
-    pairs, lengths, triples, degrees
-        Distances in Å and angles in degrees.
-    internals : bool
-        Whether by FixInternals, which holds angles, too.
-    **options
-        For FixInternals.
-    """
-    still = np.asarray(fixed, dtype=int)
-    held: list[Any] = [FixAtoms(still.tolist())] if len(still) else []
-    if internals:
-        bonds = [[float(d), [int(i) for i in pair]] for d, pair in zip(lengths, pairs, strict=True)]
-        angles = [[float(a), [int(i) for i in triple]] for a, triple in zip(degrees, triples, strict=True)]
-        held.append(FixInternals(bonds=bonds or None, angles_deg=angles or None, **options))
-    elif len(pairs):
-        held.append(FixBondLengths(pairs, bondlengths=lengths))
-    return held

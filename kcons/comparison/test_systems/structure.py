@@ -15,6 +15,7 @@ import numpy as np
 from ase import units
 
 from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, place, properties
+from kcons.comparison.test_systems.potential import Potential
 from kcons.comparison.test_systems.registry import STRUCTURE_OPTIONS, add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
@@ -286,24 +287,38 @@ def _test_system(
         x = _relaxed(system_of(topology, field, None, False), x, platform, relax)
     # SETTLE's lengths are rounded to single precision: with the same ones, all MD engines run the same system.
     held = ConstraintSet(Distance(rows.pairs, rows.lengths / ASE_LENGTH), x / ASE_LENGTH, rows.masses)
-    motion = Motion(held, x / ASE_LENGTH)
-    on = motion.restore_positions(x / ASE_LENGTH)
     md_engine = OpenMMEngine(lambda: system, platform=platform, home=True)
-    potential = md_engine.potential()
-    what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances, {TEMPERATURE:g} K"
-    return TestSystem(
-        name=name,
-        title=f"{what}; {'PME, ' if box is not None else ''}{potential.name}",
-        constraint_set=held,
-        positions=on,
-        velocities=thermal_velocities(motion, on, TEMPERATURE, seed),
-        potential=potential,
+    what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances"
+    return molecules_at_300_k(
+        name,
+        f"{what}, {TEMPERATURE:g} K; {'PME, ' if box is not None else ''}",
+        held,
+        x / ASE_LENGTH,
+        seed,
+        potential=md_engine.potential(),
         symbols=[atom.element.symbol if atom.element is not None else "X" for atom in topology.atoms()],
         bonds=rows.pairs,
         cell=None if box is None else box / ASE_LENGTH,
         openmm=md_engine,
+    )
+
+
+def molecules_at_300_k(
+    name: str, title: str, held: ConstraintSet, x: FloatArray, seed: int, *, potential: Potential, **more: Any
+) -> TestSystem:
+    """A test system of molecules from a file: on the constraints, with thermal velocities, steps and horizon."""
+    motion = Motion(held, x)
+    on = motion.restore_positions(x)
+    return TestSystem(
+        name=name,
+        title=title + potential.name,
+        constraint_set=held,
+        positions=on,
+        velocities=thermal_velocities(motion, on, TEMPERATURE, seed),
+        potential=potential,
         thermal_energy=units.kB * TEMPERATURE,
         **steps_of(len(x)),
+        **more,
     )
 
 
