@@ -10,14 +10,14 @@ import numpy as np
 from ase import units
 from matplotlib.animation import FuncAnimation, PillowWriter
 
-from kcons import State, run
-from kcons.comparison import fluid
-from kcons.thermostats import Langevin, thermal_velocities
+from kcons import State, System, run
+from kcons.comparison import test_systems
+from kcons.thermostats import Langevin
 
 folder, frames = (sys.argv[1:] + [".", "80"][len(sys.argv) - 1 :])[:2]
-water = fluid.water(27)
-system, kT = water.system(), 300 * units.kB
-start = State(water.positions, thermal_velocities(system, water.positions, kT, 1))
+water = test_systems.build("water", 27, forces="ase")
+system, kT = System(water.motion, water.potential.forces), water.thermal_energy
+start = State(water.positions, water.velocities)
 stepper = Langevin(kT, 1e-3 / units.fs, 1)
 path = run(system, start, 2 * units.fs, 5 * int(frames), stepper=stepper, record=5)
 atoms = path.positions.reshape(len(path), -1, 3, 3)

@@ -9,6 +9,7 @@ python examples/notes/growth_results.py --show F          the tables of an earli
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison import environment, json_files, processor_of
+from kcons.comparison import environment, processor_of
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")
@@ -355,14 +356,14 @@ def main() -> None:
         "far_out": far_out if full else lambda: [],
     }
     if options.show:
-        result = json_files.read(options.show)
+        result = json.loads(options.show.read_text(encoding="utf-8"))
     elif options.part:
-        result = json_files.read(options.out)
+        result = json.loads(options.out.read_text(encoding="utf-8"))
         result[options.part] = parts[options.part]()
     else:
         result = {"machine": environment(), "full": full} | {name: part() for name, part in parts.items()}
     if options.out:
-        json_files.write(options.out, result)
+        options.out.write_text(json.dumps(result, indent=1, default=float) + "\n", encoding="utf-8")
     show(result)
 
 

@@ -1,18 +1,20 @@
 """Our dynamics class beside ASE's: accuracy, cost, pressure, temperature.
 
-``python examples/studies/ase_dynamics.py`` takes a few seconds. With ``--full --out docs/results/ase_dynamics.json`` it
-measures everything that docs/ase.md shows (minutes); ``--show FILE`` prints such a file.
+python ase_dynamics.py --quick --out DIR   a few seconds
+python ase_dynamics.py --out DIR           what docs/ase.md shows, minutes
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
 
+import harness
 import numpy as np
-import study_scripts as scripts
+import pandas as pd
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
@@ -24,7 +26,6 @@ from ase.md.md import MolecularDynamics
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import ConstrainedDynamics, constrain, draw_velocities, rigid_water
-from kcons.comparison import environment, processor_of
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
 
@@ -285,81 +286,49 @@ def statistics(steps: int) -> list[dict]:
     return rows
 
 
-# -- a bond that is pulled --------------------------------------------------------------------------
-
-
-def pulled_bond(steps: int) -> None:
-    atoms = molecule("CH3CH2OH")
-    atoms.calc = EMT()
-    length = atoms.get_distance(0, 1)
-    rate = 0.002 / FS
-    bond = Distance([[0, 1]], lambda t: length + rate * t)
-    dynamics = ConstrainedDynamics(atoms, 0.5 * FS, BlanesMoan4(), constraints=[bond])
-
-    print("The C-C bond of ethanol, pulled at 0.002 A/fs")
-    print("  time/fs  length/A  length - target/A  potential energy/eV")
-
-    def show() -> None:
-        now = atoms.get_distance(0, 1)
-        miss = now - length - rate * dynamics.get_time()
-        print(f"  {dynamics.get_time() / FS:7.1f}  {now:8.5f}  {miss:17.1e}  {atoms.get_potential_energy():19.4f}")
-
-    dynamics.attach(show, interval=max(1, steps // 4))
-    dynamics.run(steps)
-    print()
-
-
 # -- all of it --------------------------------------------------------------------------------------
 
 
-def run(full: bool) -> dict:
-    result: dict = {"full": full, "machine": environment()}
-    parts = {
-        "cost": lambda: [row for n in ((10, 100, 1000) if full else (10,)) for row in cost(n, 101 if full else 5)],
-        "far": lambda: far_from_the_origin(1000 if full else 50),
-        "energy": lambda: energy_at_equal_evaluations(*((960, 480.0) if full else (48, 24.0))),
-        "statistics": lambda: statistics(40_000 if full else 200),
+def part(name: str, measure: Callable[[], list[dict]]) -> Iterator[dict[str, Any]]:
+    yield from ({"part": name, **row} for row in measure())
+
+
+def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
+    full = not chosen.quick
+    found = {
+        f"cost, {n} waters": ("cost", partial(cost, n, 101 if full else 5))
+        for n in ((10, 100, 1000) if full else (10,))
     }
-    for name, measure in parts.items():
-        if full:
-            print(f"measuring: {name}", file=sys.stderr, flush=True)
-        result[name] = measure()
-    return result
+    found["far"] = ("far", partial(far_from_the_origin, 1000 if full else 50))
+    found["energy"] = ("energy", partial(energy_at_equal_evaluations, *((960, 480.0) if full else (48, 24.0))))
+    found["statistics"] = ("statistics", partial(statistics, 40_000 if full else 200))
+    return {name: partial(part, *work) for name, work in found.items()}
 
 
-def show(result: dict) -> None:
-    print("Microseconds of CPU a step of 1 fs, rigid waters, a calculator that does nothing; medians")
-    print("(projections: as calls of the engine, one by one; last column: whole / (forces + 1.3 projections))")
-    print("waters  dynamics                                whole   forces  projections      ratio")
-    for r in result["cost"]:
-        line = f"{r['waters']:6d}  {r['dynamics']:36s} {r['step_us']:8.0f}"
-        if "forces_us" in r:
-            line += f" {r['forces_us']:8.0f} {r['projections_us']:12.0f} {r['ratio']:10.2f}"
-        print(line)
-    steps = result["far"][0]["steps"]
-    print(f"\nKinetic energy lost by a free rigid CO in {steps} steps (relative)")
-    print("step/fs  distance/A  VelocityVerlet  ConstrainedDynamics")
-    for r in result["far"]:
-        print(f"{r['timestep_fs']:7.2f}  {r['distance']:10.0e}  {r['ase']:14.1e}  {r['kcons']:19.1e}")
-    print(f"\nEthanol by {result['energy'][0]['forces']}, X-H bonds held: largest deviation of the total energy")
-    print("stepper         step/fs  evaluations  deviation/eV")
-    for r in result["energy"]:
-        print(f"{r['stepper']:14s} {r['timestep_fs']:8.2f} {r['evaluations']:12d} {r['deviation_ev']:13.1e}")
-    print("\nStatistics under ASE's thermostats             expected    found  standard error")
-    for r in result["statistics"]:
-        print(f"{r['what']:44s} {r['expected']:10.2f} {r['mean']:8.2f} {r['error']:15.2f}")
-    computer = result["machine"]
-    versions = ", ".join(f"{name} {v}" for name, v in computer["versions"].items() if v and name != "kcons")
-    print(f"\n{processor_of(computer)}; {versions}")
-    print(f"commit {computer['commit']}, {computer['date']}")
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    times = {"step_us": "{:.0f}", "forces_us": "{:.0f}", "projections_us": "{:.0f}", "ratio": "{:.2f}"}
+    return {
+        "Microseconds a step, median": harness.shown(table, "cost", waters="{:.0f}", dynamics="{}", **times),
+        "Kinetic energy lost by a free rigid CO (relative)": harness.shown(
+            table, "far", timestep_fs="{:.2f}", distance="{:.0e}", ase="{:.1e}", kcons="{:.1e}"
+        ),
+        "Ethanol, X-H bonds held: largest deviation of the total energy": harness.shown(
+            table,
+            "energy",
+            forces="{}",
+            stepper="{}",
+            timestep_fs="{:.2f}",
+            evaluations="{:.0f}",
+            deviation_ev="{:.1e}",
+        ),
+        "Statistics under ASE's thermostats": harness.shown(
+            table, "statistics", what="{}", expected="{:.2f}", mean="{:.2f}", error="{:.2f}"
+        ),
+    }
 
 
 def main() -> None:
-    def measure(options: argparse.Namespace) -> dict:
-        pulled_bond(40)
-        return run(options.full)
-
-    scripts.script(scripts.options(__doc__, full="everything that the page shows; minutes"), measure, show)
+    harness.main("ase_dynamics", harness.options(__doc__, "ase-dynamics"), pieces, tables)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """How fast is the engine, and how exact? Every shape it has a solver for, against the MD engines' own constraints.
 
-    python engine_speed.py                  small systems, a minute
-    python engine_speed.py --full --out F   all sizes and slow peers, four minutes; F receives JSON
-    python engine_speed.py --certificates   only what certificates take of a run
+    python engine_speed.py --quick --out DIR         small systems, a minute
+    python engine_speed.py --out DIR                 all sizes and slow peers, four minutes
+    python engine_speed.py --certificates --out DIR  only what certificates take of a run
 
 Times are medians of repeats in one process, one thread, warm. P is the position projection, V the velocity
 projection, both through the public calls of `Motion`, checks included; each P starts from a fresh thermal
@@ -12,29 +12,31 @@ the same run: kick and drift, then kick.
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import harness
 import numba
 import numpy as np
-import study_scripts as scripts
+import pandas as pd
 from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.constraints import FixBondLengths
 from ase.md.verlet import VelocityVerlet
-from rich.console import Console
 
 import kcons
 from kcons import ConstraintSet, State, System
 from kcons.ase import constrain
-from kcons.comparison import environment, processor_of, system_of
+from kcons.comparison import system_of
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.motion import Motion
 from kcons.plan import make_plan
@@ -437,124 +439,104 @@ def certificate(name: str, x: np.ndarray, masses: np.ndarray, constraints: list[
     }  # fmt: skip
 
 
-def certificates(full: bool) -> dict:
-    seconds = 10.0 if full else 0.2
+# -- the study ------------------------------------------------------------------------------------
+
+
+def row(part: str, measured: Callable[..., dict], make: Callable[[], tuple], **given: Any) -> Iterator[dict[str, Any]]:
+    """What is measured on a system that is made for it."""
+    found = measured(given.pop("name"), *make()[:3], **given)
+    found["solvers"] = "+".join(found.get("solvers", ()))
+    yield {"part": part, **found}
+
+
+def peers(name: str, measured: Callable[[], dict]) -> Iterator[dict[str, Any]]:
+    yield from ({"part": "peers", "name": name, "what": what, "value": v} for what, v in measured().items())
+
+
+def ccma(held: str, tolerance: float) -> dict:
+    x, masses, _, system = protein(held)
+    return openmm_constraints(x, masses, system, tolerance, 20)
+
+
+def in_ase(n: int) -> dict:
+    times = {how: ase_step(n, how, 50) for how in ("free", "kcons")}
+    return {**times, "ratio": times["kcons"] / times["free"]}
+
+
+def certified(full: bool) -> dict[str, Any]:
     bent = np.array([[0.0, 0, 0], [1.1, 0.2, 0], [1.5, 1.3, 0.3], [2.6, 1.5, 1.1]])
     angles = [Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2], [1, 2, 3]])]
-    rows = [
-        certificate("one bond", bent[:2], np.array([12.0, 16.0]), [Distance([[0, 1]])], seconds),
-        certificate("four atoms, bonds and angles", bent, np.full(4, 12.0), angles, seconds),
-        certificate("rigid water, 100 molecules", *water(100), seconds),
-        certificate("chain, zigzag, 1000 bonds", *chain(1000, "zigzag"), seconds),
-    ]
-    if full:
-        rows.append(certificate("rigid water, 10000 molecules", *water(10_000), seconds))
-    return {"machine": environment(), "full": full, "certificates": rows}
+    systems: dict[str, Callable[[], tuple]] = {
+        "one bond": lambda: (bent[:2], np.array([12.0, 16.0]), [Distance([[0, 1]])]),
+        "four atoms, bonds and angles": lambda: (bent, np.full(4, 12.0), angles),
+        "rigid water, 100 molecules": partial(water, 100),
+        "chain, zigzag, 1000 bonds": partial(chain, 1000, "zigzag"),
+        **({"rigid water, 10000 molecules": partial(water, 10_000)} if full else {}),
+    }
+    given = {"seconds": 10.0 if full else 0.2}
+    return {name: partial(row, "certificates", certificate, make, name=name, **given) for name, make in systems.items()}
 
 
-def show_certificates(result: dict, console: Console) -> None:
-    headings = ("system", "rows", "steps", "step", "certificates", "each", "share")
-    table = scripts.table("Certificates in a run without forces", headings, {"system"})
-    table.add_row("", "", "", "µs", "", "µs", "%", end_section=True)
-    for r in result["certificates"]:
-        table.add_row(
-            r["name"], f"{r['rows']:,}", f"{r['steps']:,}", f"{r['step_us']:.1f}", f"{r['certificates']:,}",
-            f"{r['certificate_us']:.0f}", f"{100 * r['share']:.2f}",
-        )  # fmt: skip
-    console.print(table)
-    machine = result["machine"]
-    console.print(f"{processor_of(machine)}, one thread; commit {machine['commit']}, {machine['date']}")
-
-
-# -- the run --------------------------------------------------------------------------------------
-
-
-def run(full: bool, console: Console) -> dict:
-    result: dict[str, Any] = {"machine": environment(), "full": full, "engine": [], "peers": {}}
-
-    def add(*args: Any, **kwargs: Any) -> None:
-        row = measure(*args, **kwargs)
-        result["engine"].append(row)
-        console.print(
-            f"{row['name']}: {row['p_ns']:.1f} + {row['v_ns']:.1f} ns a row, {row['ratio_to_bare']:.2f} × bare"
-        )
-
-    for n in (1_000, 10_000, 100_000) if full else (1_000,):
-        add(f"rigid water, {n} molecules", *water(n))
+def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
+    full = not chosen.quick
+    if chosen.certificates:
+        return certified(full)
+    sizes = (1_000, 10_000, 100_000, 1_000_000) if full else (1_000,)
+    systems: dict[str, Callable[[], tuple]] = {f"rigid water, {n} molecules": partial(water, n) for n in sizes[:3]}
     n = 10_000 if full else 1_000
     for hydrogens, label in ((1, "X-H"), (2, "CH2"), (3, "CH3")):
-        add(f"{label}, {n} groups", *groups(n, hydrogens))
-    sizes = (1_000, 10_000, 100_000, 1_000_000) if full else (1_000,)
+        systems[f"{label}, {n} groups"] = partial(groups, n, hydrogens)
     for kind in ("zigzag", "straight", "175 degrees", "freely jointed"):
-        for n in sizes:
-            add(f"chain, {kind}, {n} bonds", *chain(n, kind))
-    for n in sizes:
-        add(f"chain by the generic path, zigzag, {n} bonds", *chain(n, "zigzag"), path="generic")
-        add(f"tree (polymethylene), {n} bonds", *tree(n // 3))
+        systems |= {f"chain, {kind}, {n} bonds": partial(chain, n, kind) for n in sizes}
+    generic = {f"chain by the generic path, zigzag, {n} bonds": partial(chain, n, "zigzag") for n in sizes}
+    systems |= generic | {f"tree (polymethylene), {n} bonds": partial(tree, n // 3) for n in sizes}
+    others: dict[str, Callable[[], dict]] = {"ASE FixBondLengths": partial(fix_bond_lengths, 1_000 if full else 10)}
     if find_spec("openmm") is not None:
-        for held in ("all bonds", "bonds and H angles", "mixed") if full else ("all bonds",):
-            x, masses, constraints, system = protein(held)
-            add(f"DHFR, {held}", x, masses, constraints)
-            if held != "mixed" and full:
-                for tolerance in (1e-6, 1e-12):
-                    peer = openmm_constraints(x, masses, system, tolerance, 20)
-                    result["peers"][f"OpenMM CCMA, DHFR, {held}, {tolerance:g}"] = peer
-        result["peers"]["OpenMM SETTLE"] = settle(10_000 if full else 1_000, 20)
-    result["peers"]["ASE FixBondLengths"] = fix_bond_lengths(1_000 if full else 10)
-    result["ase_step"] = {
-        f"{n} waters": {how: ase_step(n, how, 50) for how in ("free", "kcons")}
-        for n in ((100, 1000) if full else (100,))
-    }
-    result["one_bond"] = one_bond(1_000_000 if full else 100_000)
+        held = ("all bonds", "bonds and H angles", "mixed") if full else ("all bonds",)
+        systems |= {f"DHFR, {h}": partial(protein, h) for h in held}
+        others["OpenMM SETTLE"] = partial(settle, 10_000 if full else 1_000, 20)
+        for h in held[:2] if full else ():
+            others |= {f"OpenMM CCMA, DHFR, {h}, {t:g}": partial(ccma, h, t) for t in (1e-6, 1e-12)}
+    others |= {f"ASE VelocityVerlet, {n} waters, s": partial(in_ase, n) for n in ((100, 1000) if full else (100,))}
+    others["one bond"] = partial(one_bond, 1_000_000 if full else 100_000)
     if full:
-        result["first_call"] = first_call()
-    return result
+        others["import and first call"] = first_call
+    found: dict[str, Any] = {
+        name: partial(row, "engine", measure, make, name=name, path="generic" if name in generic else "")
+        for name, make in systems.items()
+    }
+    return found | {name: partial(peers, name, measured) for name, measured in others.items()}
 
 
-def exponent(rows: list[dict], start: str) -> float:
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    times = {"p_ns": "{:.1f}", "v_ns": "{:.1f}", "bare_ns_atom": "{:.2f}", "ratio_to_bare": "{:.2f}"}
+    errors = {"sigma_over_tolerance": "{:.2f}", "velocity_error": "{:.0e}", "setup_s": "{:.3f}"}
+    found = {
+        "Engine: P and V in ns a row, bare in ns an atom, P + V over bare": harness.shown(
+            table, "engine", name="{}", solvers="{}", rows="{:.0f}", **times, **errors
+        ),
+        "Peers": harness.shown(table, "peers", name="{}", what="{}", value="{:.4g}"),
+        "Certificates in a run without forces": harness.shown(
+            table, "certificates", name="{}", rows="{:.0f}", step_us="{:.1f}", certificate_us="{:.0f}", share="{:.2%}"
+        ),
+    }
+    exponents = {start: exponent(table, start) for start in ("chain, zigzag", "chain by the generic", "tree")}
+    grown = pd.DataFrame([{"systems": name, "exponent": f"{p:.3f}"} for name, p in exponents.items() if p is not None])
+    return {title: frame for title, frame in {**found, "P + V against rows": grown}.items() if len(frame)}
+
+
+def exponent(table: pd.DataFrame, start: str) -> float | None:
     """Fitted exponent of P + V against the number of rows."""
-    points = [(r["rows"], r["rows"] * (r["p_ns"] + r["v_ns"])) for r in rows if r["name"].startswith(start)]
-    n, t = np.log(np.array(points)).T
-    return float(np.polyfit(n, t, 1)[0])
-
-
-def show(result: dict, console: Console) -> None:
-    headings = ("system", "solver", "rows", "P", "V", "P + V", "bare", "P + V", "σ/tol", "|Av|/v", "set-up")
-    table = scripts.table("Engine: time and error", headings, {"system", "solver"})
-    table.add_row("", "", "", "ns/row", "ns/row", "ns/row", "ns/atom", "× bare", "", "", "s", end_section=True)
-    for r in result["engine"]:
-        table.add_row(
-            r["name"], "+".join(r["solvers"]), f"{r['rows']:,}", f"{r['p_ns']:.1f}", f"{r['v_ns']:.1f}",
-            f"{r['p_ns'] + r['v_ns']:.1f}", f"{r['bare_ns_atom']:.2f}", f"{r['ratio_to_bare']:.2f}",
-            f"{r['sigma_over_tolerance']:.2f}", f"{r['velocity_error']:.0e}", f"{r['setup_s']:.3f}",
-        )  # fmt: skip
-    console.print(table)
-    machine = result["machine"]
-    versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "ase", "openmm"))
-    console.print(f"{processor_of(machine)}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
-    for name, peer in result["peers"].items():
-        console.print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in peer.items()))
-    for name, times in result["ase_step"].items():
-        console.print(
-            f"ASE VelocityVerlet, {name}: free {times['free'] * 1e6:.0f} µs, kcons {times['kcons'] * 1e6:.0f} µs, "
-            f"ratio {times['kcons'] / times['free']:.2f}"
-        )
-    console.print(f"one bond among {result['one_bond']['atoms']:,} atoms: {result['one_bond']['p_plus_v_us']:.1f} µs")
-    if result["full"]:
-        for start in ("chain, zigzag", "chain by the generic", "tree"):
-            console.print(f"exponent, {start}: {exponent(result['engine'], start):.3f}")
-        console.print(f"import and first call: {result['first_call']}")
+    rows = table[(table.part == "engine") & table.name.str.startswith(start)] if "name" in table else table[:0]
+    if len(rows) < 2:
+        return None
+    return float(np.polyfit(np.log(rows["rows"]), np.log(rows["rows"] * (rows.p_ns + rows.v_ns)), 1)[0])
 
 
 def main() -> None:
-    console = Console(width=150)
-    parser = scripts.options(__doc__, full="all sizes and the slow peers")
+    parser = harness.options(__doc__, "engine-speed")
     parser.add_argument("--certificates", action="store_true", help="only what certificates take of a run")
-    scripts.script(
-        parser,
-        lambda options: certificates(options.full) if options.certificates else run(options.full, console),
-        lambda result: (show_certificates if "certificates" in result else show)(result, console),
-    )
+    harness.main("engine_speed", parser, pieces, tables)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What studies share: pieces of work, run one after another into a CSV file with a row a measurement.
+"""What studies share: pieces of work, run one after another into a CSV file with a row a measurement; calls in turn.
 
 The file begins with lines '# commit: ...', '# machine: ...', '# versions: ...', '# settings: ...'. It is written after
 each piece, so that a study that was cut off goes on from the rows in its file.
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from time import process_time
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich.progress import track
 
@@ -91,3 +93,73 @@ def run(path: Path, pieces: Mapping[str, Callable[[], Iterable[Mapping[str, Any]
         rows += [{"piece": name, **row} for row in pieces[name]()]
         write(path, head, pd.DataFrame(rows))
     return pd.DataFrame(rows)
+
+
+def main(
+    name: str,
+    parser: argparse.ArgumentParser,
+    pieces: Callable[[argparse.Namespace], Mapping[str, Callable[[], Iterable[Mapping[str, Any]]]]],
+    tables: Callable[[pd.DataFrame], Mapping[str, pd.DataFrame]],
+) -> None:
+    """A study as a command: run its pieces into NAME.csv, and print its tables.
+
+    Parameters
+    ----------
+    name : str
+    parser : argparse.ArgumentParser
+        From `options`.
+    pieces : callable
+        What was chosen, to pieces as for `run`.
+    tables : callable
+        The frame to tables by title.
+    """
+    chosen = parser.parse_args()
+    path = chosen.out / f"{name}.csv"
+    table = run(path, pieces(chosen), **{key: value for key, value in vars(chosen).items() if key != "out"})
+    for title, found in tables(table).items():
+        if len(found):
+            print(f"{title}\n{found.to_string(index=False)}\n")
+    head, _ = read(path)
+    print(f"{head['machine']}; commit {head['commit'][:10]}, {head['date']}; {path}")
+
+
+def shown(table: pd.DataFrame, part: str, **columns: str) -> pd.DataFrame:
+    """The rows whose column 'part' is `part`, with columns by name, each formatted; blank where there is no value."""
+    rows = table[table.part == part]
+    return pd.DataFrame(
+        {
+            name: ["" if pd.isna(value) else form.format(value) for value in rows[name]]
+            for name, form in columns.items()
+            if name in rows
+        }
+    )
+
+
+# -- times ------------------------------------------------------------------------------------------
+
+
+def in_turn(
+    calls: Mapping[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = process_time
+) -> dict[str, list[float]]:
+    """Seconds of each call, `repeats` times, in turn: disturbances of the machine then affect all calls alike."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            begun = clock()
+            call()
+            seconds[name].append(clock() - begun)
+    return seconds
+
+
+def ratio(first: Sequence[float], second: Sequence[float]) -> float:
+    """Median over the turns of first/second."""
+    return float(np.median(np.array(first) / np.array(second)))
+
+
+def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict[str, float]]:
+    """Median milliseconds of one of the `steps` of a call, and the speed relative to the first of them all."""
+    first = next(iter(seconds.values()))
+    return {
+        name: {"ms": 1e3 * float(np.median(found)) / steps, "ratio": ratio(first, found)}
+        for name, found in seconds.items()
+    }

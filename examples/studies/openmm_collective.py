@@ -1,43 +1,35 @@
 """Collective variables held in OpenMM: what a row costs in water, and what it reaches on a peptide.
 
-    python openmm_collective.py           a short run
-    python openmm_collective.py --full    2700 atoms, as in docs/openmm_collective.md
+    python openmm_collective.py --quick --out DIR   a short run
+    python openmm_collective.py --out DIR           2700 atoms, as in docs/openmm_collective.md
 
 Times are processor times of one thread, in runs that take turns; only their ratios mean something.
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import os
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
+import harness
 import numpy as np
 import openmm
-import study_scripts as scripts
+import pandas as pd
 from openmm import app, unit
-from rich.console import Console
-from rich.table import Table
 
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 
 
-def measure_collective(full: bool = False) -> dict[str, Any]:
-    """Steps a second with rows between oxygens of rigid water, relative to VerletIntegrator.
-
-    Returns
-    -------
-    dict
-        'title', 'atoms' and 'rows': name -> {'ms', 'ratio', 'residual'}, milliseconds a step, relative speed, and the
-        largest |sigma| in nm at the end.
-    """
+def in_water(full: bool) -> Iterator[dict[str, Any]]:
+    """Steps with rows between oxygens of rigid water: time, speed of VerletIntegrator's, largest |sigma| in nm."""
     edge, cutoff = (3.0, 0.9) if full else (1.9, 0.8)
     field = app.ForceField("tip3p.xml")
     box = app.Modeller(app.Topology(), [])
@@ -85,21 +77,13 @@ def measure_collective(full: bool = False) -> dict[str, Any]:
         contexts[name] = context
     steps, rounds = (50, 9) if full else (5, 3)
     calls = {name: partial(integrator.step, steps) for name, (integrator, _, _) in runs.items()}
-    found = scripts.speeds(scripts.in_turn(calls, rounds), steps)
-    return {
-        "title": f"Distances held in rigid water, {len(x)} atoms, PME, 2 fs",
-        "atoms": len(x),
-        "rows": {
-            name: {
-                **found[name],
-                "residual": None if part is None else float(np.abs(part.residuals(contexts[name])).max()),
-            }
-            for name, (_, _, part) in runs.items()
-        },
-    }
+    found = harness.speeds(harness.in_turn(calls, rounds), steps)
+    for name, (_, _, part) in runs.items():
+        off = None if part is None else float(np.abs(part.residuals(contexts[name])).max())
+        yield {"part": "water", "integrator": name, "atoms": len(x), **found[name], "residual": off}
 
 
-def accuracy() -> dict[str, dict[str, float]]:
+def accuracy() -> Iterator[dict[str, Any]]:
     """Alanine dipeptide with all bonds, phi and psi held: errors after 8 fs in nm, by scheme."""
     pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
     x = np.array(pdb.positions.value_in_unit(unit.nanometer))
@@ -123,38 +107,39 @@ def accuracy() -> dict[str, dict[str, float]]:
         return positions, float(np.abs(rows.residuals(context)).max()), float(np.abs(rows.rates(context)).max())
 
     exact, _, _ = end("kahan-li6", 32)
-    table = {}
     for scheme, steps in (("rattle", (16, 32)), ("suzuki4", (8, 16)), ("kahan-li6", (4, 8))):
         coarse, fine = (end(scheme, n) for n in steps)
         errors = [float(np.abs(state[0] - exact).max()) for state in (coarse, fine)]
-        table[scheme] = {
+        yield {
+            "part": "accuracy",
+            "scheme": scheme,
             "error": errors[1],
             "order": float(np.log2(errors[0] / errors[1])),
             "sigma": fine[1],
             "slope": fine[2],
         }
-    return table
+
+
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    speed = {"ms": "{:.2f}", "ratio": "{:.2f}", "residual": "{:.1e}"}
+    reached = {"error": "{:.1e}", "order": "{:.2f}", "sigma": "{:.1e}", "slope": "{:.1e}"}
+    return {
+        "Distances held in rigid water, PME, 2 fs: ms a step, relative speed, |sigma| in nm": harness.shown(
+            table, "water", integrator="{}", atoms="{:.0f}", **speed
+        ),
+        "Alanine dipeptide, all bonds, phi, psi: error in nm, |sigma| in rad, |A v| in rad/ps": harness.shown(
+            table, "accuracy", scheme="{}", **reached
+        ),
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--full", action="store_true", help="2700 atoms, and more rows")
-    full = parser.parse_args().full
-    console = Console(width=100)
-
-    result = measure_collective(full)
-    table = Table("integrator", "ms a step", "relative speed", "|sigma| / nm", title=result["title"])
-    for name, row in result["rows"].items():
-        residual = "" if row["residual"] is None else f"{row['residual']:.1e}"
-        table.add_row(name, f"{row['ms']:.2f}", f"{row['ratio']:.2f}", residual)
-    console.print(table)
-
-    table = Table(
-        "scheme", "error / nm", "order", "|sigma| / rad", "|A v| ps/rad", title="Alanine dipeptide, all bonds, phi, psi"
+    harness.main(
+        "openmm_collective",
+        harness.options(__doc__, "openmm-collective"),
+        lambda chosen: {"water": partial(in_water, not chosen.quick), "accuracy": accuracy},
+        tables,
     )
-    for name, row in accuracy().items():
-        table.add_row(name, f"{row['error']:.1e}", f"{row['order']:.2f}", f"{row['sigma']:.1e}", f"{row['slope']:.1e}")
-    console.print(table)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,7 @@
 """What kcons' constraint solver does inside OpenMM: speed against CCMA, set-up, steps a second, and hard cases.
 
-    python openmm_constraints.py                  small systems, a minute
-    python openmm_constraints.py --full --out F   everything, five minutes; F receives JSON
-    python openmm_constraints.py --full --steps F --out F   the speed of steps again, the rest kept
-    python openmm_constraints.py --show F         the tables of an earlier result
+    python openmm_constraints.py --quick --out DIR   small systems, a minute
+    python openmm_constraints.py --out DIR           everything, five minutes
 
 One process, one thread, CPU platform. Times are processor times of the process, taken in turn, and ratios are medians
 over the turns, so that they hold on a shared machine.
@@ -18,19 +16,19 @@ os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 import argparse
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
 import openmm
-import study_scripts as scripts
+import pandas as pd
 from openmm import app, unit
-from rich.console import Console
 
 from kcons import ConstraintSet
-from kcons.comparison import environment, json_files, processor_of, system_of
+from kcons.comparison import system_of
 from kcons.constraints import Distance
 from kcons.errors import KconsError
 from kcons.motion import Motion
@@ -144,8 +142,8 @@ def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, re
         "rows": held.n_rows,
         "tolerance": tolerance,
         **{f"{key}_ns": float(np.median(values)) for key, values in samples.items()},
-        "p_ratio": scripts.ratio(samples["ccma_p"], samples["p"]),
-        "v_ratio": scripts.ratio(samples["ccma_v"], samples["v"]),
+        "p_ratio": harness.ratio(samples["ccma_p"], samples["p"]),
+        "v_ratio": harness.ratio(samples["ccma_v"], samples["v"]),
         "ccma_error": float(np.max(np.abs(held.value(theirs)) / held.scale)),
         "error": error,
         "ccma_velocity_error": float(np.abs(rate @ tangent.ravel()).max()),
@@ -204,7 +202,7 @@ def speeds(name: str, times: dict[str, list[float]], steps: int) -> dict:
     return {
         "name": name,
         "ms_a_step": {label: 1e3 * float(np.median(t)) / steps for label, t in times.items()},
-        "ratio": {label: scripts.ratio(times["VerletIntegrator"], t) for label, t in times.items()},
+        "ratio": {label: harness.ratio(times["VerletIntegrator"], t) for label, t in times.items()},
     }
 
 
@@ -246,7 +244,7 @@ def steps_in_water(molecules: int, rows: tuple[int, ...], steps: int, repeats: i
         one = openmm.XmlSerializer.clone(system)
         part = hold(one, Distance(pairs_in_water(start, count)), start)
         add(f"{count} carried", ProjectedIntegrator(0.001, parts=[part]), one, part)
-    times = scripts.in_turn(calls, repeats)
+    times = harness.in_turn(calls, repeats)
     for _, part in keep:
         if part is not None:
             part.check(_)
@@ -270,7 +268,7 @@ def steps_in_dhfr(name: str, tolerance: float, steps: int, repeats: int, **optio
         integrator.step(3)
         keep.append(context)
         calls[label] = lambda integrator=integrator: integrator.step(steps)
-    times = scripts.in_turn(calls, repeats)
+    times = harness.in_turn(calls, repeats)
     part.check(keep[-1])
     return speeds(f"DHFR AllBonds, {name}, {tolerance:g}", times, steps)
 
@@ -398,108 +396,73 @@ def run_builtin(x: np.ndarray, masses: np.ndarray, pairs: list, off: float, step
 # -- all of it ------------------------------------------------------------------------------------
 
 
-def run(full: bool, console: Console, kept: dict | None = None) -> dict:
-    """All measurements; or, with an earlier result, only the speed of steps."""
-    result: dict[str, Any] = kept or {"machine": environment(), "full": full}
-    result["machine"]["versions"]["openmm"] = openmm.__version__
-    result["steps_machine"] = environment()
+def one(part: str, measure: Callable[[], dict]) -> Iterator[dict[str, Any]]:
+    """One row; of whole steps one for each integrator."""
+    found = measure()
+    if part != "steps":
+        yield {"part": part, **found}
+        return
+    for name, ms in found["ms_a_step"].items():
+        yield {"part": part, "name": found["name"], "integrator": name, "ms": ms, "speed": found["ratio"][name]}
 
-    def each(key: str, jobs: list[Callable[[], dict]]) -> None:
-        result[key] = []
-        for job in jobs:
-            result[key].append(job())
-            console.print(f"{key}: {result[key][-1]}", soft_wrap=True)
 
-    solvers: list[Callable[[], dict]] = [lambda: solver("chain, 300 bonds", *chain(300), 1e-10, 7)]
-    setups = [lambda: setup("chain, 300 bonds", lambda: chain(300))]
-    if full:
-        solvers = [
-            lambda: solver("DHFR AllBonds", *dhfr(app.AllBonds), 1e-10, 101),
-            lambda: solver("DHFR AllBonds", *dhfr(app.AllBonds), 1e-6, 101),
-            lambda: solver("DHFR HAngles", *dhfr(app.HAngles), 1e-10, 51),
-            lambda: solver("freely jointed chain, 10000 bonds", *chain(10_000), 1e-10, 51),
-        ]
-        setups = [
-            lambda: setup("DHFR HAngles", lambda: dhfr(app.HAngles)),
-            lambda: setup("chain, 100000 bonds", lambda: chain(100_000)),
-        ]
-    if kept is None:
-        each("solver", solvers)
-        each("setup", setups)
-    if full:
-        steps: list[Callable[[], dict]] = [lambda: steps_in_water(900, (1, 20), 50, 11)]
+def hard(case: str) -> dict[str, Any]:
+    ours, theirs = (run(*hard_cases()[case]) for run in (run_carried, run_builtin))
+    return {"name": case, "kcons": ours.get("refused") or ours["error"], "OpenMM": theirs["raised"] or theirs["error"]}
+
+
+def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
+    jobs: list[tuple[str, str, Callable[[], dict]]] = []
+    if chosen.quick:
+        jobs.append(("solver", "chain", lambda: solver("chain, 300 bonds", *chain(300), 1e-10, 7)))
+        jobs.append(("setup", "chain", lambda: setup("chain, 300 bonds", lambda: chain(300))))
+        jobs.append(("steps", "water", lambda: steps_in_water(64, (1, 5), 5, 3)))
+        cases = ["methane, 10 distances", "collinear, 3"]
+    else:
+        for name, kind, tolerance, repeats in (
+            ("DHFR AllBonds", app.AllBonds, 1e-10, 101),
+            ("DHFR AllBonds", app.AllBonds, 1e-6, 101),
+            ("DHFR HAngles", app.HAngles, 1e-10, 51),
+        ):
+            job = lambda n=name, k=kind, t=tolerance, r=repeats: solver(n, *dhfr(k), t, r)  # noqa: E731
+            jobs.append(("solver", f"{name}, {tolerance:g}", job))
+        far = "freely jointed chain, 10000 bonds"
+        jobs.append(("solver", far, lambda: solver(far, *chain(10_000), 1e-10, 51)))
+        jobs.append(("setup", "DHFR", lambda: setup("DHFR HAngles", lambda: dhfr(app.HAngles))))
+        jobs.append(("setup", "chain", lambda: setup("chain, 100000 bonds", lambda: chain(100_000))))
+        jobs.append(("steps", "water", lambda: steps_in_water(900, (1, 20), 50, 11)))
         vacuum = {"nonbondedMethod": app.NoCutoff}
         solvent = {"nonbondedMethod": app.CutoffNonPeriodic, "nonbondedCutoff": 2.0 * unit.nanometer, "obc": True}
         for name, options, count in (("vacuum", vacuum, 50), ("implicit solvent", solvent, 10)):
-            steps += [partial(steps_in_dhfr, name, tolerance, count, 11, **options) for tolerance in (1e-10, 1e-6)]
-    else:
-        steps = [lambda: steps_in_water(64, (1, 5), 5, 3)]
-    each("steps", steps)
-    if kept is not None:
-        return result
-    cases = {name: c for name, c in hard_cases().items() if full or name in ("methane, 10 distances", "collinear, 3")}
-    result["hard"] = [{"name": name, "kcons": run_carried(*c), "OpenMM": run_builtin(*c)} for name, c in cases.items()]
-    return result
+            for tolerance in (1e-10, 1e-6):
+                job = partial(steps_in_dhfr, name, tolerance, count, 11, **options)
+                jobs.append(("steps", f"{name}, {tolerance:g}", job))
+        cases = list(hard_cases())
+    jobs += [("hard", case, partial(hard, case)) for case in cases]
+    return {f"{part}, {name}": partial(one, part, job) for part, name, job in jobs}
 
 
-def show(result: dict, console: Console) -> None:
-    table = scripts.table(
-        "The solver alone: OpenMM's CCMA and kcons on the same input, ns a row",
-        ("system", "rows", "tol", *("P CCMA", "P kcons", "ratio", "V CCMA", "V kcons", "ratio"), "CCMA", "kcons"),
-        {"system"},
-    )
-    table.add_row(*[""] * 9, "error", "error", end_section=True)
-    for r in result["solver"]:
-        table.add_row(
-            r["name"], f"{r['rows']:,}", f"{r['tolerance']:g}", f"{r['ccma_p_ns']:.0f}", f"{r['p_ns']:.0f}",
-            f"{r['p_ratio']:.1f}", f"{r['ccma_v_ns']:.0f}", f"{r['v_ns']:.0f}", f"{r['v_ratio']:.1f}",
-            f"{r['ccma_error']:.0e}", f"{r['error']:.0e}",
-        )  # fmt: skip
-    console.print(table)
-    headings = ("system", "rows", "CCMA", "rows given to kcons", "ratio", "moved over to kcons", "ratio")
-    table = scripts.table("From a System to a Context, s", headings, {"system"})
-    for r in result["setup"]:
-        table.add_row(
-            r["name"], f"{r['rows']:,}", f"{r['ccma_s']:.2f}", f"{r['given_s']:.3f}", f"{r['given_ratio']:.0f}",
-            f"{r['moved_s']:.3f}", f"{r['moved_ratio']:.0f}",
-        )  # fmt: skip
-    console.print(table)
-    title = "Speed of whole steps: milliseconds, and times VerletIntegrator's steps a second"
-    table = scripts.table(title, ("system", "integrator", "ms", "speed"), {"system", "integrator"})
-    for r in result["steps"]:
-        for k, (name, ms) in enumerate(r["ms_a_step"].items()):
-            table.add_row(r["name"] if k == 0 else "", name, f"{ms:.2f}", f"{r['ratio'][name]:.2f}")
-    console.print(table)
-    headings = ("distances held", "kcons", "OpenMM")
-    table = scripts.table("Hard cases: largest relative error of a distance over 500 steps", headings, headings)
-    for r in result["hard"]:
-        ours, theirs = r["kcons"], r["OpenMM"]
-        error = theirs["error"]
-        # Files hold null for NaN.
-        known = error is not None and np.isfinite(error)
-        bad = f"{error:.0e}" if known else f"NaN after {theirs['steps']} steps"
-        held = "refused: singular at this geometry" if "refused" in ours else f"{ours['error']:.0e}"
-        table.add_row(r["name"], held, theirs["raised"] or bad)
-    console.print(table)
-    machine, other = result["machine"], result["steps_machine"]
-    versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "openmm"))
-    console.print(
-        f"{processor_of(machine)}, one thread, CPU platform, processor time; {versions}; "
-        f"commit {machine['commit']}, {machine['date']}"
-    )
-    if other["commit"] != machine["commit"]:
-        console.print(f"Speed of whole steps: commit {other['commit']}, {other['date']}")
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    times = {name: "{:.0f}" for name in ("ccma_p_ns", "p_ns", "p_ratio", "ccma_v_ns", "v_ns", "v_ratio")}
+    made = {"ccma_s": "{:.2f}", "given_s": "{:.3f}", "given_ratio": "{:.0f}", "moved_s": "{:.3f}"}
+    return {
+        "The solver alone: OpenMM's CCMA and kcons on the same input, ns a row": harness.shown(
+            table, "solver", name="{}", rows="{:.0f}", tolerance="{:g}", **times, ccma_error="{:.0e}", error="{:.0e}"
+        ),
+        "From a System to a Context, s": harness.shown(
+            table, "setup", name="{}", rows="{:.0f}", **made, moved_ratio="{:.0f}"
+        ),
+        "Speed of whole steps: milliseconds, and times VerletIntegrator's steps a second": harness.shown(
+            table, "steps", name="{}", integrator="{}", ms="{:.2f}", speed="{:.2f}"
+        ),
+        "Hard cases: largest relative error of a distance over 500 steps": harness.shown(
+            table, "hard", name="{}", kcons="{}", OpenMM="{}"
+        ),
+    }
 
 
 def main() -> None:
-    console = Console(width=150)
-    parser = scripts.options(__doc__, full="all systems")
-    parser.add_argument("--steps", type=Path, help="an earlier result, in which the speed of steps is measured again")
-
-    def measure(options: argparse.Namespace) -> dict:
-        return run(options.full, console, json_files.read(options.steps) if options.steps else None)
-
-    scripts.script(parser, measure, lambda result: show(result, console))
+    harness.main("openmm_constraints", harness.options(__doc__, "openmm-constraints"), pieces, tables)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """Heavy hydrogens at 4 fs in OpenMM: what the integrators sample, what temperature they report, how energy drifts.
 
-    python openmm_heavy_hydrogens.py                     short runs
-    python openmm_heavy_hydrogens.py --full --out F      the committed results, some five minutes
-    python openmm_heavy_hydrogens.py --show F            the tables of an earlier run
+    python openmm_heavy_hydrogens.py --quick --out DIR   short runs
+    python openmm_heavy_hydrogens.py --out DIR           what docs/openmm_models.md shows, some five minutes
 
 Alanine dipeptide (amber14, no cutoff) with hydrogens of 3 dalton, each atom in a weak well, so that no momentum is
 conserved; Reference platform, 300 K. Energies of bonds and angles are configurational averages. The reported
@@ -13,17 +12,17 @@ kick. Standard errors are from 20 blocks, those of the drift from independent ru
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
 import openmm
-import study_scripts as scripts
+import pandas as pd
 from openmm import app, unit
-from rich.console import Console
 
-from kcons.comparison import environment
 from kcons.openmm import (
     Isokinetic,
     Langevin,
@@ -34,6 +33,7 @@ from kcons.openmm import (
     positions_of,
     velocities_of,
 )
+from kcons.thermostats.correlated_series import slope
 
 PDB = Path(__file__).resolve().parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"
 TEMPERATURE, FRICTION, HEAVY = 300.0, 5.0, 3.0
@@ -199,72 +199,54 @@ def drift(
             integrator.step(25)
             energies.append(sum(energy(context)))
         t = np.arange(len(energies)) * 1e-4
-        slopes.append(scripts.slope(t, np.array(energies) / (KT * freedom))[0])
+        slopes.append(slope(t, np.array(energies) / (KT * freedom))[0])
     return {"slope": float(np.mean(slopes)), "error": float(np.std(slopes, ddof=1) / np.sqrt(runs))}
 
 
-# -- output -----------------------------------------------------------------------------------------
+# -- the study --------------------------------------------------------------------------------------
 
 
-def measured(chosen: argparse.Namespace) -> dict[str, Any]:
-    parts = {}
-    warm_up = 5000 if chosen.full else 200
-    for constraints, runs in RUNS.items():
-        if not chosen.full:
-            runs = [run for run in runs if run[1] == 4][:2]
-        system, x = alanine(constraints)
-        start = start_of(system, x, 1, warm_up)
-        omega = harmonic(system, x)
-        parts[constraints] = {
-            "freedom": len(omega),
-            "shortest period": float(2e3 * np.pi / omega.max()),
-            "expected": float(TEMPERATURE * (1 - np.mean((omega * 0.004) ** 2) / 4)),
-            "runs": [
-                {"name": name, "fs": fs, **sample(system, start, name, 1e-3 * fs, 1000.0 if chosen.full else 4.0)}
-                for name, fs in runs
-            ],
-            "drift": {
-                name: drift(system, x, make, warm_up, *((250.0, 4) if chosen.full else (2.0, 2)))
-                for name, make in CONSERVING.items()
-            },
-        }
-    return {"machine": environment(), "full": chosen.full, "parts": parts}
+def rows(constraints: str, full: bool) -> Iterator[dict[str, Any]]:
+    """Averages of runs from one start, and drifts of the integrators that conserve energy."""
+    warm_up = 5000 if full else 200
+    system, x = alanine(constraints)
+    start = start_of(system, x, 1, warm_up)
+    omega = harmonic(system, x)
+    yield {
+        "part": "harmonic",
+        "constraints": constraints,
+        "shortest_fs": float(2e3 * np.pi / omega.max()),
+        "expected_K": float(TEMPERATURE * (1 - np.mean((omega * 0.004) ** 2) / 4)),
+    }
+    for name, fs in RUNS[constraints] if full else [run for run in RUNS[constraints] if run[1] == 4][:2]:
+        found = sample(system, start, name, 1e-3 * fs, 1000.0 if full else 4.0)
+        flat = {f"{key}{'_error' if what == 'error' else ''}": v for key, m in found.items() for what, v in m.items()}
+        yield {"part": "runs", "constraints": constraints, "integrator": name, "fs": fs, **flat}
+    for name, make in CONSERVING.items():
+        found = drift(system, x, make, warm_up, *((250.0, 4) if full else (2.0, 2)))
+        yield {"part": "drift", "constraints": constraints, "integrator": name, **found}
 
 
-def show(result: dict[str, Any]) -> None:
-    console = Console(width=120)
-
-    def told(found: dict[str, float], digits: int = 1) -> str:
-        return f"{found['mean']:.{digits}f} ± {found['error']:.{digits}f}"
-
-    for constraints, part in result["parts"].items():
-        rows = [
-            (
-                run["name"],
-                f"{run['fs']}",
-                told(run["bonds"], 2),
-                told(run["angles"], 2),
-                told(run["reported"]),
-                told(run["half"]) if run["half"] != run["reported"] else "",
-            )
-            for run in part["runs"]
-        ]
-        if constraints == "AllBonds":
-            rows = [(*row[:2], "", *row[3:]) for row in rows]
-        headings = ("integrator", "fs", "U bonds, kJ/mol", "U angles, kJ/mol", "reported, K", "after half a kick, K")
-        console.print(scripts.table(f"{constraints}, 3 dalton, 300 K", headings, {"integrator"}, rows))
-        console.print(
-            f"shortest period {part['shortest period']:.1f} fs; harmonic, velocities at the ends of steps of 4 fs: "
-            f"{part['expected']:.1f} K"
-        )
-        for name, found in part["drift"].items():
-            console.print(f"{name}, 4 fs: drift {found['slope']:+.1e} ± {found['error']:.0e} kT/ns/dof")
-    machine = result["machine"]
-    console.print(f"OpenMM {machine['versions']['openmm']}; {machine['date']}")
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    means = {f"{key}{end}": "{:.2f}" for key in ("bonds", "angles", "reported", "half") for end in ("", "_error")}
+    return {
+        "3 dalton, 300 K: energies in kJ/mol, temperatures in K": harness.shown(
+            table, "runs", constraints="{}", integrator="{}", fs="{:g}", **means
+        ),
+        "Harmonic, velocities at the ends of steps of 4 fs": harness.shown(
+            table, "harmonic", constraints="{}", shortest_fs="{:.1f}", expected_K="{:.1f}"
+        ),
+        "Drift at 4 fs, kT/ns/dof": harness.shown(
+            table, "drift", constraints="{}", integrator="{}", slope="{:+.1e}", error="{:.0e}"
+        ),
+    }
 
 
 def main() -> None:
-    scripts.script(scripts.options(__doc__, full="runs of 1 ns"), measured, show)
+    def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
+        return {constraints: partial(rows, constraints, not chosen.quick) for constraints in RUNS}
+
+    harness.main("openmm_heavy_hydrogens", harness.options(__doc__, "heavy-hydrogens"), pieces, tables)
 
 
 if __name__ == "__main__":

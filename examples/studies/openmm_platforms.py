@@ -1,9 +1,8 @@
 """OpenMM's platforms and precisions: what kcons costs there, how closely it holds, and how the energy drifts.
 
-    python openmm_platforms.py                           short runs on the CPU
-    python openmm_platforms.py --platform "CUDA mixed" --full --out F   the committed results
-    python openmm_platforms.py --platform "OpenCL mixed" --drift 10 --starts 3 --out F   of villin in water
-    python openmm_platforms.py --show F                  the tables of an earlier run
+    python openmm_platforms.py --quick --out DIR         short runs on the CPU
+    python openmm_platforms.py --platform "CUDA mixed" --out DIR   what docs/openmm_platforms.md shows
+    python openmm_platforms.py --platform "OpenCL mixed" --drift 10 --starts 3 --out DIR   of villin in water
 
 Speeds are medians of runs that take turns, relative to openmm.VerletIntegrator at the same tolerance of the
 constraints. The drift is the slope of the total energy at 2 fs, in kT a nanosecond and degree of freedom, with its
@@ -15,19 +14,19 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
 import openmm
-import study_scripts as scripts
+import pandas as pd
 from openmm import app, unit
-from rich.console import Console
 
-from kcons.comparison import environment, processor_of
 from kcons.openmm import Isokinetic, Langevin, Precision, ProjectedIntegrator, RattleIntegrator, positions_of
+from kcons.thermostats.correlated_series import slope
 
 DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 TEMPERATURE, FRICTION, STEP = 300.0, 1.0, 0.002
@@ -120,12 +119,13 @@ def drift(integrator: openmm.Integrator, context: openmm.Context, picoseconds: f
         energies.append(total_energy(context))
     t = np.arange(samples) * every * STEP * 1e-3
     y = np.array(energies) / (0.00831446261815324 * TEMPERATURE * freedom)
-    slope, error = scripts.slope(t, y)
-    return {"slope": slope, "error": error, "picoseconds": samples * every * STEP}
+    found = slope(t, y)
+    return {"slope": found.value, "error": found.error, "picoseconds": samples * every * STEP}
 
 
-def on_platform(title: str, system: openmm.System, positions: Any, place: str, full: bool) -> dict[str, Any]:
+def on_platform(title: str, make: Callable[[], Any], place: str, full: bool) -> Iterator[dict[str, Any]]:
     """Speed, residual and drift of all integrators on one System and platform."""
+    system, positions = make()
     start = start_of(system, positions, place, 2000 if full else 20)
     freedom = 3 * system.getNumParticles() - system.getNumConstraints() - 3
     integrators = {name: make() for name, make in INTEGRATORS.items()}
@@ -141,21 +141,18 @@ def on_platform(title: str, system: openmm.System, positions: Any, place: str, f
         contexts[name].getState(energy=True)
 
     calls = {name: partial(call, name) for name in integrators}
-    rows: dict[str, dict[str, Any]] = scripts.speeds(scripts.in_turn(calls, rounds, clock=time.perf_counter), steps)
-    for name, row in rows.items():
-        row["residual"] = residual(system, positions_of(contexts[name]))
+    held = Precision.of(next(iter(contexts.values())))
+    about = {"part": "speed", "system": title, "atoms": system.getNumParticles(), "precision": str(held)}
+    for name, row in harness.speeds(harness.in_turn(calls, rounds, clock=time.perf_counter), steps).items():
+        off = residual(system, positions_of(contexts[name]))
+        moved: dict[str, float] = {}
         if name in CONSERVING:
             contexts[name].setState(start)
-            row["drift"] = drift(integrators[name], contexts[name], 100.0 if full else 0.1, freedom)
-    held = Precision.of(next(iter(contexts.values())))
-    return {
-        "title": f"{title}, {system.getNumParticles()} atoms, {held}, tolerance {held.tolerance:g}",
-        "steps": steps,
-        "rows": rows,
-    }
+            moved = drift(integrators[name], contexts[name], 100.0 if full else 0.1, freedom)
+        yield {**about, "tolerance": held.tolerance, "integrator": name, **row, "residual": off, **moved}
 
 
-def drifts(place: str, pdb: Path, picoseconds: float, starts: int) -> dict[str, Any]:
+def drifts(place: str, pdb: Path, picoseconds: float, starts: int) -> Iterator[dict[str, Any]]:
     """Drift and residual of those at constant energy, from the same starts.
 
     The error of a mean over starts is the larger of what blocks within the runs say and what the scatter says.
@@ -171,67 +168,56 @@ def drifts(place: str, pdb: Path, picoseconds: float, starts: int) -> dict[str, 
             context.setState(start)
             slope = drift(integrator, context, picoseconds, freedom)
             done.append(slope | {"residual": residual(system, positions_of(context))})
-    rows: dict[str, dict[str, Any]] = {}
+    held = Precision.of(context)
+    system_name = "Villin" if pdb == VILLIN else pdb.stem
+    about = {"part": "drift", "system": system_name, "atoms": system.getNumParticles(), "precision": str(held)}
     for name, done in runs.items():
         slopes, errors = (np.array([run[key] for run in done]) for key in ("slope", "error"))
         blocks = np.sqrt(np.sum(errors**2)) / starts
         scatter = slopes.std(ddof=1) / np.sqrt(starts) if starts > 1 else 0.0
         mean = {"slope": float(slopes.mean()), "error": float(max(blocks, scatter)), "picoseconds": picoseconds}
-        rows[name] = {"drift": mean, "residual": max(run["residual"] for run in done), "runs": done}
-    held = Precision.of(context)
-    name = "Villin" if pdb == VILLIN else pdb.stem
-    title = f"{name} in water, HBonds, {system.getNumParticles()} atoms, {held}, tolerance {held.tolerance:g}"
-    return {"title": f"{title}, {starts} x {picoseconds:g} ps", "rows": rows}
+        off = max(run["residual"] for run in done)
+        yield {**about, "integrator": name, "starts": starts, "residual": off, **mean}
 
 
-# -- output -----------------------------------------------------------------------------------------
+# -- the study --------------------------------------------------------------------------------------
 
 
-def show(result: dict[str, Any]) -> None:
-    console = Console(width=120)
-    timed = ("µs a step", "speed, of Verlet")
-    for part in result["measurements"]:
-        rows = []
-        for name, row in part["rows"].items():
-            drifting = row.get("drift")
-            slope = f"{drifting['slope']:+.1e} ± {drifting['error']:.0e}" if drifting else ""
-            times = (f"{1e3 * row['ms']:.0f}", f"{row['ratio']:.2f}") if "ms" in row else ()
-            rows.append((name, *times, f"{row['residual']:.0e}", slope))
-        headings = ("integrator", *(timed if times else ()), "largest residual", "drift, kT/ns/dof")
-        console.print(scripts.table(part["title"], headings, {"integrator"}, rows))
-    machine = result["machine"]
-    console.print(
-        f"{result['device'] or processor_of(machine)}; OpenMM {machine['versions']['openmm']}; {machine['date']}"
-    )
-
-
-def measured(chosen: argparse.Namespace) -> dict[str, Any]:
-    places = chosen.platform or ["CPU"]
-    about = {"machine": environment(), "device": chosen.device}
-    if chosen.drift:
-        runs = [drifts(place, chosen.pdb or VILLIN, chosen.drift, chosen.starts) for place in places]
-        return about | {"full": chosen.drift >= 10, "measurements": runs}
-    systems = [("Rigid water", *water(3.0 if chosen.full else 1.9))]
+def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
+    full, found = not chosen.quick, {}
+    systems: dict[str, Callable[[], Any]] = {"Rigid water": partial(water, 3.0 if full else 1.9)}
     if chosen.pdb:
-        systems += [
-            (f"{chosen.pdb.stem}, {held}", *protein(chosen.pdb, getattr(app, held))) for held in ("HBonds", "AllBonds")
-        ]
-    runs = [
-        on_platform(title, system, positions, place, chosen.full)
-        for place in places
-        for title, system, positions in systems
-    ]
-    return about | {"full": chosen.full, "measurements": runs}
+        for held in ("HBonds", "AllBonds"):
+            systems[f"{chosen.pdb.stem}, {held}"] = partial(protein, chosen.pdb, getattr(app, held))
+    for place in chosen.platform or ["CPU"]:
+        if chosen.drift:
+            found[place] = partial(drifts, place, chosen.pdb or VILLIN, chosen.drift, chosen.starts)
+        else:
+            found |= {
+                f"{place}, {name}": partial(on_platform, name, make, place, full) for name, make in systems.items()
+            }
+    return found
+
+
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    about = {"system": "{}", "precision": "{}", "integrator": "{}"}
+    moved = {"residual": "{:.0e}", "slope": "{:+.1e}", "error": "{:.0e}"}
+    return {
+        "ms a step, speed of Verlet's, largest residual, drift in kT/ns/dof": harness.shown(
+            table, "speed", **about, ms="{:.3f}", ratio="{:.2f}", **moved
+        ),
+        "Largest residual, drift in kT/ns/dof": harness.shown(table, "drift", **about, **moved),
+    }
 
 
 def main() -> None:
-    parser = scripts.options(__doc__, full="the sizes of the committed results")
+    parser = harness.options(__doc__, "openmm-platforms")
     parser.add_argument("--platform", action="append", help="such as CPU or 'CUDA mixed'; may be given several times")
     parser.add_argument("--pdb", type=Path, help="a solvated protein to be measured as well")
     parser.add_argument("--device", default="", help="the name of the processor, where that is a GPU")
     parser.add_argument("--drift", type=float, metavar="PS", help="only the drift, over so many picoseconds")
     parser.add_argument("--starts", type=int, default=1, help="with --drift: so many runs of each integrator")
-    scripts.script(parser, measured, show)
+    harness.main("openmm_platforms", parser, pieces, tables)
 
 
 if __name__ == "__main__":

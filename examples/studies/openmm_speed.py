@@ -1,8 +1,7 @@
 """OpenMM with kcons' integrators: what they cost, and what they reach for it.
 
-    python openmm_speed.py                  short runs, a minute
-    python openmm_speed.py --full --out F   the committed results; F receives JSON
-    python openmm_speed.py --show F         the tables of an earlier run
+    python openmm_speed.py --quick --out DIR   short runs, a minute
+    python openmm_speed.py --out DIR           what docs/openmm.md shows
 
 Times are medians of processor times, one thread, of runs that take turns, so that a busy machine slows all of them
 alike: only their ratios mean something. Errors are those of positions against a converged trajectory.
@@ -10,22 +9,20 @@ alike: only their ratios mean something. Errors are those of positions against a
 
 from __future__ import annotations
 
-import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
+import harness
 import numpy as np
 import openmm
-import study_scripts as scripts
+import pandas as pd
 from openmm import app, unit
-from rich.console import Console
 
-from kcons.comparison import environment, processor_of
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
@@ -82,10 +79,10 @@ def race(
         context.setVelocitiesToTemperature(300, 1)
         integrators[name].step(steps)
     calls = {name: partial(integrator.step, steps) for name, integrator in integrators.items()}
-    return scripts.speeds(scripts.in_turn(calls, repeats), steps)
+    return harness.speeds(harness.in_turn(calls, repeats), steps)
 
 
-def plain_water(full: bool) -> dict[str, Any]:
+def plain_water(full: bool) -> Iterator[dict[str, Any]]:
     """The RATTLE form against VerletIntegrator."""
     system, positions = water(3.0 if full else 2.0)
     integrators = {
@@ -96,14 +93,11 @@ def plain_water(full: bool) -> dict[str, Any]:
         "kcons geodesic": ProjectedIntegrator(0.002, "geodesic"),
     }
     rows = race(system, positions, integrators, 10, 50 if full else 5)
-    return {
-        "title": f"Rigid water, {system.getNumParticles()} atoms, PME, 2 fs",
-        "atoms": system.getNumParticles(),
-        "rows": rows,
-    }
+    for name, row in rows.items():
+        yield {"part": "water", "integrator": name, "atoms": system.getNumParticles(), **row}
 
 
-def work_and_precision(full: bool) -> dict[str, Any]:
+def work_and_precision(full: bool) -> Iterator[dict[str, Any]]:
     """Error after 48 fs against force evaluations per ps."""
     system, positions = alanine()
     duration = 0.048
@@ -140,12 +134,9 @@ def work_and_precision(full: bool) -> dict[str, Any]:
             evaluations = SCHEMES[scheme]().force_evaluations / dt * 1e3
             rows.setdefault(scheme, []).append({"fs": dt, "error_nm": error, "evaluations_per_ps": evaluations})
     needed = {scheme: evaluations_at(points, 5e-7) for scheme, points in rows.items()}
-    return {
-        "title": "Alanine dipeptide, all bonds held: error after 48 fs",
-        "schemes": rows,
-        "evaluations_per_ps_at_5e-7_nm": needed,
-        "fewer_than_rattle": {scheme: needed["rattle"] / value for scheme, value in needed.items()},
-    }
+    for scheme, points in rows.items():
+        for point in points:
+            yield {"part": "precision", "scheme": scheme, **point, "fewer": needed["rattle"] / needed[scheme]}
 
 
 def evaluations_at(points: list[dict[str, float]], error: float) -> float:
@@ -156,50 +147,28 @@ def evaluations_at(points: list[dict[str, float]], error: float) -> float:
     return float(np.exp(offset + slope * np.log(error)))
 
 
-#: One function a measurement; each returns what `show` prints and the JSON file keeps.
-MEASUREMENTS: dict[str, Callable[[bool], dict[str, Any]]] = {
-    "plain water": plain_water,
-    "work and precision": work_and_precision,
-}
-
-
-# -- output -----------------------------------------------------------------------------------------
-
-
-def show(result: dict[str, Any], console: Console) -> None:
-    for measured in result["measurements"].values():
-        if "rows" in measured:
-            headings = ("integrator", "ms a step", "steps a second, relative")
-            table = scripts.table(measured["title"], headings, {"integrator"})
-            for name, row in measured["rows"].items():
-                table.add_row(name, f"{row['ms']:.3f}", f"{row['ratio']:.2f}")
-        else:
-            headings = ("scheme", "step/fs", "error/nm", "force evaluations/ps", "fewer than RATTLE at 5e-7 nm")
-            table = scripts.table(measured["title"], headings, {"scheme"})
-            for scheme, points in measured["schemes"].items():
-                for k, p in enumerate(points):
-                    fewer = f"{measured['fewer_than_rattle'][scheme]:.1f} ×" if k == 0 else ""
-                    name = scheme if k == 0 else ""
-                    table.add_row(name, f"{p['fs']:g}", f"{p['error_nm']:.1e}", f"{p['evaluations_per_ps']:.0f}", fewer)
-        console.print(table)
-    machine = result["machine"]
-    console.print(
-        f"{processor_of(machine)}, one thread; OpenMM {machine['versions']['openmm']}; "
-        f"commit {machine['commit']}, {machine['date']}"
-    )
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    points = {"fs": "{:g}", "error_nm": "{:.1e}", "evaluations_per_ps": "{:.0f}", "fewer": "{:.1f} ×"}
+    return {
+        "Rigid water, PME, 2 fs: ms a step, steps a second relative to the first": harness.shown(
+            table, "water", integrator="{}", atoms="{:.0f}", ms="{:.3f}", ratio="{:.2f}"
+        ),
+        "Alanine dipeptide, all bonds: error after 48 fs; fewer: evaluations than RATTLE at 5e-7 nm": harness.shown(
+            table, "precision", scheme="{}", **points
+        ),
+    }
 
 
 def main() -> None:
-    console = Console(width=120)
-    parser = scripts.options(__doc__, full="the sizes of the committed results")
-    parser.add_argument("--only", choices=[*MEASUREMENTS], help="one measurement")
-
-    def measure(options: argparse.Namespace) -> dict[str, Any]:
-        chosen = {options.only: MEASUREMENTS[options.only]} if options.only else MEASUREMENTS
-        measured = {name: measurement(options.full) for name, measurement in chosen.items()}
-        return {"machine": environment(), "full": options.full, "measurements": measured}
-
-    scripts.script(parser, measure, lambda result: show(result, console))
+    harness.main(
+        "openmm_speed",
+        harness.options(__doc__, "openmm-speed"),
+        lambda chosen: {
+            "plain water": partial(plain_water, not chosen.quick),
+            "work and precision": partial(work_and_precision, not chosen.quick),
+        },
+        tables,
+    )
 
 
 if __name__ == "__main__":

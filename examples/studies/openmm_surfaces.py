@@ -1,8 +1,7 @@
 """Particles on surfaces in OpenMM: how exact, and how fast against VerletIntegrator of the same particles set free.
 
-    python openmm_surfaces.py                  few particles, seconds
-    python openmm_surfaces.py --full --out F   1000 particles, minutes; F receives JSON
-    python openmm_surfaces.py --show F         the tables of a file
+    python openmm_surfaces.py --quick --out DIR   few particles, seconds
+    python openmm_surfaces.py --out DIR           1000 particles, minutes
 
 Speed: liquid argon (density 0.8, reduced), each atom on a surface of its own through its place in the lattice; one
 thread, the two integrators in turn, medians of the processor time a step.
@@ -13,18 +12,18 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from pathlib import Path
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
+import harness
 import numpy as np
 import openmm
+import pandas as pd
 from openmm import unit
-from rich.console import Console
-from rich.table import Table
 
-from kcons.comparison import environment, json_files, processor_of
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm import SCHEMES, ExpressionSurface, SurfaceIntegrator
 
@@ -88,7 +87,8 @@ def started(system: openmm.System, integrator: openmm.Integrator, x: np.ndarray)
     return context
 
 
-def speed(kind: str, scheme: str, compiled: bool, n: int, cutoff: float, repeats: int, steps: int) -> dict[str, Any]:
+def speed(kind: str, scheme: str, compiled: bool, cutoff: float, full: bool) -> Iterator[dict[str, Any]]:
+    n, repeats, steps = (1000, 15, 60) if full else (64, 3, 20)
     system, x = argon(n, cutoff)
     free = openmm.VerletIntegrator(0.002)
     free_context = started(system, free, x)
@@ -109,7 +109,9 @@ def speed(kind: str, scheme: str, compiled: bool, n: int, cutoff: float, repeats
     across = np.abs(np.einsum("ij,ij->i", part.normals(x_now), v)) / np.linalg.norm(v, axis=1)
     verlet, ours = np.median(times, axis=0)
     del free_context
-    return {
+    yield {
+        "part": "speed",
+        "particles": n,
         "kind": kind,
         "scheme": scheme,
         "compiled": compiled,
@@ -147,73 +149,46 @@ def pendulum(scheme: str, steps: int, duration: float) -> np.ndarray:
     return _state(context)[0]
 
 
-def precision(duration: float) -> list[dict[str, Any]]:
+def precision(duration: float) -> Iterator[dict[str, Any]]:
     exact = pendulum("blanes-moan6", 400, duration)
-    rows = []
     for scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan4", "blanes-moan6"):
         evaluations = SCHEMES[scheme]().force_evaluations
         for number in (100, 200, 400):
             steps = number // evaluations
             error = float(np.abs(pendulum(scheme, steps, duration) - exact).max())
-            rows.append({"scheme": scheme, "evaluations": steps * evaluations, "error": error})
-    return rows
+            yield {"part": "precision", "scheme": scheme, "evaluations": steps * evaluations, "error": error}
 
 
-def run(full: bool) -> dict[str, Any]:
-    n, repeats, steps = (1000, 15, 60) if full else (64, 3, 20)
-    result: dict[str, Any] = {"machine": environment(), "full": full, "particles": n, "speed": []}
-    for cutoff in CUTOFFS if full else CUTOFFS[1:2]:
-        for compiled in (False, True):
-            result["speed"].append(speed("spheres", "rattle", compiled, n, cutoff, repeats, steps))
-        result["speed"].append(speed("spheres", "geodesic", False, n, cutoff, repeats, steps))
-    for kind in KINDS[1:]:
-        for compiled in (False, True) if kind in QUADRICS else (False,):
-            result["speed"].append(speed(kind, "rattle", compiled, n, 1.0, repeats, steps))
-    result["precision"] = precision(4.0)
-    return result
+def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
+    full = not chosen.quick
+    cases = [
+        ("spheres", *case, cutoff)
+        for cutoff in (CUTOFFS if full else CUTOFFS[1:2])
+        for case in (("rattle", False), ("rattle", True), ("geodesic", False))
+    ]
+    cases += [
+        (kind, "rattle", compiled, 1.0)
+        for kind in KINDS[1:]
+        for compiled in ((False, True) if kind in QUADRICS else (False,))
+    ]
+    found: dict[str, Any] = {", ".join(map(str, case)): partial(speed, *case, full) for case in cases}
+    return {**found, "pendulum": partial(precision, 4.0)}
 
 
-def show(result: dict[str, Any], console: Console) -> None:
-    table = Table(title=f"{result['particles']} argon atoms on surfaces: processor time a step, one thread")
-    for name in ("surfaces", "scheme", "cutoff/nm", "Verlet/µs", "held/µs", "ratio", "off/nm", "across"):
-        table.add_column(name, justify="left" if name in ("surfaces", "scheme") else "right")
-    for row in result["speed"]:
-        table.add_row(
-            row["kind"] + (", compiled" if row["compiled"] else ""),
-            row["scheme"],
-            f"{row['cutoff_nm']:g}",
-            f"{row['verlet_us']:.0f}",
-            f"{row['ours_us']:.0f}",
-            f"{row['ratio']:.2f}",
-            f"{row['off_nm']:.0e}",
-            f"{row['across']:.0e}",
-        )
-    console.print(table)
-    table = Table(title="Spherical pendulum: error at t = 4")
-    table.add_column("scheme")
-    for label in ("100", "200", "400"):
-        table.add_column(f"{label} forces", justify="right")
-    for scheme in dict.fromkeys(row["scheme"] for row in result["precision"]):
-        table.add_row(scheme, *(f"{row['error']:.0e}" for row in result["precision"] if row["scheme"] == scheme))
-    console.print(table)
-    machine = result["machine"]
-    console.print(
-        f"{processor_of(machine)}, one thread; OpenMM {machine['versions']['openmm']}; commit {machine['commit']}, "
-        f"{machine['date']}"
-    )
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    columns = {"cutoff_nm": "{:g}", "verlet_us": "{:.0f}", "ours_us": "{:.0f}", "ratio": "{:.2f}", "off_nm": "{:.0e}"}
+    return {
+        "Argon atoms on surfaces: processor time a step, one thread": harness.shown(
+            table, "speed", kind="{}", compiled="{}", scheme="{}", **columns, across="{:.0e}"
+        ),
+        "Spherical pendulum: error at t = 4": harness.shown(
+            table, "precision", scheme="{}", evaluations="{:.0f}", error="{:.0e}"
+        ),
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--show", type=Path)
-    arguments = parser.parse_args()
-    console = Console(width=110)
-    result = json_files.read(arguments.show) if arguments.show else run(arguments.full)
-    show(result, console)
-    if arguments.out:
-        json_files.write(arguments.out, result)
+    harness.main("openmm_surfaces", harness.options(__doc__, "openmm-surfaces"), pieces, tables)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
 """Relaxed torsion scans: the profile of a molecule, and what it costs beside geomeTRIC and Sella.
 
-    python relaxed_scan.py                 seconds: H2O2 by EMT, both ways
-    python relaxed_scan.py --full --out F  minutes: 20 molecules by GFN2-xTB, what docs/scans.md shows
-    python relaxed_scan.py --show F        the tables of an earlier result
+    python relaxed_scan.py --quick --out DIR   seconds: H2O2 by EMT, both ways
+    python relaxed_scan.py --out DIR           minutes: 20 molecules by GFN2-xTB, what docs/scans.md shows
 
-With --full (needs tblite, geometric and sella, from the package index) every torsion is scanned at 24 values. Each of
+In full (needs tblite, geometric and sella, from the package index) every torsion is scanned at 24 values. Each of
 the three programs relaxes each point from the same structure, that of the neighbouring point with the group beyond the
 bond turned, until no force along the constraint is larger than FMAX on any atom; geomeTRIC's other criteria are off,
 all else is left as its authors set it. Counted are calls of energy and forces. Energies are compared with those that
@@ -20,23 +19,21 @@ import logging
 import os
 import tempfile
 import warnings
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from importlib import metadata
-from multiprocessing import get_context
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import harness
 import numpy as np
-import study_scripts as scripts
+import pandas as pd
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 
 from kcons.ase import Constraints
-from kcons.comparison import environment
 from kcons.constraints import Dihedral
 from kcons.free_energy import Scan, scan
 
@@ -239,58 +236,47 @@ def compared(name: str) -> dict[str, Any]:
     return result
 
 
-def profile() -> dict[str, Any]:
+def rows(name: str) -> Iterator[dict[str, Any]]:
+    """A row a program."""
+    found = compared(name)
+    about = {"part": "programs", "molecule": name, "barrier": found["barrier"], "failures": found["failures"]}
+    for program, calls in found["calls"].items():
+        yield {**about, "program": program, "calls": calls, "off": found["off"].get(program)}
+    yield {**about, "program": "kcons, both ways", **found["both ways"]}
+
+
+def profile() -> Iterator[dict[str, Any]]:
     """H2O2 by EMT."""
     atoms = molecule("H2O2")
     atoms.calc = EMT()
     found: Scan = scan(atoms, Dihedral([[2, 0, 1, 3]]), np.radians(np.arange(0, 360, 30)), fmax=FMAX)
     energies = (found.energies - found.energies.min()) * KJ
+    for point, energy in zip(found.grid.points, energies.tolist(), strict=True):
+        angle = found.grid.shown(point)[0]
+        yield {"part": "profile", "degrees": angle, "energy": energy, "calls": found.evaluations}
+
+
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    if "program" not in table:
+        return {
+            "H2O2 by EMT, kJ/mol": harness.shown(table, "profile", degrees="{:.0f}", energy="{:.3f}", calls="{:.0f}")
+        }
+    columns = {"program": "{}", "calls": "{:.0f}", "off": "{:.4f}"}
     return {
-        "degrees": [found.grid.shown(point)[0] for point in found.grid.points],
-        "energies": energies.tolist(),
-        "calls": found.evaluations,
-        "relaxations": len(found.attempts),
+        f"{POINTS} points, forces to {FMAX} eV/Å: calls by GFN2-xTB; how far energies are off, kJ/mol": harness.shown(
+            table, "programs", molecule="{}", barrier="{:.2f}", **columns
+        ),
+        "All": table.groupby("program", sort=False).calls.sum().reset_index(),
     }
-
-
-def run(full: bool, workers: int) -> dict[str, Any]:
-    result: dict[str, Any] = {"full": full, "machine": environment(), "fmax": FMAX, "points": POINTS}
-    if not full:
-        return {**result, "profile": profile()}
-    result["versions"] = {name: metadata.version(name) for name in ("tblite", "geometric", "sella")}
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        result["molecules"] = list(pool.map(compared, MOLECULES))
-    return result
-
-
-def show(result: dict[str, Any]) -> None:
-    if "profile" in result:
-        found = result["profile"]
-        print(f"H2O2 by EMT: {found['relaxations']} relaxations, {found['calls']} calls of energy and forces")
-        for angle, energy in zip(found["degrees"], found["energies"], strict=True):
-            print(f"{angle:6.0f} degrees {energy:9.3f} kJ/mol")
-        return
-    print(f"{result['points']} points, forces to {result['fmax']} eV/angstrom; calls of energy and forces by GFN2-xTB,")
-    print("and how far energies are off, in kJ/mol: kcons, geomeTRIC, Sella")
-    print("molecule       barrier  kcons  geomeTRIC  Sella  its scan   off                     both ways")
-    for r in result["molecules"]:
-        calls = r["calls"]
-        off = " ".join(f"{r['off'][name]:7.4f}" for name in ("kcons", "geomeTRIC", "Sella"))
-        print(
-            f"{r['molecule']:13s} {r['barrier']:8.2f} {calls['kcons']:6d} {calls['geomeTRIC']:10d} {calls['Sella']:6d} "
-            f"{calls[SCAN]:9d} {off} {r['both ways']['calls']:8d}"
-        )
-    totals = {
-        name: sum(r["calls"][name] for r in result["molecules"]) for name in ("kcons", "geomeTRIC", "Sella", SCAN)
-    }
-    print(f"all: {totals}")
-    print(f"{result['machine']['date']}, {result['versions']}")
 
 
 def main() -> None:
-    parser = scripts.options(__doc__, full="20 molecules, beside geomeTRIC and Sella")
-    parser.add_argument("--workers", type=int, default=1, help="molecules at a time (default 1)")
-    scripts.script(parser, lambda options: run(options.full, options.workers), show)
+    harness.main(
+        "relaxed_scan",
+        harness.options(__doc__, "relaxed-scan"),
+        lambda chosen: {"H2O2": profile} if chosen.quick else {name: partial(rows, name) for name in MOLECULES},
+        tables,
+    )
 
 
 if __name__ == "__main__":

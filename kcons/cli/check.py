@@ -110,7 +110,7 @@ def _check(chosen: argparse.Namespace) -> int:
 
 
 def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
-    from kcons.comparison.averages import trajectory_temperatures
+    from kcons.comparison import trajectory_temperatures
 
     if result.violated:
         return ["no temperatures of the configurations: frames are off the constraints; say what the run held"]

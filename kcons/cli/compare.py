@@ -1,4 +1,4 @@
-"""`kcons compare`: how much error each method makes, for how much time; thermostats; long steps."""
+"""`kcons compare`: how much error each method makes, for how much time; averages at a temperature."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from kcons.cli import listing, long_steps
+from kcons.cli import listing
 from kcons.cli.parser import Parser
 from kcons.cli.systems import check_name, molecules, owner, test_system
-from kcons.cli.terminal import console, names, numbers, rendered, say_written, show
+from kcons.cli.terminal import console, names, numbers
 from kcons.errors import InputError
 
-#: Options by what can be run.
-OF_FLUIDS = frozenset({"size", "seed", "dt", "methods", "out", "quick", "budget", "criterion"})
-OF_STEPS_OF_FLUIDS = OF_FLUIDS - {"criterion"} | {"slow", "fast"}
-OF_STEPS_OF_FILES = OF_STEPS_OF_FLUIDS - {"size"} | {"coordinates", "constrain", "select", "rigid_residues", "platform"}
+#: Options that go with expensive and cheap forces.
+WITH_CHEAP_FORCES = frozenset(
+    {"seed", "dt", "methods", "out", "quick", "budget", "resume", "criterion", "slow", "fast", "coordinates"}
+    | {"constrain", "select", "rigid_residues", "platform"}
+)
 #: Options that results depend on, beside the system, the budget and what is said about molecules.
 SETTINGS = ("size", "seed", "quick", "dt")
 #: Steps of a production run that are looked at, in fs.
@@ -48,7 +49,7 @@ def add(commands: Any, common: Parser) -> None:
     compare.add_argument(
         "--out",
         type=Path,
-        help="folder for compare.csv, .png and .txt (default ./compare-SYSTEM, with --fast ./compare-SYSTEM-steps)",
+        help="folder for compare.csv, .png and .txt (default ./compare-SYSTEM, for averages ./compare-SYSTEM-averages)",
     )
     compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
     compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
@@ -62,96 +63,50 @@ def add(commands: Any, common: Parser) -> None:
     compare.add_argument(
         "--criterion",
         choices=("error", "drift", "temperature"),
-        help="what methods are ranked by: error of the trajectory (default), drift of the energy; for thermostats the "
-        "temperature of the configurations",
+        help="what methods are ranked by: error of the trajectory (default), drift of the energy; temperature runs "
+        "thermostats instead, and looks at the temperature of the configurations",
     )
-    long_steps.add(compare)
+    compare.add_argument("--slow", metavar="FORCES", help="of a file: expensive forces, as in --forces, with --fast")
+    compare.add_argument(
+        "--fast", metavar="FORCES", help="and cheap ones: how long may the step be? (--slow gfn2 --fast amber14-all)"
+    )
     compare.set_defaults(run=run, of=compare)
 
 
 def run(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return listing.of_everything()
-    from kcons.comparison import test_systems
-
-    budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
-    folder: Path = chosen.out or Path(f"compare-{Path(chosen.scene or '').stem}")
-    if chosen.dt is not None and not chosen.dt:
-        raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
-    if chosen.slow is not None or chosen.fast is not None:
-        known = OF_STEPS_OF_FLUIDS if chosen.scene in test_systems.FLUIDS else OF_STEPS_OF_FILES
-        chosen.of.take_only(chosen, known, "does not go with --slow and --fast; leave it out")
-        check_name(chosen)
-        folder = chosen.out or folder.with_name(f"{folder.name}-steps")  # beside what compares trajectories
-        return long_steps.run(chosen, budget, folder)
-    if chosen.scene in test_systems.FLUIDS:
-        return _thermostats(chosen, budget, folder)
-    return _trajectories(chosen, budget, folder)
-
-
-def _trajectories(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
-    target: float | None = chosen.target_error
-    if target is not None and not (target > 0 and isfinite(target)):
-        raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
-    if chosen.criterion == "temperature":
-        from kcons.comparison import test_systems
-
-        raise InputError(
-            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}, whose averages are known. For a file "
-            "kcons compare FILE says which step is right for averages; of a run, kcons check TRAJECTORY --topology "
-            "FILE --forces ... tells",
-            item="criterion",
-        )
-    if chosen.criterion == "drift" and target is not None:
-        raise InputError("--target-error is an error of trajectories; leave --criterion drift out", item="criterion")
     from kcons.cli.progress import Bars
-    from kcons.comparison import measure, methods, ranking, report
+    from kcons.comparison import report
     from kcons.steppers.files import ResultFolder, in_one_piece
 
-    methods.choose(chosen.methods)  # complain before any work
-    check_name(chosen)
-    asked = _asked(chosen, budget)
-    names = [f"compare.{kind}" for kind in ("csv", "png", "txt")]
-    results = ResultFolder(folder, names[0], {"asked": {"system": asked["system"]}}, names, "a comparison")
+    temperature = _asks_for_averages(chosen)  # complain before any work
+    budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
+    named = f"compare-{Path(chosen.scene).stem}" + ("-averages" if temperature else "")
+    folder: Path = chosen.out or Path(named)
+    asked = _asked(chosen, budget, temperature)
+    files = [f"compare.{kind}" for kind in ("csv", "png", "txt")]
+    results = ResultFolder(folder, files[0], {"asked": {"system": asked["system"]}}, files, "a comparison")
     results.refuse_others()
-    path = folder / names[0]
+    path = folder / files[0]
     done = _earlier(path, asked) if chosen.resume else None
+
+    def keep(table: Any) -> None:
+        table.attrs["asked"] = asked
+        report.write_csv(path, table)
+
     with results.taken(), Bars() as watcher:
         if done is None:  # what an earlier run left is not what --resume is to go on from
-            for name in names:
+            for name in files:
                 (folder / name).unlink(missing_ok=True)
-        with watcher.piece("building the test system", 1):
-            system = test_system(chosen, quick=chosen.quick)
-        if chosen.dt is not None:
-            system = system.with_time_steps(chosen.dt)
-        reference = measure.reference_of(system, watcher)
-
-        def keep(table: Any) -> None:
-            table.attrs["asked"] = asked
-            report.write_csv(path, table)
-
-        options: dict[str, Any] = {
-            "budget": budget,
-            "rounds": 1 if chosen.quick else measure.ROUNDS,
-            "reference": reference,
-        }
+        options = {"budget": budget, "done": done, "keep": keep, "watcher": watcher}
         try:
-            table = measure.compare(system, chosen.methods, **options, done=done, keep=keep, watcher=watcher)
+            table, words = (_averages if temperature else _trajectories)(chosen, options)
         except KeyboardInterrupt:
             if path.is_file():
                 print(f"kcons: --resume goes on from what is in {path}", file=sys.stderr)
             raise
-        if target is not None:
-            rows = ranking.find_steps(system, table, target, reference, budget=budget, watcher=watcher)
-            table = measure.table_of([*table.to_dict("records"), *rows], table.attrs)
-        production = _production(chosen, system, budget, watcher)
         keep(table)
-        found = ranking.rank(table, chosen.criterion or "error", target)
-        code = ""
-        if found is not None and len(found.table):
-            best = found.table.iloc[0]
-            code = methods.code(system, best.method, best.setting, _expression(chosen))
-        words = report.text(table, found, code, production)
         with in_one_piece(folder / "compare.txt") as file:
             file.write(f"{words}\n".encode())
         with in_one_piece(folder / "compare.png") as file:
@@ -161,9 +116,94 @@ def _trajectories(chosen: argparse.Namespace, budget: float, folder: Path) -> in
     return 0
 
 
-def _asked(chosen: argparse.Namespace, budget: float) -> dict[str, Any]:
+def _asks_for_averages(chosen: argparse.Namespace) -> bool:
+    """Whether averages are compared, and not trajectories.
+
+    Raises
+    ------
+    InputError
+        Options that are wrong or do not go together.
+    """
+    from kcons.comparison import methods
+
+    target, forces = chosen.target_error, (chosen.slow, chosen.fast)
+    if chosen.dt is not None and not chosen.dt:
+        raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
+    if target is not None and not (target > 0 and isfinite(target)):
+        raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
+    averages = chosen.criterion == "temperature" or any(forces)
+    if target is not None and (averages or chosen.criterion == "drift"):
+        other = "--slow and --fast" if any(forces) else f"--criterion {chosen.criterion}"
+        raise InputError(f"--target-error is an error of trajectories; leave {other} out", item="criterion")
+    if not averages:
+        methods.choose(chosen.methods)
+        check_name(chosen)
+        return False
+    from kcons.comparison.averages import choose_samplers
+
+    choose_samplers(chosen.methods, any(forces))
+    if any(forces):
+        chosen.of.take_only(chosen, WITH_CHEAP_FORCES, "does not go with --slow and --fast; leave it out")
+        if chosen.criterion in ("error", "drift"):
+            raise InputError("--criterion does not go with --slow and --fast; leave it out", item="criterion")
+        for name in ("slow", "fast"):
+            if getattr(chosen, name) is None:
+                other = {"slow": "fast", "fast": "slow"}[name]
+                what = {"slow": "expensive", "fast": "cheap"}[name]
+                raise InputError(f"--{other} needs --{name}: give the {what} forces, too", item=name)
+        if chosen.slow == chosen.fast:
+            raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
+        if chosen.scene is None or not Path(chosen.scene).is_file():
+            raise InputError(f"--slow and --fast are for files, not for {chosen.scene!r}", item="scene")
+    check_name(chosen)
+    return True
+
+
+def _trajectories(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[Any, str]:
+    """The table of a test system through methods, and what is said of it."""
+    from kcons.comparison import measure, methods, ranking, report
+
+    budget, watcher = options["budget"], options["watcher"]
+    with watcher.piece("building the test system", 1):
+        system = test_system(chosen, quick=chosen.quick)
+    if chosen.dt is not None:
+        system = system.with_time_steps(chosen.dt)
+    reference = measure.reference_of(system, watcher)
+    rounds = 1 if chosen.quick else measure.ROUNDS
+    table = measure.compare(system, chosen.methods, rounds=rounds, reference=reference, **options)
+    if chosen.target_error is not None:
+        rows = ranking.find_steps(system, table, chosen.target_error, reference, budget=budget, watcher=watcher)
+        table = measure.table_of([*table.to_dict("records"), *rows], table.attrs)
+    production = _production(chosen, system, budget, watcher)
+    found = ranking.rank(table, chosen.criterion or "error", chosen.target_error)
+    code = ""
+    if found is not None and len(found.table):
+        best = found.table.iloc[0]
+        code = methods.code(system, best.method, best.setting, _expression(chosen))
+    return table, report.text(table, found, code, production)
+
+
+def _averages(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[Any, str]:
+    """The table of a test system through thermostats, and what is said of it."""
+    from kcons.comparison import averages, ranking, report
+
+    with options["watcher"].piece("building the test system", 1):
+        both = [argparse.Namespace(**{**vars(chosen), "forces": name}) for name in (chosen.slow, chosen.fast) if name]
+        system, *cheap = [test_system(each, quick=chosen.quick) for each in both or [chosen]]
+    given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt, "seed": chosen.seed}
+    table = averages.compare_averages(system, chosen.methods, **given, **options)
+    found = ranking.rank(table, "temperature")
+    code = ""
+    if found is not None and len(found.table):
+        best = found.table.iloc[0]
+        code = averages.code(system, best.method, best.setting, best.friction, _expression(chosen))
+    return table, report.text(table, found, code)
+
+
+def _asked(chosen: argparse.Namespace, budget: float, averages: bool) -> dict[str, Any]:
     """What the rows of a table depend on."""
     settings = {name: getattr(chosen, name) for name in SETTINGS}
+    settings |= {"averages": True, "slow": chosen.slow, "fast": chosen.fast} if averages else {}
     return {"system": owner(chosen.scene), **settings, "budget": budget, **molecules(chosen)}
 
 
@@ -222,55 +262,3 @@ def _literal(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     return f"[{', '.join(map(_literal, value))}]" if isinstance(value, list) else repr(value)
-
-
-def _thermostats(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
-    """Averages of a fluid at a temperature."""
-    if chosen.target_error is not None:
-        raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
-    if chosen.criterion not in (None, "temperature"):
-        raise InputError(
-            f"--criterion {chosen.criterion} is for trajectories; thermostats are ranked by temperature",
-            item="criterion",
-        )
-    from kcons.cli.progress import Bars
-    from kcons.comparison import test_systems
-    from kcons.comparison.averages import ranking, sampling
-    from kcons.comparison.averages import report as sampling_report
-    from kcons.comparison.study import report_files
-
-    sampling.chosen(chosen.methods)  # complain before any work
-    check_name(chosen)
-    chosen.of.take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
-    system = owner(chosen.scene)
-    results = report_files.results(folder, "compare", system)
-    results.refuse_others()
-    fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
-    if chosen.dt is not None:
-        fluid = fluid.with_time_steps(chosen.dt)
-    folder.mkdir(parents=True, exist_ok=True)
-    with Bars() as watcher:
-        result = sampling.compare(
-            fluid,
-            methods=chosen.methods,
-            budget=budget,
-            seed=chosen.seed,
-            watcher=watcher,
-            settings={
-                "system": system,
-                "size": chosen.size,
-                "seed": chosen.seed,
-                "quick": chosen.quick,
-                "dt": chosen.dt,
-            },
-            partial=True,
-        )
-    table, explained = sampling_report.table(result), sampling_report.explanation(result)
-    first = list(filter(None, [ranking.text(result)]))
-    terminal = console()
-    for words in first:
-        terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
-    show(table, explained, terminal)
-    with results.taken():
-        say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
-    return 130 if "interrupted" in result.settings else 0

@@ -10,8 +10,7 @@ if TYPE_CHECKING:
 
 def of_everything() -> int:
     """Print the names of test systems and methods."""
-    from kcons.comparison import methods, test_systems
-    from kcons.comparison.averages import long_steps, sampling
+    from kcons.comparison import averages, methods, test_systems
 
     print("test systems")
     for name, entry in test_systems.SYSTEMS.items():
@@ -21,15 +20,9 @@ def of_everything() -> int:
     print("methods")
     for name, method in methods.METHODS.items():
         print(f"  {name:<27} {method.title}{_when(method)}")
-    print("test systems at a temperature, whose averages are compared")
-    for name, entry in test_systems.FLUIDS.items():
-        print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
-    titles = {name: thermostat.title for name, thermostat in sampling.METHODS.items()}
-    steps = {name: method_of_steps.title for name, method_of_steps in long_steps.METHODS.items()}
-    for heading, named in (("thermostats for these", titles), ("long steps (--slow, --fast)", steps)):
-        print(heading)
-        for name, title in named.items():
-            print(f"  {name:<21} {title}")
+    print("thermostats (--criterion temperature)")
+    for name, sampler in averages.SAMPLERS.items():
+        print(f"  {name:<21} {sampler.title}{' (--slow, --fast)' if sampler.several else ''}")
     return 0
 
 

@@ -6,7 +6,6 @@ import argparse
 from typing import Any
 
 from kcons.cli import listing
-from kcons.cli.compare import OF_FLUIDS
 from kcons.cli.parser import Parser
 from kcons.cli.systems import check_name, molecules, test_system
 from kcons.errors import InputError
@@ -32,12 +31,6 @@ def run(chosen: argparse.Namespace) -> int:
     given = molecules(chosen)
     if test_systems.is_other_file(chosen.scene) and test_systems.by_mdanalysis(chosen.scene, given):
         return plan_file(chosen, given)
-    if chosen.scene in test_systems.FLUIDS:
-        chosen.of.take_only(chosen, OF_FLUIDS, "is not for fluids; leave it out")
-        fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed)
-        print(fluid.title)
-        print(fluid.motion.report(fluid.positions))
-        return 0
     system = test_system(chosen)
     print(system.title)
     print(system.motion.report(system.positions, system.velocities))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def check_name(chosen: argparse.Namespace) -> None:
     from kcons.comparison import test_systems
 
-    known = ", ".join((*test_systems.SYSTEMS, *test_systems.FLUIDS))
+    known = ", ".join(test_systems.SYSTEMS)
     if chosen.scene is None:
         raise InputError(f"name a test system: {known}; or a PDB file", item="scene")
     if test_systems.is_file(chosen.scene) or test_systems.is_other_file(chosen.scene):
@@ -25,10 +25,10 @@ def check_name(chosen: argparse.Namespace) -> None:
             raise InputError(f"there is no file {chosen.scene}", item="scene")
         if chosen.size is not None:
             raise InputError("a file has the size it has; leave --size out", item="size")
-    elif chosen.scene not in test_systems.SYSTEMS and chosen.scene not in test_systems.FLUIDS:
+    elif chosen.scene not in test_systems.SYSTEMS:
         raise InputError(
             f"there is no test system {chosen.scene!r}"
-            f"{did_you_mean(chosen.scene, (*test_systems.SYSTEMS, *test_systems.FLUIDS))}; "
+            f"{did_you_mean(chosen.scene, test_systems.SYSTEMS)}; "
             f"there are {known}; or give a PDB file",
             item="scene",
         )

@@ -5,9 +5,9 @@
 - `runs`, `methods`: everything that runs them
 - `measure`: a test system through methods, a row a method and setting
 - `ranking`, `report`: what follows from the table, and what is shown of it
-- `averages`: thermostats and the averages they give
+- `averages`: a test system through thermostats and long steps, a row a run
 - `production`: which step is right for averages
-- `study`: files and tables of averages
+- `trajectory_temperatures`: temperatures of configurations along a trajectory of any engine
 """
 
 from importlib import import_module
@@ -15,24 +15,16 @@ from typing import Any
 
 from kcons.errors import with_extra
 
-#: Names by the module that has them, or that they are; imported when they are asked for.
+#: Names by the module that has them; imported when they are asked for.
 _NAMES = {
-    "averages.layers": ("layers",),
-    "averages.long_steps": ("long_steps",),
-    "averages.long_steps_report": ("long_steps_report",),
-    "averages.sampling": ("sampling",),
-    "averages.step_zero": ("extrapolate",),
-    "averages.volumes": ("volumes",),
+    "averages": ("AVERAGES", "SAMPLERS", "add_sampler", "compare_averages"),
     "machine": ("environment", "processor_of"),
     "measure": ("COLUMNS", "compare"),
     "methods": ("METHODS", "Method", "add_method", "code"),
     "ranking": ("Ranking", "find_steps", "observed_orders", "rank"),
     "report": ("figure", "read_csv", "text", "write_csv"),
     "runs": ("Run",),
-    "study.json_files": ("json_files",),
-    "test_systems": ("Reference", "TestSystem"),
-    "test_systems.fluid": ("Fluid", "fluid"),
-    "test_systems.lennard_jones": ("LennardJones",),
+    "test_systems": ("Reference", "TestSystem", "add_system"),
     "test_systems.openmm_engine": ("system_of",),
     "test_systems.potential": ("Potential", "PotentialCalculator"),
     "test_systems.system": ("ASE_UNITS",),
@@ -48,7 +40,7 @@ def __getattr__(name: str) -> Any:
                 found = import_module(f"{__name__}.{module}")
             except ModuleNotFoundError as error:
                 raise with_extra(error, f"{__name__}.{name}") from error
-            return found if module.rpartition(".")[2] == name else getattr(found, name)
+            return getattr(found, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

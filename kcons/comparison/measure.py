@@ -138,9 +138,9 @@ def compare(
     return table_of(rows, {**about, "margin": timing.time(rows)})
 
 
-def table_of(rows: list[dict[str, Any]], about: dict[str, Any]) -> pd.DataFrame:
+def table_of(rows: list[dict[str, Any]], about: dict[str, Any], columns: Iterable[str] = COLUMNS) -> pd.DataFrame:
     """Rows as a table with all columns."""
-    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    table = pd.DataFrame(rows, columns=list(columns))
     table["note"] = table["note"].astype(object).fillna("")
     table.attrs = about
     return table
@@ -163,8 +163,7 @@ def described(system: TestSystem, reference: Reference) -> dict[str, Any]:
         "long_time": units.long_time,
         "forces": system.potential.name,
         "force_seconds": force_seconds(system),
-        "error_is": "distance an atom" if system.shortfall is None else "energy above the optimum",
-        "error_unit": units.length if system.shortfall is None else units.energy,
+        "error_unit": units.length,
         "reference": reference.how,
         "reference_error": reference.error,
         "environment": environment(),
@@ -192,6 +191,12 @@ def force_seconds(system: TestSystem) -> float:
             times.append(perf_counter() - now)
         found.append(times[0] - times[1])
     return max(0.0, float(np.median(found[1:] or found)))
+
+
+def processor_clock(system: TestSystem) -> Callable[[], float]:
+    """Processor time; wall time where forces are computed on a GPU, for which the processor waits."""
+    gpu = system.openmm is not None and system.openmm.platform not in ("Reference", "CPU")
+    return perf_counter if gpu else process_time
 
 
 def warm_up(system: TestSystem, methods: Iterable[Method], budget: float) -> None:
@@ -423,9 +428,7 @@ class Rounds:
 
     def __init__(self, system: TestSystem, least: int, limit: float, patience: float, watcher: Watcher) -> None:
         self.system, self.least, self.limit, self.patience, self.watcher = system, least, limit, patience, watcher
-        gpu = system.openmm is not None and system.openmm.platform not in ("Reference", "CPU")
-        #: On a GPU the processor waits.
-        self.clock = perf_counter if gpu else process_time
+        self.clock = processor_clock(system)
 
     def time(self, rows: list[dict[str, Any]]) -> float | None:
         """Put medians into rows of short runs; by how much such medians differ, or None."""

@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from string import Template
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from scipy.linalg import qr
 
 from kcons import steppers
-from kcons.comparison.runs import InAse, InOpenMM, OfSciPy, OfStates, OnArrays, Run, ase_constraints
+from kcons.comparison.runs import InAse, InOpenMM, OfSciPy, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 Start = Callable[[TestSystem, float], Run]
 #: A test system to the reason why a method cannot run it; None if it can.
 Refuses = Callable[[TestSystem], str | None]
-#: A test system, a step as text (or a tolerance) and the number of steps to lines of Python.
-Code = Callable[[TestSystem, str, int], list[str]]
+#: Lines of Python with $made_by (the test system), $step, $steps, and $ps (the step in ps); or a test system to them.
+Code = str | Callable[[TestSystem], str]
 
 Kind = Literal["trajectory", "baseline", "thermostat"]
 ENGINES = ("arrays", "ASE", "OpenMM")
@@ -50,7 +51,6 @@ class Method:
     adaptive: bool
     kind: Kind
     usual: bool
-    friction: bool
     refuses_too: Refuses
     code: Code | None
 
@@ -66,8 +66,6 @@ class Method:
 
     def refuses(self, system: TestSystem) -> str | None:
         """Why it cannot run a test system, or None."""
-        if system.friction and self.holds and not self.friction:
-            return "it has no friction"
         if self.engine == "OpenMM":
             if find_spec("openmm") is None:
                 return "OpenMM is not installed; python -m pip install openmm"
@@ -98,7 +96,6 @@ def add_method(
     adaptive: bool = False,
     kind: Kind = "trajectory",
     usual: bool = True,
-    friction: bool = False,
     refuses: Refuses = lambda system: None,
     code: Code | None = None,
 ) -> Method:
@@ -122,12 +119,11 @@ def add_method(
         A baseline holds nothing, and only its cost is stated. Of a thermostat no error of a trajectory can be stated.
     usual : bool
         Whether it runs unless methods are named.
-    friction : bool
-        Whether it can run test systems with friction.
     refuses : callable, optional
         Test system to the reason why the method cannot run it, or None.
-    code : callable, optional
-        Test system, step as text and number of steps to lines of Python that run it.
+    code : str or callable, optional
+        Lines of Python that run it, with $made_by (an expression that makes the test system), $step (or the tolerance),
+        $steps and $ps (the step in ps); or a test system to them.
 
     Raises
     ------
@@ -141,7 +137,7 @@ def add_method(
     if not (isinstance(force_evaluations, int) and force_evaluations >= 1):
         raise InputError(f"force_evaluations is {force_evaluations!r}; give 1 or more", item="force_evaluations")
     METHODS[name] = made = Method(
-        name, title or name, start, engine, force_evaluations, adaptive, kind, usual, friction, refuses, code
+        name, title or name, start, engine, force_evaluations, adaptive, kind, usual, refuses, code
     )
     return made
 
@@ -190,7 +186,7 @@ def _at_home(method: Method, home: bool) -> bool:
     return method.engine == "OpenMM" if home else method.engine != "OpenMM" or method.name in GUESTS
 
 
-def _step(system: TestSystem, dt: float) -> str:
+def _step(dt: float) -> str:
     """A time step as text, with all digits: steps divide the horizon."""
     return repr(float(f"{dt:.15g}"))
 
@@ -212,17 +208,42 @@ STEPPERS: dict[str, type[steppers.Stepper]] = {
 #: Those that run unless methods are named: the plain one, and of each order a composition and a splitting.
 USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
-_ON_ARRAYS = (
-    "test_system = MADE_BY",
-    "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions",
-    "system = System(motion, test_system.potential.forces)  # a function of positions and time",
-    "start = State(test_system.positions, test_system.velocities)",
+_ON_ARRAYS = """\
+from kcons import Motion, State, System$run
+from kcons.comparison import test_systems
+from kcons.steppers import $stepper
+
+test_system = $made_by
+motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions
+system = System(motion, test_system.potential.forces)  # a function of positions and time
+start = State(test_system.positions, test_system.velocities)
+"""
+_BY_STEPPER = _ON_ARRAYS.replace("$run", ", run") + "end = run(system, start, $step, $steps, stepper=$stepper())\n"
+_BY_EXTRAPOLATION = (
+    _ON_ARRAYS.replace("$run", "").replace("$stepper", "Extrapolation")
+    + """\
+for end in Extrapolation($step).states(system, start, until=test_system.horizon):
+    pass  # each state is the end of a step
+"""
 )
+_BY_DYNAMICS = """\
+from ase import units
+
+from kcons.ase import ConstrainedDynamics
+from kcons.comparison import test_systems
+from kcons.steppers import $stepper
+
+test_system = $made_by
+atoms = test_system.atoms()  # yours, with a calculator and velocities
+held = test_system.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]
+dynamics = ConstrainedDynamics(atoms, $step * units.fs, $stepper(), constraints=held)
+dynamics.run($steps)
+"""
 
 
 def _system(system: TestSystem, held: ConstraintSet | None = None) -> System:
     motion = Motion(system.constraint_set if held is None else held, system.positions)
-    return System(motion, system.potential.forces, friction=system.friction)
+    return System(motion, system.potential.forces)
 
 
 def on_arrays(make: Callable[[float], steppers.Stepper], system: TestSystem, dt: float) -> Run:
@@ -238,29 +259,8 @@ def _nothing_held(system: TestSystem, dt: float) -> Run:
     return OnArrays(made, made.with_forces(State(system.positions, system.velocities)), Rattle(), dt)
 
 
-def _code_of_stepper(stepper: str, system: TestSystem, dt: str, steps: int) -> list[str]:
-    if system.units.energy == "eV":
-        return [
-            "from ase import units",
-            "",
-            "from kcons.ase import ConstrainedDynamics",
-            "from kcons.comparison import test_systems",
-            f"from kcons.steppers import {stepper}",
-            "",
-            "test_system = MADE_BY",
-            "atoms = test_system.atoms()  # yours, with a calculator and velocities",
-            "held = test_system.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]",
-            f"dynamics = ConstrainedDynamics(atoms, {dt} * units.fs, {stepper}(), constraints=held)",
-            f"dynamics.run({steps})",
-        ]
-    return [
-        "from kcons import Motion, State, System, run",
-        "from kcons.comparison import test_systems",
-        f"from kcons.steppers import {stepper}",
-        "",
-        *_ON_ARRAYS,
-        f"end = run(system, start, {dt}, {steps}, stepper={stepper}())",
-    ]
+def _code_of_stepper(stepper: str, system: TestSystem) -> str:
+    return (_BY_DYNAMICS if system.units.energy == "eV" else _BY_STEPPER).replace("$stepper", stepper)
 
 
 def _without_step(kind: type[steppers.Stepper]) -> Callable[[float], steppers.Stepper]:
@@ -277,7 +277,6 @@ for _name, _kind in STEPPERS.items():
         title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
         force_evaluations=_kind().force_evaluations,
         usual=_name in USUAL,
-        friction=True,
         code=partial(_code_of_stepper, _kind.__name__),
     )
 
@@ -288,7 +287,6 @@ add_method(
     title="kcons Baumgarte",
     force_evaluations=steppers.Baumgarte(rate=1.0).force_evaluations,
     usual=False,
-    friction=True,
 )
 
 
@@ -297,26 +295,7 @@ def _extrapolated(system: TestSystem, tolerance: float) -> Run:
     return OfStates(steppers.Extrapolation(tolerance).states(_system(system), start, system.horizon), start)
 
 
-def _code_of_extrapolation(system: TestSystem, tolerance: str, steps: int) -> list[str]:
-    return [
-        "from kcons import Motion, State, System",
-        "from kcons.comparison import test_systems",
-        "from kcons.steppers import Extrapolation",
-        "",
-        *_ON_ARRAYS,
-        f"for end in Extrapolation({tolerance}).states(system, start, until=test_system.horizon):",
-        "    pass  # each state is the end of a step",
-    ]
-
-
-add_method(
-    "extrapolation",
-    _extrapolated,
-    title="kcons Extrapolation",
-    adaptive=True,
-    friction=True,
-    code=_code_of_extrapolation,
-)
+add_method("extrapolation", _extrapolated, title="kcons Extrapolation", adaptive=True, code=_BY_EXTRAPOLATION)
 add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", kind="baseline")
 
 
@@ -354,7 +333,7 @@ class _Landing(OfSciPy):
             x = self.motion.project_positions(x, x, time=t)
             v = self.motion.project_velocities(x, v, time=t)
             # By less than the tolerance: the force known there need not be computed again.
-            f = self.last[0] - self.system.friction * self.system.masses[:, None] * v
+            f = self.last[0]
             self.solver.y = np.concatenate([x.ravel(), v.ravel()])
             self.solver.f = np.concatenate([v.ravel(), self.motion.acceleration(x, v, f, t).ravel()])
 
@@ -371,8 +350,6 @@ def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
     def rate(t: float, y: FloatArray) -> FloatArray:
         x, v = y.reshape(2, *shape)
         f = last[0] = system.potential.forces(x, t)
-        if system.friction:
-            f = f - system.friction * system.masses[:, None] * v
         return np.concatenate([y[n:], motion.acceleration(x, v, f, t).ravel()])
 
     # Errors are measured against one unit of length and the thermal speed, not against each entry.
@@ -383,40 +360,8 @@ def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
     return _Landing(solver, system, motion, last) if land else OfSciPy(solver, shape)
 
 
-def _code_of_dop853(system: TestSystem, rtol: str, steps: int) -> list[str]:
-    return [
-        "import numpy as np",
-        "from scipy.integrate import solve_ivp",
-        "",
-        "from kcons import Motion",
-        "from kcons.comparison import test_systems",
-        "",
-        "test_system = MADE_BY",
-        "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet, rows independent",
-        "",
-        "",
-        "def rate(t, y):",
-        "    x, v = y.reshape(2, -1, 3)",
-        "    return np.concatenate([v, motion.acceleration(x, v, test_system.potential.forces(x, t), t)]).ravel()",
-        "",
-        "",
-        "start = np.concatenate([test_system.positions, test_system.velocities]).ravel()",
-        "scale = np.repeat([1.0, np.sqrt(np.mean(test_system.velocities**2)) or 1.0], start.size // 2)",
-        f"options = dict(method='DOP853', rtol=max({rtol}, 1e-13), atol={rtol} * scale)",
-        "end = solve_ivp(rate, (0, test_system.horizon), start, **options)",
-        "assert end.success",
-    ]
-
-
-add_method(
-    "dop853",
-    partial(_dop853, False),
-    title="SciPy DOP853 on eq. 105",
-    adaptive=True,
-    friction=True,
-    code=_code_of_dop853,
-)
-add_method("dop853-projected", partial(_dop853, True), title="kcons + DOP853, projected", adaptive=True, friction=True)
+add_method("dop853", partial(_dop853, False), title="SciPy DOP853 on eq. 105", adaptive=True)
+add_method("dop853-projected", partial(_dop853, True), title="kcons + DOP853, projected", adaptive=True)
 
 
 # -- ASE --------------------------------------------------------------------------------------------
@@ -440,49 +385,51 @@ def _kcons_in_ase(system: TestSystem) -> Sequence[Any]:
 
 def _bond_lengths(system: TestSystem) -> Sequence[Any]:
     """FixBondLengths at its own tolerance, angles held by their end distances."""
-    return ase_constraints(system.fixed, system.bonds, _distances(system, system.bonds), internals=False)
+    from ase.constraints import FixBondLengths
+
+    return [*_fixed(system), FixBondLengths(system.bonds)]
 
 
 def _internals(system: TestSystem) -> Sequence[Any]:
     """FixInternals at its own tolerance."""
-    bonds = system.bonds if system.angle_bonds is None else system.angle_bonds
-    degrees = [system.atoms().get_angle(*triple) for triple in system.angles]
-    lengths = _distances(system, bonds)
-    return ase_constraints(system.fixed, bonds, lengths, system.angles, degrees, internals=True)
+    from ase.constraints import FixInternals
+
+    atoms = system.atoms()
+    pairs = system.bonds if system.angle_bonds is None else system.angle_bonds
+    bonds = [[float(atoms.get_distance(*pair)), pair] for pair in np.asarray(pairs).tolist()]
+    angles = [[float(atoms.get_angle(*triple)), triple] for triple in system.angles.tolist()]
+    return [*_fixed(system), FixInternals(bonds=bonds or None, angles_deg=angles or None)]
 
 
-def _distances(system: TestSystem, pairs: Any) -> FloatArray:
-    x = system.positions
-    return np.asarray(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1))
+def _fixed(system: TestSystem) -> list[Any]:
+    from ase.constraints import FixAtoms
+
+    return [FixAtoms(system.fixed.tolist())] if len(system.fixed) else []
 
 
 def _distances_only(system: TestSystem) -> str | None:
     return None if system.bonds is not None else "it holds distances only"
 
 
-def _code_in_ase(imported: str, held: str, system: TestSystem, dt: str, steps: int) -> list[str]:
-    return [
-        *imported.splitlines(),
-        "from ase.md.verlet import VelocityVerlet",
-        "",
-        "from kcons.comparison import test_systems",
-        "",
-        "test_system = MADE_BY",
-        "atoms = test_system.atoms()  # yours, with a calculator and velocities",
-        f"atoms.set_constraint({held})",
-        f"VelocityVerlet(atoms, {dt} * test_system.units.time_unit).run({steps})",
-    ]
+_IN_ASE = """\
+$imports
+from ase.md.verlet import VelocityVerlet
 
+from kcons.comparison import test_systems
+
+test_system = $made_by
+atoms = test_system.atoms()  # yours, with a calculator and velocities
+atoms.set_constraint($held)
+VelocityVerlet(atoms, $step * test_system.units.time_unit).run($steps)
+"""
 
 add_method(
     "ase-kcons",
     partial(_in_ase, _kcons_in_ase),
     title="ASE Verlet + kcons",
     engine="ASE",
-    code=partial(
-        _code_in_ase,
-        "from kcons.ase import Constraints",
-        "Constraints(test_system.constraint_set.constraints)",
+    code=_IN_ASE.replace("$imports", "from kcons.ase import Constraints").replace(
+        "$held", "Constraints(test_system.constraint_set.constraints)"
     ),
 )
 add_method(
@@ -491,10 +438,8 @@ add_method(
     title="ASE Verlet + FixBondLengths",
     engine="ASE",
     refuses=_distances_only,
-    code=partial(
-        _code_in_ase,
-        "from ase.constraints import FixAtoms, FixBondLengths",
-        "[FixAtoms(test_system.fixed), FixBondLengths(test_system.bonds)]",
+    code=_IN_ASE.replace("$imports", "from ase.constraints import FixAtoms, FixBondLengths").replace(
+        "$held", "[FixAtoms(test_system.fixed), FixBondLengths(test_system.bonds)]"
     ),
 )
 add_method(
@@ -576,14 +521,14 @@ def _free_in_openmm(system: TestSystem, dt: float) -> Run:
     return _in_openmm(system, dt, openmm.VerletIntegrator(dt * engine.time), made, own=True)
 
 
-def _projected(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
+def _projected(scheme: str, system: TestSystem, dt: float) -> Run:
     from kcons.openmm import ProjectedIntegrator
 
     integrator = ProjectedIntegrator(_engine(system).step(dt), scheme, tolerance=TIGHT)
-    return _in_openmm(system, dt, integrator, force_evaluations=each)
+    return _in_openmm(system, dt, integrator, force_evaluations=evaluations(scheme))
 
 
-def _held(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
+def _held(scheme: str, system: TestSystem, dt: float) -> Run:
     """Constraints carried to kcons' solver; rigid water stays with OpenMM, unless there is nothing else."""
     from kcons.openmm import ProjectedIntegrator, hold
 
@@ -592,23 +537,27 @@ def _held(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
     rows: Sequence[Any] = engine.surfaces
     part = hold(made, rows, x, take="all", keep_water=not only_water(system))
     integrator = ProjectedIntegrator(engine.step(dt), scheme, parts=[part], tolerance=TIGHT)
-    return _in_openmm(system, dt, integrator, made, force_evaluations=each)
+    return _in_openmm(system, dt, integrator, made, force_evaluations=evaluations(scheme))
 
 
-def _on_surfaces(scheme: str, each: int, system: TestSystem, dt: float) -> Run:
+def _on_surfaces(scheme: str, system: TestSystem, dt: float) -> Run:
     from kcons.openmm import SurfaceIntegrator
 
     engine = _engine(system)
     made = engine.copy()
-    options = {"surfaces": engine.surfaces, "system": made, "tolerance": TIGHT}
-    integrator = SurfaceIntegrator(engine.step(dt), scheme, **options)
-    return _in_openmm(system, dt, integrator, made, force_evaluations=each)
+    integrator = SurfaceIntegrator(engine.step(dt), scheme, surfaces=engine.surfaces, system=made, tolerance=TIGHT)
+    return _in_openmm(system, dt, integrator, made, force_evaluations=evaluations(scheme))
 
 
 def _compiled(tolerance: float, system: TestSystem, dt: float) -> Run:
     from kcons.openmm import RattleIntegrator
 
     return _in_openmm(system, dt, RattleIntegrator(_engine(system).step(dt), tolerance=tolerance))
+
+
+def evaluations(scheme: str) -> int:
+    """Force evaluations of a step of a scheme."""
+    return 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
 
 
 def _bonds_in_openmm(system: TestSystem) -> str | None:
@@ -627,116 +576,103 @@ def _surfaces(system: TestSystem) -> str | None:
     return None if _engine(system).surfaces else "no particle is held on a surface"
 
 
-def _code_in_openmm(imported: str, made: Sequence[str], system: TestSystem, dt: str, steps: int) -> list[str]:
-    ps = _step(system, float(dt) * system.units.time_unit * _engine(system).time)
-    if float(ps) > 0.02:  # which might be meant in fs
-        ps, imported = f"{ps} * unit.picoseconds", f"{imported}\nfrom openmm import unit"
-    keep = str(not only_water(system)) if any("KEEP" in line for line in made) else ""
-    lines = [line.replace("STEP", ps).replace("KEEP", keep) for line in made]
-    return [
-        *imported.splitlines(),
-        "",
-        "from kcons.comparison import test_systems",
-        "",
-        "test_system = MADE_BY",
-        "md_engine = test_system.openmm",
-        "system = md_engine.copy()  # yours, with its constraints",
-        *lines,
-        "context = md_engine.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)",
-        "context.setPositions(test_system.positions * md_engine.length)",
-        "context.setVelocities(test_system.velocities * md_engine.speed)",
-        f"integrator.step({steps})",
-    ]
+_IN_OPENMM = """\
+import openmm
+
+from kcons.comparison import test_systems
+
+test_system = $made_by
+md_engine = test_system.openmm
+system = md_engine.copy()  # yours, with its constraints
+$integrator
+context = md_engine.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)
+context.setPositions(test_system.positions * md_engine.length)
+context.setVelocities(test_system.velocities * md_engine.speed)
+integrator.step($steps)
+"""
 
 
-def _add_openmm() -> None:
-    """OpenMM's own integrators over tolerances, and those of kcons in it."""
-    bath = (300.0, 1.0)
-    kinds: dict[str, tuple[str, str, tuple[float, ...]]] = {
-        "openmm-verlet": ("OpenMM Verlet", "VerletIntegrator", ()),
-        "openmm-middle": ("OpenMM LangevinMiddle, no friction", "LangevinMiddleIntegrator", (300.0, 0.0)),
-        "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", "NoseHooverIntegrator", ()),
-    }
-    for name, (title, kind, arguments) in kinds.items():
-        for tolerance in TOLERANCES:
-            plain, told = tolerance == DEFAULT, exponent(tolerance)
-            given = ", ".join([*(f"{a:g}" for a in arguments), "STEP"])
-            made: tuple[str, ...] = (
-                f"integrator = openmm.{kind}({given})",
-                f"integrator.setConstraintTolerance({tolerance:g})",
-            )
-            add_method(
-                name if plain else f"{name}-{told}",
-                partial(_own, kind, arguments, tolerance),
-                title=f"{title}, {told}",
-                engine="OpenMM",
-                usual=name == "openmm-verlet" or plain,
-                refuses=_bonds_in_openmm,
-                code=partial(_code_in_openmm, "import openmm", made),
-            )
-    for name, title, kind in (
-        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", "LangevinMiddleIntegrator"),
-        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", "NoseHooverIntegrator"),
-    ):
-        start = partial(_own, kind, bath, DEFAULT)
-        add_method(name, start, title=title, engine="OpenMM", kind="thermostat", refuses=_kelvin)
-    usual = ("rattle", "suzuki4", "blanes-moan4", "kahan-li6", "blanes-moan6")
-    for scheme in (*usual, "geodesic", "yoshida4", "blanes-moan6a", "leapfrog"):
-        each = 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
-        made = (f'integrator = ProjectedIntegrator(STEP, "{scheme}", tolerance={TIGHT:g})',)
-        add_method(
-            f"openmm-kcons-{scheme}",
-            partial(_projected, scheme, each),
-            title=f"OpenMM + kcons {scheme}",
-            engine="OpenMM",
-            force_evaluations=each,
-            usual=scheme in usual,
+def _lines(integrator: str, imported: str = "") -> str:
+    """Lines of Python that run an integrator, which is of kcons if it is `imported`."""
+    made = _IN_OPENMM.replace("$integrator", integrator.rstrip())
+    return made.replace("import openmm\n", f"from kcons.openmm import {imported}\n") if imported else made
+
+
+def _held_lines(scheme: str, system: TestSystem) -> str:
+    return _lines(
+        f"""\
+x = test_system.positions * md_engine.length
+part = hold(system, md_engine.surfaces, x, take="all", keep_water={not only_water(system)})  # constraints move to kcons
+integrator = ProjectedIntegrator($ps, "{scheme}", parts=[part], tolerance={TIGHT:g})""",
+        "ProjectedIntegrator, hold",
+    )
+
+
+#: OpenMM's own integrators over tolerances.
+_OWN: tuple[tuple[str, str, str, tuple[float, ...]], ...] = (
+    ("openmm-verlet", "OpenMM Verlet", "VerletIntegrator", ()),
+    ("openmm-middle", "OpenMM LangevinMiddle, no friction", "LangevinMiddleIntegrator", (300.0, 0.0)),
+    ("openmm-nose-hoover", "OpenMM NoseHoover, no bath", "NoseHooverIntegrator", ()),
+)
+in_openmm = partial(add_method, engine="OpenMM")
+
+for _name, _title, _own_kind, _arguments in _OWN:
+    for _tolerance in TOLERANCES:
+        _plain, _told = _tolerance == DEFAULT, exponent(_tolerance)
+        _given = ", ".join([*(f"{a:g}" for a in _arguments), "$ps"])
+        in_openmm(
+            _name if _plain else f"{_name}-{_told}",
+            partial(_own, _own_kind, _arguments, _tolerance),
+            title=f"{_title}, {_told}",
+            usual=_name == "openmm-verlet" or _plain,
             refuses=_bonds_in_openmm,
-            code=partial(_code_in_openmm, "from kcons.openmm import ProjectedIntegrator", made),
+            code=_lines(
+                f"integrator = openmm.{_own_kind}({_given})\nintegrator.setConstraintTolerance({_tolerance:g})"
+            ),
         )
-    for tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
-        told = exponent(tolerance)
-        made = (f"integrator = RattleIntegrator(STEP, tolerance={tolerance:g})",)
-        add_method(
-            "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{told}",
-            partial(_compiled, tolerance),
-            title=f"OpenMM + kcons compiled RATTLE, {told}",
-            engine="OpenMM",
-            refuses=_bonds_in_openmm,
-            code=partial(_code_in_openmm, "from kcons.openmm import RattleIntegrator", made),
-        )
-    for scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
-        each = STEPPERS[scheme]().force_evaluations
-        made = (
-            "x = test_system.positions * md_engine.length",
-            'part = hold(system, md_engine.surfaces, x, take="all", keep_water=KEEP)  # constraints move to kcons',
-            f'integrator = ProjectedIntegrator(STEP, "{scheme}", parts=[part], tolerance={TIGHT:g})',
-        )
-        add_method(
-            f"openmm-held-{scheme}",
-            partial(_held, scheme, each),
-            title=f"OpenMM + kcons {scheme}, own solver",
-            engine="OpenMM",
-            force_evaluations=each,
-            usual=scheme != "blanes-moan4",
-            refuses=_bonds_or_surfaces,
-            code=partial(_code_in_openmm, "from kcons.openmm import ProjectedIntegrator, hold", made),
-        )
-    for scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan6"):
-        each = STEPPERS[scheme]().force_evaluations
-        add_method(
-            f"openmm-surface-{scheme}",
-            partial(_on_surfaces, scheme, each),
-            title=f"OpenMM + kcons {scheme}, surfaces",
-            engine="OpenMM",
-            force_evaluations=each,
-            refuses=_surfaces,
-        )
-    free = "baseline: OpenMM Verlet, nothing held"
-    add_method("openmm-free", _free_in_openmm, title=free, engine="OpenMM", kind="baseline")
-
-
-_add_openmm()
+for _name, _title, _own_kind in (
+    ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", "LangevinMiddleIntegrator"),
+    ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", "NoseHooverIntegrator"),
+):
+    in_openmm(_name, partial(_own, _own_kind, (300.0, 1.0), DEFAULT), title=_title, kind="thermostat", refuses=_kelvin)
+for _scheme in (*USUAL, "geodesic", "yoshida4", "blanes-moan6a", "leapfrog"):
+    in_openmm(
+        f"openmm-kcons-{_scheme}",
+        partial(_projected, _scheme),
+        title=f"OpenMM + kcons {_scheme}",
+        force_evaluations=evaluations(_scheme),
+        usual=_scheme in USUAL,
+        refuses=_bonds_in_openmm,
+        code=_lines(f'integrator = ProjectedIntegrator($ps, "{_scheme}", tolerance={TIGHT:g})', "ProjectedIntegrator"),
+    )
+for _tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
+    _told = exponent(_tolerance)
+    in_openmm(
+        "openmm-rattle" if _tolerance == TIGHT else f"openmm-rattle-{_told}",
+        partial(_compiled, _tolerance),
+        title=f"OpenMM + kcons compiled RATTLE, {_told}",
+        refuses=_bonds_in_openmm,
+        code=_lines(f"integrator = RattleIntegrator($ps, tolerance={_tolerance:g})", "RattleIntegrator"),
+    )
+for _scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
+    in_openmm(
+        f"openmm-held-{_scheme}",
+        partial(_held, _scheme),
+        title=f"OpenMM + kcons {_scheme}, own solver",
+        force_evaluations=evaluations(_scheme),
+        usual=_scheme != "blanes-moan4",
+        refuses=_bonds_or_surfaces,
+        code=partial(_held_lines, _scheme),
+    )
+for _scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan6"):
+    in_openmm(
+        f"openmm-surface-{_scheme}",
+        partial(_on_surfaces, _scheme),
+        title=f"OpenMM + kcons {_scheme}, surfaces",
+        force_evaluations=evaluations(_scheme),
+        refuses=_surfaces,
+    )
+in_openmm("openmm-free", _free_in_openmm, title="baseline: OpenMM Verlet, nothing held", kind="baseline")
 
 
 # -- lines of Python --------------------------------------------------------------------------------
@@ -757,18 +693,24 @@ def code(system: TestSystem, name: str, setting: float, made_by: str) -> str:
         ``test_systems.build("chain", 10)``.
     """
     method = choose([name])[0]
-    steps = 0 if method.adaptive else round(system.horizon / (setting * system.units.time_unit))
-    if method.code is not None and not system.friction:
-        lines = method.code(system, _step(system, setting), steps)
-    else:
-        internal = setting if method.adaptive else setting * system.units.time_unit
-        lines = [
-            "from kcons.comparison import METHODS, test_systems",
-            "",
-            "test_system = MADE_BY",
-            f'run = METHODS["{name}"].start(test_system, {internal!r})',
-            "while run.time < test_system.horizon * (1 - 1e-9):",
-            "    run.advance()",
-            "print(run.observe()[0])",
-        ]
-    return "\n".join(lines).replace("MADE_BY", made_by) + "\n"
+    internal = setting if method.adaptive else setting * system.units.time_unit
+    lines = method.code or ""
+    if callable(lines):
+        lines = lines(system)
+    if not lines:
+        lines = f"""\
+from kcons.comparison import METHODS, test_systems
+
+test_system = $made_by
+run = METHODS["{name}"].start(test_system, {internal!r})
+while run.time < test_system.horizon * (1 - 1e-9):
+    run.advance()
+print(run.observe()[0])
+"""
+    ps = ""
+    if "$ps" in lines:
+        ps = _step(internal * _engine(system).time)
+        if float(ps) > 0.02:  # which might be meant in fs
+            ps, lines = f"{ps} * unit.picoseconds", lines.replace("\n\n", "\nfrom openmm import unit\n\n", 1)
+    steps = 0 if method.adaptive else round(system.horizon / internal)
+    return Template(lines).substitute(made_by=made_by, step=_step(setting), steps=steps, ps=ps)

@@ -7,20 +7,20 @@ underestimate fast motions, so that the kinetic energy does not tell. The temper
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from kcons.comparison.averages.layers import of_test_systems
-from kcons.comparison.averages.long_steps import METHODS, measure
+from kcons.comparison.averages import KINDS, SAMPLERS, sample
+from kcons.comparison.measure import first_line
 from kcons.comparison.progress import Watcher
+from kcons.comparison.ranking import RIGHT
 from kcons.comparison.test_systems import TestSystem
 from kcons.steppers import Rattle, State, System, run
 from kcons.thermostats.correlated_series import slope
 
-#: Temperatures that are off by so much, two standard errors included, are right enough.
-RIGHT = 0.01
 #: Seconds a force evaluation may take for each second of the budget of a step.
 CHEAP = 1e-3
 #: Records of the energy, and standard errors beyond which its slope is a climb.
@@ -29,46 +29,9 @@ RECORDS, CLIMBS = 40, 3.0
 FRICTION = 0.005
 
 
-@dataclass(frozen=True)
-class StepCheck:
-    """What was seen at one step.
-
-    Attributes
-    ----------
-    step : float
-        In the unit of time that is shown.
-    off, error : float
-        Of the temperature that is farthest off, relative, and its standard error; NaN where the run failed.
-    kind : str
-        Of which motion: shift, turn or internal.
-    climb : float
-        Slope of the energy over its standard error, at constant energy.
-    note : str
-        Why a run failed.
-    """
-
-    step: float
-    off: float
-    error: float
-    kind: str
-    climb: float
-    note: str = ""
-
-    @property
-    def right(self) -> bool:
-        return abs(self.off) + 2 * self.error <= RIGHT and self.climb <= CLIMBS
-
-    @property
-    def known(self) -> bool:
-        """Whether this run can tell."""
-        return (
-            bool(self.note) or 2 * self.error <= RIGHT or abs(self.off) - 2 * self.error > RIGHT or self.climb > CLIMBS
-        )
-
-
 def check_steps(
-    system: TestSystem, steps: Sequence[float], budget: float, *, kelvin: float = 300.0, watcher: Watcher | None = None
-) -> list[StepCheck]:
+    system: TestSystem, steps: Sequence[float], budget: float, *, watcher: Watcher | None = None
+) -> list[dict[str, Any]]:
     """Look at steps, from the shortest on, until one is wrong.
 
     Parameters
@@ -79,35 +42,34 @@ def check_steps(
         In the unit of time that is shown.
     budget : float
         Seconds for each step.
-    kelvin : float
     watcher : Watcher, optional
+
+    Returns
+    -------
+    list of dict
+        Rows of `kcons.comparison.averages.sample` with 'climb': the slope of the energy at constant energy over its
+        standard error.
     """
     watching, unit = watcher or Watcher(), system.units.time_unit
-    layers, found = of_test_systems(system, system, kelvin), []
+    found: list[dict[str, Any]] = []
     for step in sorted(steps):
         with watching.piece(f"temperature of the configurations, {step:g} {system.units.time}", budget):
             try:
                 climb = _climb(system, step * unit, 0.25 * budget)
-                told = measure(layers, METHODS["langevin"], step * unit, FRICTION / unit, budget=0.75 * budget)
+                row = sample(system, SAMPLERS["langevin"], step * unit, FRICTION / unit, budget=0.75 * budget)
             except Exception as error:  # whatever forces or constraints raise ends the run, and is shown
-                found.append(StepCheck(step, np.nan, np.nan, "", np.nan, f"{type(error).__name__}: {error}"))
-                break
-        if not told.kinds:
-            found.append(StepCheck(step, np.nan, np.nan, "", climb, told.note))
-            break
-        kind = max(told.kinds, key=lambda k: abs(told.kinds[k][0]) + 2 * told.kinds[k][1])
-        found.append(StepCheck(step, *told.kinds[kind], kind, climb))
-        if found[-1].known and not found[-1].right:
+                row, climb = {"setting": step, "status": "failed", "note": first_line(error)}, 0.0
+        found.append({**row, "climb": climb})
+        if known(found[-1]) and not right(found[-1]):
             break
     return found
 
 
 def _climb(system: TestSystem, dt: float, seconds: float) -> float:
     """Slope of the energy at constant energy, in standard errors, of a run of about so many seconds."""
-    from time import perf_counter
-
     made = System(system.motion, system.potential.forces)
-    state, stepper = State(system.positions, system.velocities), Rattle()
+    stepper = Rattle()
+    state = run(made, State(system.positions, system.velocities), dt, 2, stepper=stepper)  # loads kernels
     begun = perf_counter()
     state = run(made, state, dt, 10, stepper=stepper)
     each = (perf_counter() - begun) / 10
@@ -120,27 +82,51 @@ def _climb(system: TestSystem, dt: float, seconds: float) -> float:
     return found.value / found.error if found.error > 0 else 0.0
 
 
-def sentence(checks: Sequence[StepCheck], unit: str, kelvin: float = 300.0) -> str:
+def right(row: Mapping[str, Any]) -> bool:
+    """Whether every temperature is right within 1 %, two standard errors included, and the energy does not climb."""
+    return row["status"] == "ok" and row["error"] <= RIGHT and row["climb"] <= CLIMBS
+
+
+def known(row: Mapping[str, Any]) -> bool:
+    """Whether this run can tell that."""
+    if row["status"] != "ok" or row["climb"] > CLIMBS:
+        return True
+    _, off, error = _worst(row)
+    return 2 * error <= RIGHT or abs(off) - 2 * error > RIGHT
+
+
+def _worst(row: Mapping[str, Any]) -> tuple[str, float, float]:
+    """The kind of motion whose temperature is farthest off, by how much, and the standard error of that."""
+    kinds = [kind for kind in KINDS if kind in row]
+    kind = max(kinds, key=lambda k: abs(row[k]) + 2 * row[f"{k}_error"])
+    return kind, row[kind], row[f"{kind}_error"]
+
+
+def sentence(rows: Sequence[Mapping[str, Any]], unit: str, kelvin: float = 300.0) -> str:
     """What the steps come to."""
-    right = [check for check in checks if check.right]
-    last = checks[-1]
-    doubt = next((check for check in checks if not check.known), None)
-    if doubt is not None and (not right or doubt.step > right[-1].step):
-        known = f"A step of {right[-1].step:g} {unit} is right for averages at {kelvin:g} K; at" if right else "At"
+    good = [row["setting"] for row in rows if right(row)]
+    doubt = next((row for row in rows if not known(row)), None)
+    if doubt is not None and (not good or doubt["setting"] > good[-1]):
+        before = f"A step of {good[-1]:g} {unit} is right for averages at {kelvin:g} K; at" if good else "At"
         return (
-            f"{known} {doubt.step:g} {unit} the temperature of configurations is known to {200 * doubt.error:.1g} % "
-            f"only (two standard errors): give a larger --budget to know it to {100 * RIGHT:g} %."
+            f"{before} {doubt['setting']:g} {unit} the temperature of configurations is known to "
+            f"{200 * _worst(doubt)[2]:.1g} % only (two standard errors): give a larger --budget to know it to "
+            f"{100 * RIGHT:g} %."
         )
-    if not right:
-        why = last.note or f"{last.kind} motions are off by {100 * last.off:+.1f} %"
-        return f"No step that was tried, from {checks[0].step:g} {unit} on, is right for averages: {why}."
+    last = rows[-1]
+    if last["status"] != "ok":
+        why = last["note"].split("\n")[0]
+    elif last["error"] <= RIGHT:
+        why = "the energy climbs"
+    else:
+        kind, off, _ = _worst(last)
+        why = f"{kind} motions are off by {100 * off:+.1f} %"
+    if not good:
+        return f"No step that was tried, from {rows[0]['setting']:g} {unit} on, is right for averages: {why}."
     words = (
-        f"For averages at {kelvin:g} K the step may be {right[-1].step:g} {unit}: configurations have that temperature "
+        f"For averages at {kelvin:g} K the step may be {good[-1]:g} {unit}: configurations have that temperature "
         f"within {100 * RIGHT:g} %, and the energy does not climb"
     )
-    if last is right[-1]:
+    if right(last):
         return f"{words}; longer ones were not tried."
-    why = last.note.split("\n")[0] if last.note else f"{last.kind} motions are off by {100 * last.off:+.1f} %"
-    if not last.note and last.climb > CLIMBS and abs(last.off) + 2 * last.error <= RIGHT:
-        why = "the energy climbs"
-    return f"{words}. At {last.step:g} {unit} {why}."
+    return f"{words}. At {last['setting']:g} {unit} {why}."

@@ -7,9 +7,8 @@ Python, by force evaluations. Costs that differ by less than the scatter of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +20,7 @@ from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.errors import InputError
 
-Criterion = Literal["error", "drift"]
+Criterion = Literal["error", "drift", "temperature"]
 
 #: Columns of costs, and what they are called.
 COSTS = {"seconds": "processor time", "evaluations": "force evaluations"}
@@ -37,6 +36,8 @@ USUAL_STEP = 2.0
 #: Steps are predicted for this part of the error, since the prediction may be off; one that makes less than `WASTE` of
 #: it was too short. So many runs of one method, and so many methods, are tried.
 SAFETY, WASTE, TRIES, FINALISTS = 0.85, 0.5, 5, 4
+#: Deviation of a temperature that is right enough.
+RIGHT = 0.01
 #: Orders between which a prediction is believed, and how far it reaches beyond what was measured, as a ratio of steps.
 ORDERS, REACH = (0.5, 10.0), 30.0
 
@@ -66,10 +67,8 @@ def with_errors(table: pd.DataFrame) -> pd.DataFrame:
 def observed_orders(table: pd.DataFrame) -> dict[str, float]:
     """Title -> slope of log(error) against log(time step), at the two finest steps above the error of the reference.
 
-    Methods with fewer than two such steps are left out; so is all where the error is no distance from a trajectory.
+    Methods with fewer than two such steps are left out.
     """
-    if table.attrs["error_unit"] != table.attrs["length"]:
-        return {}
     done = with_errors(table)
     done = done[~done.adaptive.astype(bool) & (done.error > max(5 * table.attrs["reference_error"], 1e-12))]
     found = {}
@@ -90,19 +89,6 @@ def pareto(rows: pd.DataFrame, cost: str, least: float = 0.0) -> pd.DataFrame:
             kept.append(index)
             last = error
     return ordered.loc[kept]
-
-
-def cost_at(rows: pd.DataFrame, cost: str, error: float) -> float:
-    """What one method costs at an error: at its points, or on the line of the logarithms between two neighbors; inf
-    below its smallest error.
-    """
-    known = [(math.log(max(e, 1e-300)), math.log(c)) for e, c in zip(rows.error, rows[cost], strict=True)]
-    wanted = math.log(max(error, 1e-300))
-    found = [c for e, c in known if e <= wanted]
-    for (e0, c0), (e1, c1) in pairwise(known):
-        if min(e0, e1) <= wanted <= max(e0, e1) and e0 != e1:
-            found.append(c0 + (c1 - c0) * (wanted - e0) / (e1 - e0))
-    return math.exp(min(found)) if found else math.inf
 
 
 # -- the ranking ------------------------------------------------------------------------------------
@@ -148,22 +134,26 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
     ----------
     table : DataFrame
         From `kcons.comparison.compare`.
-    criterion : {'error', 'drift'}
-        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of that.
+    criterion : {'error', 'drift', 'temperature'}
+        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of that; or, for
+        a table of averages, how far the temperature of the configurations is off.
     limit : float, optional
-        The largest value that is good enough; by default what the usual method makes at its usual step.
+        The largest value that is good enough; by default what the usual method makes at its usual step, and 1 % of the
+        temperature.
     """
     about, cost = table.attrs, cost_that_decides(table)
     done = with_errors(table)
     least = resolution(table) if criterion == "error" else 0.0
-    value = done.error if criterion == "error" else done.slope.abs() + 2 * done.slope_error.fillna(0.0)
+    value = done.slope.abs() + 2 * done.slope_error.fillna(0.0) if criterion == "drift" else done.error
     done = done.assign(value=value.astype(float), cost=done[cost])
     done = done[np.isfinite(done.value)]
     if not len(done):
         return None
     limit_is, slack = "asked for", 0.0
-    if limit is None:
-        limit, limit_is = _usual(done, about["time"])
+    if limit is None and criterion == "temperature":
+        limit, limit_is = RIGHT, "two standard errors included"
+    elif limit is None:
+        limit, limit_is = _usual(done, about)
         if limit < least:
             limit, limit_is = least, "the least that the reference can tell apart"
         slack = SAME_ERROR
@@ -177,8 +167,8 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
         beyond=beyond,
         limit=limit,
         limit_is=limit_is,
-        what="error" if criterion == "error" else "drift of the energy",
-        unit=about["error_unit"] if criterion == "error" else drift,
+        what="drift of the energy" if criterion == "drift" else about.get("what", "error"),
+        unit=drift if criterion == "drift" else about["error_unit"],
         cost=cost,
         scatter=same,
     )
@@ -197,39 +187,30 @@ def _places(costs: Sequence[float], same: float) -> list[int]:
     return places
 
 
-def _usual(done: pd.DataFrame, time: str) -> tuple[float, str]:
+def _usual(done: pd.DataFrame, about: Mapping[str, Any]) -> tuple[float, str]:
     """What is usually accepted: that of the plainest method that ran, at 2 fs or at its second longest step."""
     for name in USUAL_METHODS:
         rows = done[done.method == name].sort_values("setting", ascending=False)
         if len(rows):
             row = rows.iloc[min(1, len(rows) - 1)]
-            if time == "fs":
+            if about["time"] == "fs":
                 row = rows.loc[(np.log(rows.setting.astype(float) / USUAL_STEP)).abs().idxmin()]
-            return float(row.value), f"what {row.title} makes at {shown_setting(row, time)}"
+            return float(row.value), f"what {row.title} makes at {shown_setting(row, about)}"
     return float(done.value.median()), "what half of the rows make"
 
 
-def shown_setting(row: Any, time: str) -> str:
-    """'2 fs', or 'rtol 1e-6'."""
-    return f"rtol {row.setting:.0e}" if row.adaptive else f"{row.setting:.4g} {time}"
+def shown_setting(row: Any, about: Mapping[str, Any]) -> str:
+    """'2 fs', 'rtol 1e-6', or '2 fs, 5/ps' with a friction."""
+    friction = getattr(row, "friction", 0.0)
+    rate = f", {friction:.2g}/{about['long_time']}" if friction and friction > 0 else ""
+    return f"rtol {row.setting:.0e}" if row.adaptive else f"{row.setting:.4g} {about['time']}{rate}"
 
 
 # -- a wanted error ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Where one method is expected to make an error, and what that costs a long unit of time."""
-
-    method: str
-    setting: float
-    order: float
-    seconds: float
-    evaluations: float
-
-
-def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> Prediction | None:
-    """The setting of one method for an error, from its rows, by the slope next to it.
+def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> dict[str, Any] | None:
+    """The setting of one method for an error, from its rows, by the slope next to it; with the order and the costs.
 
     None where fewer than two errors are above `least`, or the error does not fall with the setting.
     """
@@ -247,12 +228,11 @@ def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> Prediction 
     ratio = math.log(error / near.error) / order
     if abs(ratio) > math.log(REACH):
         return None
-
-    def at(cost: str) -> float:
+    found = {"method": near.method, "setting": near.setting * math.exp(ratio), "order": order}
+    for cost in COSTS:
         slope = math.log(first[cost] / second[cost]) / step if near.adaptive else -1.0
-        return float(near[cost] * math.exp(slope * ratio))
-
-    return Prediction(near.method, near.setting * math.exp(ratio), order, at("seconds"), at("evaluations"))
+        found[cost] = float(near[cost] * math.exp(slope * ratio))
+    return found
 
 
 def find_steps(
@@ -295,57 +275,51 @@ def find_steps(
     if target < least:
         return []
     predicted = (predict(rows, SAFETY * target, least) for _, rows in with_errors(table).groupby("method"))
-    promising = sorted((p for p in predicted if p is not None), key=lambda p: getattr(p, cost))
+    promising = sorted((p for p in predicted if p is not None), key=lambda p: float(p[cost]))
     found: list[dict[str, Any]] = []
-    for prediction in promising[:FINALISTS]:
+    for promise in promising[:FINALISTS]:
         best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
-        seconds = prediction.seconds * system.horizon / system.units.long_time_unit
-        if getattr(prediction, cost) < 1.5 * best and seconds <= budget:
-            found += _search(system, prediction, target, reference, budget, watcher)
+        seconds = promise["seconds"] * system.horizon / system.units.long_time_unit
+        if promise[cost] < 1.5 * best and seconds <= budget:
+            method = METHODS[promise["method"]]
+            found += _search(system, method, promise["setting"], promise["order"], target, reference, budget, watcher)
     return found
 
 
 def _search(
     system: TestSystem,
-    prediction: Prediction,
+    method: Method,
+    setting: float,
+    order: float,
     target: float,
     reference: Reference,
     budget: float,
     watcher: Watcher | None,
 ) -> list[dict[str, Any]]:
     """Runs of one method at the predicted step and near it, until its longest step that makes the error is known."""
-    method = METHODS[prediction.method]
-    setting, found = prediction.setting, []
+    found: list[dict[str, Any]] = []
     good, bad, smallest = 0.0, math.inf, math.inf  # the longest step that reaches the error, the shortest that does not
+    horizon = system.horizon / system.units.time_unit
     for _ in range(TRIES):
-        setting = _dividing(system, method, setting, bad)
+        if not method.adaptive:  # the longest step that divides the horizon and is not longer, shorter than a bad one
+            count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
+            setting = horizon / (count + (horizon / count >= bad * (1 - 1e-9)))
         if setting <= good or setting >= bad:
             break
         internal = setting if method.adaptive else setting * system.units.time_unit
         row = measure(system, method, internal, reference, budget, watcher=watcher)
         found.append(row)
+        error = row.get("error", math.inf)
         if row["status"] not in ("ok", "failed"):
             break
-        error = row.get("error", math.inf)
         if error <= target:
             good = setting
             if error >= WASTE * target or error == 0:
                 break
+        elif math.isfinite(bad) and error > 0.9 * smallest:
+            break  # shorter steps do not help: something else than the step decides
         else:
-            if math.isfinite(bad) and error > 0.9 * smallest:
-                break  # shorter steps do not help: something else than the step decides
             bad, smallest = setting, min(error, smallest)
-        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / prediction.order)
+        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / order)
         setting *= min(max(ratio, 0.3), 3.0)
     return found
-
-
-def _dividing(system: TestSystem, method: Method, setting: float, bad: float) -> float:
-    """The longest step that divides the horizon and is not longer than `setting`, shorter than one known to be bad."""
-    if method.adaptive:
-        return setting
-    horizon = system.horizon / system.units.time_unit
-    count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
-    if horizon / count >= bad * (1 - 1e-9):
-        count += 1
-    return horizon / count

@@ -80,7 +80,7 @@ def text(table: pd.DataFrame, found: Ranking | None, code: str = "", more: str =
     parts = [sentence(table, found)]
     if more:
         parts.append(more)
-    if found is not None and len(found.table):
+    if found is not None and (len(found.table) or "what" in about):
         parts.append(_places(found, about))
     if code:
         parts.append(f"In Python:\n{code.rstrip()}")
@@ -92,18 +92,21 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
     about = table.attrs
     if found is None:
         left = ", ".join(f"{title} ({note})" for title, note in _notes(table).items())
+        if "what" in about:
+            return f"No run can tell the {about['what']}: {left}. Give a larger --budget."
         return f"No method reached the horizon of {about['horizon']:g} {about['time']}: {left}."
     limit = f"an {found.what} " if found.what[0] in "aeiou" else f"a {found.what} "
-    limit += f"of at most {found.limit:.2g} {found.unit} ({found.limit_is})"
+    limit += f"of at most {f'{found.limit:.2g} {found.unit}'.strip()} ({found.limit_is})"
     if not len(found.table):
         best = found.beyond.iloc[0]
-        at = shown_setting(best, about["time"])
+        at = shown_setting(best, about)
         if best.value <= found.limit:
             return f"No method makes {limit}, which cannot be told from none: the reference is no better."
-        return f"No method makes {limit}; the least is {best.value:.2g}, by {best.title} at {at}."
+        remedy = " Longer runs (--budget) make errors smaller." if "what" in about else ""
+        return f"No method makes {limit}; the least is {best.value:.2g}, by {best.title} at {at}.{remedy}"
     first = found.table.iloc[0]
-    spent = f"the least {COSTS[found.cost]} a {about['long_time']}, {_spent(first.cost, found.cost)}"
-    words = f"Use {first.title} at {shown_setting(first, about['time'])}: {spent}, for {limit}"
+    spent = f"the least {COSTS[found.cost]} {_per(about)}, {_spent(first.cost, found.cost)}"
+    words = f"Use {first.title} at {shown_setting(first, about)}: {spent}, for {limit}"
     ties = found.table[found.table.place == 1].iloc[1:]
     if len(ties):
         named = ", ".join(ties.title[:3]) + (f" and {len(ties) - 3} more" if len(ties) > 3 else "")
@@ -112,27 +115,33 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
 
 
 def _places(found: Ranking, about: dict[str, Any]) -> str:
-    shown = found.table.head(PLACES)
+    ranked = found.table if len(found.table) else found.beyond.assign(place="", times=np.nan)
+    shown = ranked.head(PLACES)
     tied = found.table.place.duplicated(keep=False)
     cells = {
-        "": [f"{p}{'=' if tie else ''}" for p, tie in zip(shown.place, tied, strict=False)],
+        "": [f"{p}{'=' if tie else ''}" for p, tie in zip(shown.place, tied, strict=False)] or [""] * len(shown),
         "method": [str(title)[:40] for title in shown.title],
-        "at": [shown_setting(row, about["time"]) for row in shown.itertuples()],
+        "at": [shown_setting(row, about) for row in shown.itertuples()],
         found.what.split()[0]: [f"{value:.1e}" for value in shown.value],
         "cost": [_spent(cost, found.cost) for cost in shown.cost],
-        "times": [f"{t:.2f}" if t < 10 else f"{t:,.0f}" for t in shown.times],
+        "times": ["" if np.isnan(t) else f"{t:.2f}" if t < 10 else f"{t:,.0f}" for t in shown.times],
         "timed": ["once" if not rounds else f"{rounds:.0f} rounds" for rounds in shown.rounds],
     }
-    if found.cost == "evaluations":
+    if found.cost == "evaluations" or "what" in about:
         del cells["timed"]
     lines = [columns(pd.DataFrame(cells), left=("", "method"))]
-    if len(found.table) > PLACES:
-        lines.append(f"... and {len(found.table) - PLACES} more")
+    if len(ranked) > PLACES:
+        lines.append(f"... and {len(ranked) - PLACES} more")
     same = f"{100 * found.scatter:.0f} %"
     how = ", to which times repeat" if found.cost == "seconds" and about.get("margin") is not None else ""
+    how = ", to which such costs are known" if "what" in about else how
     lines.append(f"Measured on {about['title']}.")
-    lines.append(f"cost: {COSTS[found.cost]} a {about['long_time']}; =: equal within {same}{how}.")
+    lines.append(f"cost: {COSTS[found.cost]} {_per(about)}; =: equal within {same}{how}.")
     return "\n".join(lines)
+
+
+def _per(about: dict[str, Any]) -> str:
+    return str(about.get("per") or f"a {about['long_time']}")
 
 
 def _notes(table: pd.DataFrame) -> dict[str, str]:
@@ -162,6 +171,8 @@ def _spent(cost: float, kind: str) -> str:
 def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     """Error against cost, axes logarithmic: curves with their names at their ends, a pale band along each front.
 
+    Of several rows of a method with one setting, such as two frictions, the one with the least error is shown.
+
     Parameters
     ----------
     table : DataFrame
@@ -172,14 +183,16 @@ def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     from matplotlib.figure import Figure
 
     about, cost = table.attrs, cost_that_decides(table)
+    table = table.loc[sorted(table.sort_values("error").drop_duplicates(["method", "setting"]).index)]
     drawn = Figure(figsize=(width, 5.0))
     FigureCanvasAgg(drawn)
     axes = drawn.subplots()
     done = with_errors(table)
     done = done[done.error > 0]
     axes.set(xscale="log", yscale="log")
-    axes.set_xlabel(f"{COSTS[cost]} a {about['long_time']}{' / s' if cost == 'seconds' else ''}")
-    axes.set_ylabel(f"error at {about['horizon']:g} {about['time']} / {about['error_unit']}")
+    axes.set_xlabel(f"{COSTS[cost]} {_per(about)}{' / s' if cost == 'seconds' else ''}")
+    error = f"error at {about['horizon']:g} {about['time']} / {about['error_unit']}"
+    axes.set_ylabel(about.get("what", error).replace(" of the conf", "\nof the conf"))
     axes.grid(True, which="major", linewidth=0.5, alpha=0.5)
     axes.set_title(about["title"], fontsize=10, loc="left", wrap=True)
     if "environment" in about:
@@ -212,7 +225,7 @@ def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     # Names stand to the right: so much room do they need.
     names = {name: str(done[done.method == name].title.iloc[0]) for name in curves}
     room = min(0.48, 0.066 * max(len(t) for t in names.values()) / width + 0.04)
-    drawn.subplots_adjust(left=0.75 / width, right=1 - room, bottom=0.12, top=0.92)
+    drawn.subplots_adjust(left=(1.1 if "what" in about else 0.75) / width, right=1 - room, bottom=0.12, top=0.92)
     ends = {name: done[done.method == name].iloc[-1] for name in curves}
     _name_curves(
         axes, [(names[n], (ends[n][cost], ends[n].error), COLORS[k % len(COLORS)]) for k, n in enumerate(curves)]

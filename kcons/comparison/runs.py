@@ -7,12 +7,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ase.constraints import FixAtoms, FixBondLengths, FixInternals
-from numpy.typing import ArrayLike
 
 from kcons import steppers
 from kcons.constraints.target import FloatArray
@@ -64,10 +61,6 @@ class Run(ABC):
         """Go back to the start; the steps go on counting."""
         raise NotImplementedError
 
-    def put(self, x: FloatArray) -> None:
-        """Other positions, such as those wrapped into a cell, and the velocities as they are."""
-        raise NotImplementedError
-
 
 class OnArrays(Run):
     """A stepper of kcons, arrays in and arrays out."""
@@ -90,9 +83,6 @@ class OnArrays(Run):
 
     def rewind(self) -> None:
         self.state = self.start
-
-    def put(self, x: FloatArray) -> None:
-        self.state = replace(self.state, positions=x)
 
 
 class OfStates(Run):
@@ -159,10 +149,6 @@ class InAse(Run):
         # Constraints would change them by what rounding leaves.
         self.atoms.set_momenta(p, apply_constraint=False)
 
-    def put(self, x: FloatArray) -> None:
-        # As atoms.wrap() does it: not through the constraints.
-        self.atoms.arrays["positions"][:] = x
-
 
 class InOpenMM(Run):
     """A Context of OpenMM at its start.
@@ -217,9 +203,6 @@ class InOpenMM(Run):
         self.context.setPositions(x)
         self.context.setVelocities(v)
 
-    def put(self, x: FloatArray) -> None:
-        self.context.setPositions(x * self.length)
-
 
 def seen(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
     """Positions and velocities of a Context, nm and nm/ps."""
@@ -228,36 +211,3 @@ def seen(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
         np.array(state.getPositions(asNumpy=True)._value),
         np.array(state.getVelocities(asNumpy=True)._value),
     )
-
-
-def ase_constraints(
-    fixed: ArrayLike,
-    pairs: Any,
-    lengths: Any,
-    triples: Any = (),
-    degrees: Any = (),
-    *,
-    internals: bool,
-    **options: Any,
-) -> list[Any]:
-    """ASE's constraint objects: FixAtoms, and FixInternals or FixBondLengths.
-
-    Parameters
-    ----------
-    fixed : array_like of int
-    pairs, lengths, triples, degrees
-        Distances in Å and angles in degrees.
-    internals : bool
-        Whether by FixInternals, which holds angles, too.
-    **options
-        For FixInternals.
-    """
-    still = np.asarray(fixed, dtype=int)
-    held: list[Any] = [FixAtoms(still.tolist())] if len(still) else []
-    if internals:
-        bonds = [[float(d), [int(i) for i in pair]] for d, pair in zip(lengths, pairs, strict=True)]
-        angles = [[float(a), [int(i) for i in triple]] for a, triple in zip(degrees, triples, strict=True)]
-        held.append(FixInternals(bonds=bonds or None, angles_deg=angles or None, **options))
-    elif len(pairs):
-        held.append(FixBondLengths(pairs, bondlengths=lengths))
-    return held

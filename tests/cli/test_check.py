@@ -339,7 +339,7 @@ def test_hydrogens_without_a_bond_are_a_gap(tmp_path, capsys):
 
 def test_temperatures_of_configurations(folder, capsys, monkeypatch):
     """Asked for with forces: among the remarks, on the page and in the file."""
-    from kcons.comparison.averages import trajectory_temperatures
+    from kcons.comparison import trajectory_temperatures
     from kcons.thermostats import Estimate, SplitTemperatures
 
     asked = []

@@ -113,8 +113,8 @@ def test_a_file_says_which_step_is_right_for_averages(tmp_path, monkeypatch, cap
     def checked(system, steps, budget, **_):
         seen.append((system.name, tuple(steps), budget))
         return [
-            production.StepCheck(2.0, 0.001, 0.002, "shift", 0.5),
-            production.StepCheck(3.0, 0.08, 0.01, "turn", 0.5),
+            {"setting": 2.0, "status": "ok", "error": 0.005, "shift": 0.001, "shift_error": 0.002, "climb": 0.5},
+            {"setting": 3.0, "status": "ok", "error": 0.1, "turn": 0.08, "turn_error": 0.01, "climb": 0.5},
         ]
 
     monkeypatch.setattr(production, "check_steps", checked)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -21,28 +19,6 @@ ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 
 def run(*arguments):
     return main.main([str(a) for a in arguments])
-
-
-def test_compare_samples_fluids(tmp_path, capsys):
-    out = tmp_path / "out"
-    options = ["--size", 8, "--methods", "isokinetic,langevin", "--dt", "0.01", "--budget", "0.3", "--out", out]
-    assert run("compare", "thermostat", *options) == 0
-    printed = capsys.readouterr()
-    assert "8 Lennard-Jones atoms" in printed.out
-    assert re.search("temperature of (its|the) configurations", printed.out.splitlines()[0])
-    assert "kT off by: temperature of the configurations" in printed.out
-    assert "Metropolis sampling\n" in printed.err
-    data = json.loads((out / "compare.json").read_text(encoding="utf-8"))
-    assert [(m["method"], m["setting"]) for m in data["measurements"]] == [("isokinetic", 0.01), ("langevin", 0.01)]
-    assert data["settings"]["size"] == 8 and data["settings"]["dt"] == [0.01]
-    assert (out / "compare.png").exists()
-    assert "isokinetic, 2K = (g - 1) kT" in (out / "compare.txt").read_text(encoding="utf-8")
-
-
-def test_plan_of_a_fluid(capsys):
-    assert run("plan", "thermostat-water") == 0
-    text = capsys.readouterr().out
-    assert "27 rigid TIP3P waters" in text and "rank 81" in text
 
 
 def test_plan_prints_clusters_rank_and_solver(capsys):
@@ -66,25 +42,18 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["compare"], "name a test system: water"),
+        (["compare"], "name a test system: alanine"),
         (["compare", "wat"], "there is no test system 'wat'"),
         (["plan", "wat"], "there is no test system 'wat'"),
         (["compare", "chain", "--methods", "shake"], "there is no method 'shake'"),
         (["compare", "chain", "--methods", ","], "no method"),
-        (["compare", "thermostat", "--methods", "rattle"], "there is no thermostat 'rattle'"),
-        (["compare", "thermostat", "--dt", "0.01,-1"], "give a positive number"),
-        (["compare", "thermostat-water", "--size", "8"], "use 27 or more"),
-        (["compare", "thermostat", "--budget", "0"], "positive number of seconds"),
         (["compare", "chain", "--size", "0"], "at least one bond"),
         (["compare", "chain", "--size", "3", "--dt", "3"], "does not divide the horizon"),
         (["compare", "chain", "--size", "3", "--dt", ","], "--dt is empty"),
         (["compare", "chain", "--seed", "-1"], "non-negative"),
         (["compare", "chain", "--size", "3", "--budget", "-1"], "positive number of seconds"),
         (["compare", "chain", "--size", "3", "--out", "/dev/null/x"], "/dev/null"),
-        (["compare", "thermostat", "--forces", "lj"], "--forces is not for fluids"),
         (["plan", str(ALANINE), "--constrain", "none"], "none with kcons compare --forces"),
-        (["plan", "thermostat", "--constrain", "hbonds"], "--constrain is not for fluids"),
-        (["plan", "thermostat", "--select", "all", "--add-hydrogens"], "is not for fluids"),
     ],
 )
 def test_mistakes_give_one_line_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):
@@ -159,8 +128,6 @@ def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["chain", "--criterion", "temperature"], "kcons check TRAJECTORY --topology FILE"),
-        (["thermostat", "--criterion", "drift"], "is for trajectories"),
         (["chain", "--criterion", "drift", "--target-error", "1e-3"], "leave --criterion drift out"),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
@@ -174,8 +141,7 @@ def test_criteria_that_do_not_fit(words, said, capsys):
     ("words", "names"),
     [
         (["compare", "chain", "--methods", "rattle"], ["compare.csv", "compare.png", "compare.txt"]),
-        (["compare", "thermostat", "--methods", "langevin"], ["compare.json", "compare.png", "compare.txt"]),
-        (["compare", "thermostat-water", "--fast", "3.8", "--methods", "spheres"], ["compare.json", "compare.txt"]),
+        (["compare", "chain", "--criterion", "temperature"], ["compare.csv", "compare.png", "compare.txt"]),
     ],
     ids=lambda given: "-".join(given[:2]),
 )

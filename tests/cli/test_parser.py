@@ -29,7 +29,7 @@ def test_wrong_words_of_the_command_line(words, meant, capsys):
     ("words", "meant"),
     [
         (["compare", "watr"], "'water'"),
-        (["compare", "termostat"], "'thermostat'"),
+        (["compare", "chan"], "'chain'"),
         (["compare", "water", "--methods", "ratle"], "'rattle'"),
         (["warmup", "protein"], "'proteins'"),
     ],

@@ -24,9 +24,10 @@ import numpy as np
 from ase.build import molecule
 from ase.calculators.emt import EMT
 
-from kcons.comparison import environment, json_files
+from kcons.comparison import environment
 from kcons.constraints import Angle, Dihedral
 from kcons.free_energy import AseWindows, Settings, Windows, scan
+from kcons.steppers.files import text
 
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "killed_runs.json"
 TORSION = Dihedral([[2, 0, 1, 3]])
@@ -138,8 +139,8 @@ def main(arguments: list[str]) -> None:
         with tempfile.TemporaryDirectory() as folder:
             row = killed(kind, Path(folder), 30)
         print(kind, row)
-        known = json_files.read(RESULT) if RESULT.exists() else {}
-        json_files.write(RESULT, known | {kind: row, "machine": environment()})
+        known = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+        RESULT.write_text(text(known | {kind: row, "machine": environment()}, 1) + "\n")
 
 
 if __name__ == "__main__":

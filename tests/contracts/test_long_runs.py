@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from stepper_systems import PROJECTED, SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
 
-from kcons.comparison import environment, json_files
+from kcons.comparison import environment
 from kcons.constraints import Distance
 from kcons.steppers import (
     BlanesMoan4,
@@ -33,6 +33,7 @@ from kcons.steppers import (
     Yoshida4,
     run,
 )
+from kcons.steppers.files import text
 
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 #: So many digits of a figure are kept in the file.
@@ -55,7 +56,7 @@ def figures() -> Iterator[dict[str, dict[str, dict[str, float]]]]:
             for kind, runs in found.items()
         }
         merged = {kind: known.get(kind, {}) | runs for kind, runs in rounded.items()}
-        json_files.write(path, merged | {"machine": environment()})
+        path.write_text(text(merged | {"machine": environment()}, 1) + "\n")
 
 
 # -- free flight ------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ they find; see docs/constant_pressure.md.
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -17,9 +18,10 @@ from openmm_systems import started, state_of
 from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
-from kcons.comparison import environment, json_files
+from kcons.comparison import environment
 from kcons.constraints import Distance
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold, molecular_pressure
+from kcons.steppers.files import text
 from kcons.thermostats.multistep import autocorrelation_time
 
 N, SIDE, KT = 30, 6.0, 0.00831446261815324 * 300
@@ -166,8 +168,8 @@ def measured():
     found, here = {}, environment()
     yield found
     if file := os.environ.get("KCONS_BAROSTATS"):
-        known = json_files.read(file)["runs"] if Path(file).exists() else {}
-        json_files.write(file, {"format": "kcons barostats", "environment": here, "runs": known | found})
+        known = json.loads(Path(file).read_text())["runs"] if Path(file).exists() else {}
+        Path(file).write_text(text({"format": "kcons barostats", "environment": here, "runs": known | found}, 1) + "\n")
 
 
 @pytest.mark.validation

@@ -110,7 +110,7 @@ def conserved_momentum(program: Program, quick: bool) -> Outcome:
 )
 def long_cutoff(program: Program, quick: bool) -> Outcome:
     if isinstance(program, Core):
-        from kcons.comparison.test_systems.lennard_jones import LennardJones
+        from systems.lennard_jones import LennardJones
 
         LennardJones(range(4), 1.58, cutoff=1.0)
         return outcome()

@@ -19,11 +19,9 @@ from kcons.motion import Motion
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-#: Studies on the harness have tests of their own, in tests/studies.
-OWN = {
-    *("harness", "study_scripts", "bare_solvers", "bare_systems", "fitted_forces"),
-    *("hard_cases", "stability", "solvers_alone", "whole_comparison"),
-}
+#: Studies with tests of their own, in tests/studies, and scripts that write no table.
+OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "solvers_alone", "whole_comparison")}
+PLAIN = {"check_speed", "constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
 EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -77,7 +75,8 @@ def test_console_snippets_run(page, text, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
 def test_example_runs(script, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert said(script).strip()
+    quick = script in STUDIES and script.stem not in PLAIN
+    assert said(script, *(["--quick", "--out", "found"] if quick else [])).strip()
 
 
 def test_examples_are_short_and_on_the_front_page():

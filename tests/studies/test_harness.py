@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from itertools import count
+
 import harness
 import pytest
 
@@ -38,3 +41,29 @@ def test_files_of_other_runs_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"settings 'quick=True', not 'quick=False': give another --out"):
         harness.run(path, {"b": lambda: [{"value": 1}]}, quick=False)
     assert path.read_text() == before
+
+
+def test_calls_are_made_in_turn_and_their_speeds_are_medians_over_the_turns():
+    made, ticks = [], count()
+    calls = {name: lambda name=name: made.append(name) for name in "ab"}
+    assert harness.in_turn(calls, 3, clock=lambda: float(next(ticks))) == {"a": [1.0] * 3, "b": [1.0] * 3}
+    assert "".join(made) == "ababab"
+    seconds = {"first": [1.0, 2.0, 9.0], "second": [2.0, 1.0, 3.0]}
+    assert harness.ratio(*seconds.values()) == 2.0
+    found = harness.speeds(seconds, 4)
+    assert found == {"first": {"ms": 500.0, "ratio": 1.0}, "second": {"ms": 500.0, "ratio": 2.0}}
+
+
+def test_a_study_as_a_command(tmp_path, monkeypatch, capsys):
+    def tables(table):
+        return {
+            "Times": harness.shown(table, "one", name="{}", ms="{:.1f}"),
+            "None": harness.shown(table, "two", x="{}"),
+        }
+
+    monkeypatch.setattr(sys, "argv", ["study", "--quick", "--out", str(tmp_path)])
+    rows = [{"part": "one", "name": "a", "ms": 1.25}, {"part": "one", "name": "b", "ms": None}]
+    harness.main("study", harness.options("About", "out"), lambda chosen: {"all": lambda: rows}, tables)
+    printed = capsys.readouterr().out
+    assert "Times\nname  ms\n   a 1.2\n   b" in printed and "None\n" not in printed and "commit" in printed
+    assert harness.read(tmp_path / "study.csv")[0]["settings"] == "quick=True"

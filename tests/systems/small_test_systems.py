@@ -2,6 +2,8 @@
 
 from importlib.util import find_spec
 
+import beads as beads  # test systems of the tests alone
+
 from kcons.comparison import test_systems
 from kcons.steppers import State, System, run
 
@@ -20,7 +22,7 @@ STORED = {
 }
 
 SMALL = {"water": 8, "chain": 5, "chain-straight": 5, "chain-175": 5, "chain-free": 5, "sphere": 2, "ethanol": 1}
-SMALL.update({"sphere-pendulum": 2, "sphere-pendulum-top": 2, "fekete": 12})
+SMALL.update({"sphere-pendulum": 2, "sphere-pendulum-top": 2})
 SMALL.update(dict.fromkeys(STORED, 1), dumbbells=2, slab=1)
 if find_spec("openmm") is not None:
     SMALL["alanine"] = 1

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lennard_jones import LennardJones
 from thermostat_systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
-from kcons.comparison.test_systems.lennard_jones import LennardJones
 from kcons.constraints import (
     CenterOfMass,
     Cylinder,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
+import fluids as fluid
 import numpy as np
 import pytest
 from thermostat_systems import dumbbells, quartic, system, waves, waves_potential
 
-from kcons.comparison import fluid
 from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import run

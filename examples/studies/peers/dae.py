@@ -47,21 +47,14 @@ class _Equations:
 
     def start(self) -> tuple[FloatArray, FloatArray]:
         test_system = self.test_system
-        x, v, f = (
-            test_system.positions,
-            test_system.velocities,
-            self.forces(test_system.positions, test_system.velocities.ravel(), 0.0),
-        )
+        x, v, f = test_system.positions, test_system.velocities, self.forces(test_system.positions, 0.0)
         motion = Motion(self.held, x)
         a, lam = motion.acceleration(x, v, f.reshape(self.shape)), motion.multipliers(x, v, f.reshape(self.shape))
         y = np.concatenate([x.ravel(), v.ravel(), np.zeros(2 * self.m)])
         return y, np.concatenate([v.ravel(), a.ravel(), lam, np.zeros(self.m)])
 
-    def forces(self, x: FloatArray, v: FloatArray, t: float) -> FloatArray:
-        f = self.test_system.potential.forces(x, t).ravel()
-        if self.test_system.friction:
-            f -= self.test_system.friction * v / self.weights
-        return f
+    def forces(self, x: FloatArray, t: float) -> FloatArray:
+        return self.test_system.potential.forces(x, t).ravel()
 
     def residual(self, t: float, y: FloatArray, rate: FloatArray) -> FloatArray:
         n, m = self.n, self.m
@@ -70,7 +63,7 @@ class _Equations:
         return np.concatenate(
             [
                 rate[:n] - v - self.weights * (a.T @ gamma),
-                rate[n : 2 * n] - self.weights * (self.forces(x, v, t) + a.T @ lam),
+                rate[n : 2 * n] - self.weights * (self.forces(x, t) + a.T @ lam),
                 self.value(y[:n]),
                 a @ v,
             ]
@@ -90,7 +83,6 @@ class _Equations:
             by_y[n : 2 * n, j] = -self.weights * (lam @ change)
             by_y[2 * n + m :, j] = change @ y[n : 2 * n]
         by_y[:n, n : 2 * n] = -np.eye(n)
-        by_y[n : 2 * n, n : 2 * n] = self.test_system.friction * np.eye(n)
         by_y[2 * n : 2 * n + m, :n] = a
         by_y[2 * n + m :, n : 2 * n] = a
         by_rate[: 2 * n, : 2 * n] = np.eye(2 * n)
@@ -183,5 +175,5 @@ def add() -> None:
         ("dae-radau", "scipy-dae Radau, index 2", RadauRun, "scipy-dae", "scipy_dae"),
         ("dae-ida", "SUNDIALS IDA, index 2", IdaRun, "scikit-sundae", "sksundae"),
     ):
-        options = {"title": title, "adaptive": True, "friction": True, "refuses": partial(refuses, package, module)}
+        options = {"title": title, "adaptive": True, "refuses": partial(refuses, package, module)}
         add_method(name, run, **options)

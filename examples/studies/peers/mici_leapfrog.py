@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from importlib.util import find_spec
 from typing import Any
@@ -40,18 +39,13 @@ class MiciRun(Run):
         momenta = self._weights * test_system.velocities.ravel()
         self._state: Any = ChainState(pos=test_system.positions.ravel().copy(), mom=momenta, dir=1)
         self._shape = shape
-        self._share = math.exp(-0.5 * test_system.friction * dt)
         self._test_system, self._system, self._start = test_system, system, self._state.copy()
         potential.forces(test_system.positions)
 
     def advance(self, steps: int = 1) -> None:
         state, step = self._state, self._integrator.step
         for _ in range(steps):
-            if self._share != 1.0:
-                state.mom = self._share * state.mom
             state = step(state)
-            if self._share != 1.0:
-                state.mom = self._share * state.mom
         self._state = state
         self.done += steps
 
@@ -82,5 +76,5 @@ def add() -> None:
         ("mici", "mici constrained leapfrog", DEFAULT),
         ("mici-tight", "mici, tight", TIGHT),
     ):
-        options = {"title": title, "usual": tolerances is DEFAULT, "friction": True, "refuses": refuses}
+        options = {"title": title, "usual": tolerances is DEFAULT, "refuses": refuses}
         add_method(name, partial(start, tolerances), **options)

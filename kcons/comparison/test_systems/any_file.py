@@ -17,11 +17,11 @@ from kcons.comparison.test_systems.structure import (
     FORCE_FIELD,
     TEMPERATURE,
     force_field_of,
+    molecules_at_300_k,
     platform_of,
-    steps_of,
     system_of,
 )
-from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
+from kcons.comparison.test_systems.system import TestSystem
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -184,20 +184,17 @@ def from_file(
         system = md_engine.system
         masses = np.array([system.getParticleMass(k)._value for k in range(len(x))])
     held = ConstraintSet(list(found.rows), x, masses, cell=cell, pbc=snapshot.pbc.tolist())
-    motion = Motion(held, x)
-    x = motion.restore_positions(x)
-    return TestSystem(
-        name=Path(path).stem,
-        title=f"{found.title}, {TEMPERATURE:g} K; {potential.name}",
-        constraint_set=held,
-        positions=x,
-        velocities=thermal_velocities(motion, x, TEMPERATURE, seed),
+    return molecules_at_300_k(
+        Path(path).stem,
+        f"{found.title}, {TEMPERATURE:g} K; ",
+        held,
+        x,
+        seed,
         potential=potential,
         symbols=[e or "X" for e in snapshot.topology.elements.tolist()],
         bonds=_distances(found.rows),
         cell=cell,
         openmm=md_engine,
-        **steps_of(len(x)),
     )
 
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.minimal import integrated, spin, turned
 from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint_set import ConstraintSet
@@ -38,22 +39,8 @@ BONDS = np.array([[0, 1], [1, 2], [2, 3]])
 TRIPLES = np.array([[0, 1, 2], [1, 2, 3]])
 
 
-def build(size: int = 1, seed: int = 1) -> TestSystem:
-    """One molecule.
-
-    Parameters
-    ----------
-    size : int
-        Has to be 1.
-    seed : int
-        Without meaning: the start is fixed.
-
-    Raises
-    ------
-    InputError
-        Another size.
-    """
-    single(size, "butane is one molecule")
+def build(size: int, seed: int) -> TestSystem:
+    """One molecule; its start is fixed."""
     return TestSystem(
         name="butane",
         title=f"four-atom chain, 3 bonds and 2 angles held, torsion {BARRIER:g} (1 + cos 3φ)",
@@ -138,3 +125,6 @@ def twist(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Refe
         return np.asarray(center + drift * time + turned(y[:4], shape(y[4])[0]))
 
     return integrated(rate, start, time, place, "equations of rotation and torsion")
+
+
+add_system("butane", build, "four-atom chain, bonds and angles held, free torsion", unit="molecule", only=True)

@@ -9,6 +9,7 @@ from ase import units
 
 from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, ASE_TIME, OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Evaluate, Potential
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
@@ -33,22 +34,8 @@ SHAPES = {
 }
 
 
-def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> TestSystem:
-    """A chain of `size` bonds; every atom is tied to its initial place by a soft anisotropic spring.
-
-    Parameters
-    ----------
-    size : int
-        Bonds.
-    seed : int
-        Of the velocities, and of the random walk.
-    shape : {'zigzag', 'straight', '175', 'free'}
-
-    Raises
-    ------
-    InputError
-        No bond, or an unknown shape.
-    """
+def build(size: int, seed: int, *, shape: str = "zigzag") -> TestSystem:
+    """A chain of `size` bonds; every atom is tied to its initial place by a soft anisotropic spring."""
     if size < 1:
         raise InputError(f"a chain needs at least one bond, not {size}", item="size")
     x = positions(size, shape, seed)
@@ -75,6 +62,7 @@ def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> TestSyste
         time_steps=tuple(pace * dt * units.fs for dt in steps),
         bonds=pairs,
         openmm=OpenMMEngine(lambda: _system(x, pairs, masses)),
+        thermal_energy=units.kB * TEMPERATURE,
     )
 
 
@@ -128,3 +116,13 @@ def _system(start: FloatArray, pairs: IntArray, masses: FloatArray) -> Any:
     for atom, site in enumerate(centre * ASE_LENGTH):
         field.addParticle(atom, site.tolist())
     return system_of(masses, field, pairs=pairs, lengths=BOND * ASE_LENGTH)
+
+
+for _shape, _text in (
+    ("zigzag", "zigzag chain, all bonds held"),
+    ("straight", "straight chain"),
+    ("175", "nearly straight chain, 175°"),
+    ("free", "freely jointed chain"),
+):
+    _name = "chain" if _shape == "zigzag" else f"chain-{_shape}"
+    add_system(_name, build, _text, size=100, quick_size=20, unit="bonds", shape=_shape)

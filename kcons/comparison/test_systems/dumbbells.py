@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from kcons.comparison.test_systems.minimal import integrated
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Evaluate, Potential
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import Reference, TestSystem, Units, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
@@ -55,21 +56,8 @@ SMALLEST = 8
 CUTOFF, SWITCH = 2.5, 0.7
 
 
-def build(size: int = 2, seed: int = 1) -> TestSystem:
-    """Two dumbbells that collide, or a box of `size` of them.
-
-    Parameters
-    ----------
-    size : int
-        2, or at least 8.
-    seed : int
-        Of orientations and velocities in the box; the collision is fixed.
-
-    Raises
-    ------
-    InputError
-        Another size.
-    """
+def build(size: int, seed: int) -> TestSystem:
+    """Two dumbbells that collide from a fixed start, or a box of at least 8 of them."""
     if size == 2:
         return _collision()
     if size < SMALLEST:
@@ -192,6 +180,7 @@ def _box(size: int, seed: int) -> TestSystem:
         bonds=_pairs(size),
         cell=np.full(3, side),
         openmm=OpenMMEngine(lambda: _box_system(masses, side, cutoff), length=1.0, time=1.0),
+        thermal_energy=TEMPERATURE,
     )
 
 
@@ -239,3 +228,6 @@ def _box_system(masses: FloatArray, side: float, cutoff: float) -> Any:
     system = system_of(masses, force, pairs=pairs, lengths=BOND)
     system.setDefaultPeriodicBoxVectors(*(np.eye(3) * side))
     return system
+
+
+add_system("dumbbells", build, "collision of two rigid dumbbells; a periodic box from 8 on", size=2, unit="dumbbells")

@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 
 from kcons.comparison.test_systems.system import Reference
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 
 #: Relative tolerance: the least that SciPy accepts, and a larger one whose difference tells the error.
 FINEST, COARSER = 2.3e-14, 1e-13
@@ -57,14 +56,3 @@ def turned(q: FloatArray, r: FloatArray) -> FloatArray:
     axis, scalar = q[:3] / np.linalg.norm(q), q[3] / np.linalg.norm(q)
     across = np.cross(axis, r)
     return np.asarray(r + 2.0 * (scalar * across + np.cross(axis, across)))
-
-
-def single(size: int, what: str) -> None:
-    """Complain unless `size` is 1.
-
-    Raises
-    ------
-    InputError
-    """
-    if size != 1:
-        raise InputError(f"{what}; it cannot be built at size {size}", item="size")

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ellipj
 
-from kcons.comparison.test_systems.minimal import integrated, single
+from kcons.comparison.test_systems.minimal import integrated
 from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Distance, Sphere
 from kcons.constraints.constraint import Constraint
@@ -55,24 +56,9 @@ PENDULUMS = {
 }
 
 
-def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> TestSystem:
-    """One of `PENDULUMS`.
-
-    Parameters
-    ----------
-    size : int
-        Has to be 1.
-    seed : int
-        Without meaning: the start is fixed.
-    kind : str
-
-    Raises
-    ------
-    InputError
-        Another size.
-    """
+def build(size: int, seed: int, *, kind: str = "pendulum") -> TestSystem:
+    """One of `PENDULUMS`; its start is fixed."""
     chosen = PENDULUMS[kind]
-    single(size, f"{kind} is a single system")
     angles, rates = np.array(chosen.angles), np.array(chosen.rates)
     x, masses = chosen.places(angles), np.array(chosen.masses)
     links = len(masses)
@@ -141,3 +127,11 @@ def _angles(chosen: Pendulum, time: float) -> Reference:
 
     start = np.array(chosen.angles + chosen.rates)
     return integrated(rate, start, time, lambda y: chosen.places(y[:count]), "Lagrange's equations of the angles")
+
+
+for _name, _text in (
+    ("pendulum", "planar pendulum from 179.9°; closed form"),
+    ("double-pendulum", "planar double pendulum"),
+    ("triple-pendulum", "planar triple pendulum"),
+):
+    add_system(_name, build, _text, unit="pendulum", only=True, kind=_name)

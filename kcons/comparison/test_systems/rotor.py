@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.minimal import integrated, spin, turned
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
@@ -46,23 +47,8 @@ VELOCITIES = {
 PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
-def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> TestSystem:
-    """The body, with one of two starts.
-
-    Parameters
-    ----------
-    size : int
-        Has to be 1.
-    seed : int
-        Without meaning: the start is fixed.
-    start : {'rotor', 'tennis-racket'}
-
-    Raises
-    ------
-    InputError
-        Another size.
-    """
-    single(size, f"{start} is one rigid body")
+def build(size: int, seed: int, *, start: str = "rotor") -> TestSystem:
+    """The body, with the start 'rotor' or 'tennis-racket'."""
     v = VELOCITIES[start]
     lengths = np.linalg.norm(POSITIONS[PAIRS[:, 0]] - POSITIONS[PAIRS[:, 1]], axis=1)
     # Half of the tennis racket's horizon lies before its first flip.
@@ -102,3 +88,9 @@ def flight(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Ref
     return integrated(
         rate, start, time, lambda y: center + drift * time + turned(y[:4], r), "Euler's equations and a quaternion"
     )
+
+
+add_system("rotor", build, "asymmetric top of 4 atoms; Euler's equations", unit="rigid body", only=True)
+add_system(
+    "tennis-racket", build, "the same, about its middle axis", unit="rigid body", only=True, start="tennis-racket"
+)

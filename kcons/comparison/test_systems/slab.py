@@ -10,6 +10,7 @@ from ase.build import fcc111
 from ase.calculators.emt import EMT
 
 from kcons.comparison.test_systems.potential import of_calculator
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
@@ -24,20 +25,8 @@ VACUUM = 6.0
 TEMPERATURE = 300.0
 
 
-def build(size: int = 1, seed: int = 1) -> TestSystem:
-    """`size` molecules, one on each 2 x 2 patch; patches beyond their number are left bare.
-
-    Parameters
-    ----------
-    size : int
-    seed : int
-        Of the tilt of the molecules and the velocities.
-
-    Raises
-    ------
-    InputError
-        No molecule.
-    """
+def build(size: int, seed: int) -> TestSystem:
+    """`size` molecules, one on each 2 x 2 patch; patches beyond their number are left bare."""
     if size < 1:
         raise InputError(f"the slab needs at least one molecule, not {size}", item="size")
     across = math.ceil(math.sqrt(size))
@@ -73,4 +62,8 @@ def build(size: int = 1, seed: int = 1) -> TestSystem:
         bonds=pairs,
         fixed=fixed,
         cell=cell,
+        thermal_energy=units.kB * TEMPERATURE,
     )
+
+
+add_system("slab", build, "rigid CO on Cu(111), lower layers fixed, EMT forces", unit="molecules")

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import REDUCED, Reference, TestSystem
 from kcons.constraints import Sphere
 from kcons.constraints.constraint_set import ConstraintSet
@@ -20,32 +21,12 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 RADIUS = 1.0
-NO_SPHERE = "ASE has no constraint that holds an atom on a sphere"
-
-
-#: The start near the top: angles from it, and speeds.
+#: The start near the top: angles from it, and speeds. What a method does wrong there is magnified a hundred times.
 TILT, SLOW = 0.02, 0.01
 
 
-def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool = False) -> TestSystem:
-    """`size` independent particles, each on its own sphere of radius 1.
-
-    Parameters
-    ----------
-    size : int
-    seed : int
-        Of places and velocities; speeds lie between 0.5 and 1.
-    gravity : float
-        Acceleration along -z; 0 gives free particles.
-    near_top : bool
-        Start within `TILT` of the unstable upright position, slowly: what a method does wrong there is magnified a
-        hundred times before the pendulums have fallen.
-
-    Raises
-    ------
-    InputError
-        No particle.
-    """
+def build(size: int, seed: int, *, gravity: float = 0.0, near_top: bool = False) -> TestSystem:
+    """`size` particles, each on its own sphere of radius 1, with speeds between 0.5 and 1."""
     if size < 1:
         raise InputError(f"a test system needs at least one particle, not {size}", item="size")
     rng = np.random.default_rng(seed)
@@ -89,7 +70,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool
         time_steps=(0.2, 0.1, 0.05, 0.025),
         tolerances=(1e-3, 1e-6, 1e-9),
         units=REDUCED,
-        refusals={"ase-bonds": NO_SPHERE, "ase-internals": NO_SPHERE},
+        refusals=dict.fromkeys(("ase-bonds", "ase-internals"), "ASE has no constraint that holds an atom on a sphere"),
         solution=pendulums if gravity else great_circles,
         openmm=OpenMMEngine(lambda: _system(masses, gravity), length=1.0, time=1.0, surfaces=[spheres]),
     )
@@ -117,3 +98,17 @@ def _system(masses: FloatArray, gravity: float) -> Any:
     for k in range(len(masses)):
         field.addParticle(k)
     return system_of(masses, *([field] if gravity else []))
+
+
+add_system("sphere", build, "free particles on spheres; closed form", size=10, quick_size=2, unit="particles")
+add_system("sphere-pendulum", build, "spherical pendulums", size=10, quick_size=2, unit="particles", gravity=1.0)
+add_system(
+    "sphere-pendulum-top",
+    build,
+    "spherical pendulums from near the top",
+    size=10,
+    quick_size=2,
+    unit="particles",
+    gravity=1.0,
+    near_top=True,
+)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import lzma
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from importlib.util import find_spec
 from io import StringIO
@@ -15,8 +14,9 @@ from typing import Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.test_systems.minimal import single
 from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, place, properties
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.registry import STRUCTURE_OPTIONS, add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
@@ -38,70 +38,45 @@ FEW_ATOMS, MANY_ATOMS = 200, 3000
 TORN = 0.5
 
 
-@dataclass(frozen=True)
-class _Known:
-    text: str
-    file: str
-    constrain: str
-    relax: int
-
-
-STRUCTURES: Mapping[str, _Known] = {
-    "alanine": _Known("alanine dipeptide in vacuum", "alanine-dipeptide-implicit.pdb.xz", "allbonds", 100),
-    "dhfr": _Known("dihydrofolate reductase in vacuum", "5dfr_minimized.pdb.xz", "allbonds", 20),
-    "dhfr-water": _Known("dihydrofolate reductase in water", "5dfr_solv-cube_equil.pdb.xz", "hbonds", 10),
-    "villin": _Known("villin headpiece in water", "", "hbonds", 20),
+#: File (of the package, or of OpenMM where none is named), what is held, steps of minimisation, and what it is.
+STRUCTURES: Mapping[str, tuple[str, str, int, str]] = {
+    "alanine": ("alanine-dipeptide-implicit.pdb.xz", "allbonds", 100, "alanine dipeptide in vacuum"),
+    "dhfr": ("5dfr_minimized.pdb.xz", "allbonds", 20, "dihydrofolate reductase in vacuum"),
+    "dhfr-water": ("5dfr_solv-cube_equil.pdb.xz", "hbonds", 10, "dihydrofolate reductase in water"),
+    "villin": ("", "hbonds", 20, "villin headpiece in water"),
 }
 
 
 def build(
-    size: int = 1,
-    seed: int = 1,
+    size: int,
+    seed: int,
     *,
-    structure: str = "alanine",
+    structure: str,
     constrain: str = "",
     force_field: Sequence[str] = FORCE_FIELD,
     platform: str = "",
 ) -> TestSystem:
-    """One of the structures that come with the package, or with OpenMM.
-
-    Parameters
-    ----------
-    size : int
-        Has to be 1.
-    seed : int
-        Of the velocities.
-    structure : str
-        A key of `STRUCTURES`.
-    constrain, force_field, platform
-        As for `from_file`; by default what is usual for the structure.
-
-    Raises
-    ------
-    InputError, UnsupportedError
-        Another size; what `from_file` raises.
-    """
-    single(size, f"{structure} is one system")
+    """One of the structures that come with the package, or with OpenMM; options as for `from_file`."""
     _need_openmm()
     from openmm import app
 
-    known = STRUCTURES[structure]
-    if known.file:
-        with resources.files("kcons.comparison.test_systems").joinpath(f"data/{known.file}").open("rb") as file:
-            text = lzma.decompress(file.read()).decode()
+    name, held, relax, text = STRUCTURES[structure]
+    if name:
+        with resources.files("kcons.comparison.test_systems").joinpath(f"data/{name}").open("rb") as file:
+            lines = lzma.decompress(file.read()).decode()
     else:
-        text = (Path(app.__file__).parent / "data" / "test.pdb").read_text()
-    molecule = app.PDBFile(StringIO(text))
+        lines = (Path(app.__file__).parent / "data" / "test.pdb").read_text()
+    molecule = app.PDBFile(StringIO(lines))
     return _test_system(
         structure,
-        known.text,
+        text,
         molecule.topology,
         _nanometers(molecule),
         seed,
-        constrain=constrain or known.constrain,
+        constrain=constrain or held,
         field=force_field_of(force_field),
         platform=platform,
-        relax=known.relax,
+        relax=relax,
     )
 
 
@@ -312,23 +287,38 @@ def _test_system(
         x = _relaxed(system_of(topology, field, None, False), x, platform, relax)
     # SETTLE's lengths are rounded to single precision: with the same ones, all MD engines run the same system.
     held = ConstraintSet(Distance(rows.pairs, rows.lengths / ASE_LENGTH), x / ASE_LENGTH, rows.masses)
-    motion = Motion(held, x / ASE_LENGTH)
-    on = motion.restore_positions(x / ASE_LENGTH)
     md_engine = OpenMMEngine(lambda: system, platform=platform, home=True)
-    potential = md_engine.potential()
-    what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances, {TEMPERATURE:g} K"
-    return TestSystem(
-        name=name,
-        title=f"{what}; {'PME, ' if box is not None else ''}{potential.name}",
-        constraint_set=held,
-        positions=on,
-        velocities=thermal_velocities(motion, on, TEMPERATURE, seed),
-        potential=potential,
+    what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances"
+    return molecules_at_300_k(
+        name,
+        f"{what}, {TEMPERATURE:g} K; {'PME, ' if box is not None else ''}",
+        held,
+        x / ASE_LENGTH,
+        seed,
+        potential=md_engine.potential(),
         symbols=[atom.element.symbol if atom.element is not None else "X" for atom in topology.atoms()],
         bonds=rows.pairs,
         cell=None if box is None else box / ASE_LENGTH,
         openmm=md_engine,
+    )
+
+
+def molecules_at_300_k(
+    name: str, title: str, held: ConstraintSet, x: FloatArray, seed: int, *, potential: Potential, **more: Any
+) -> TestSystem:
+    """A test system of molecules from a file: on the constraints, with thermal velocities, steps and horizon."""
+    motion = Motion(held, x)
+    on = motion.restore_positions(x)
+    return TestSystem(
+        name=name,
+        title=title + potential.name,
+        constraint_set=held,
+        positions=on,
+        velocities=thermal_velocities(motion, on, TEMPERATURE, seed),
+        potential=potential,
+        thermal_energy=units.kB * TEMPERATURE,
         **steps_of(len(x)),
+        **more,
     )
 
 
@@ -393,3 +383,12 @@ def _relaxed(flexible: Any, x: FloatArray, platform: str, iterations: int) -> Fl
     openmm.LocalEnergyMinimizer.minimize(context, 10.0, iterations)
     state = context.getState(positions=True)
     return np.asarray(state.getPositions(asNumpy=True).value_in_unit(unit.nanometer))
+
+
+for _name, _text, _unit in (
+    ("alanine", "alanine dipeptide, all bonds held; OpenMM", "molecule"),
+    ("dhfr", "a protein, 2489 atoms, all bonds held; OpenMM", "system"),
+    ("dhfr-water", "the same in water, 23558 atoms; OpenMM", "system"),
+    ("villin", "protein in water, 8867 atoms; OpenMM", "system"),
+):
+    add_system(_name, build, _text, unit=_unit, only=True, takes=STRUCTURE_OPTIONS[:3], structure=_name)

@@ -102,10 +102,8 @@ class TestSystem:
         How OpenMM runs it: the same masses and forces as a System.
     reference_pace : float
         The finest step compared, times this, decides about the work of a converged reference.
-    friction : float
-        Rate at which velocities die away, beside the forces; methods that have no friction cannot run the test system.
-    shortfall : callable, optional
-        Where the goal is known and not the way: what is taken for the error, as a function of the positions.
+    thermal_energy : float
+        k_B T of its velocities; 0 for test systems that have no temperature.
     """
 
     #: For pytest, which collects classes of such names.
@@ -131,8 +129,7 @@ class TestSystem:
     cell: FloatArray | None = None
     openmm: OpenMMEngine | None = None
     reference_pace: float = 1.0
-    friction: float = 0.0
-    shortfall: Callable[[FloatArray], float] | None = None
+    thermal_energy: float = 0.0
 
     @cached_property
     def motion(self) -> Motion:
@@ -198,9 +195,7 @@ class TestSystem:
         return converged(self, self.reference_pace * min(self.time_steps), progress=progress)
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
-        """Root-mean-square distance an atom; the shortfall where the test system has one."""
-        if self.shortfall is not None:
-            return self.shortfall(positions)
+        """Root-mean-square distance an atom."""
         return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
 
     def residuals(self, x: FloatArray, v: FloatArray, time: float = 0.0) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from ase.calculators.tip3p import TIP3P
 
 from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
@@ -33,26 +34,12 @@ SMALLEST = 8
 MANY = 2000
 
 
-def build(size: int = 64, seed: int = 1, *, forces: str = "") -> TestSystem:
-    """`size` molecules.
-
-    Parameters
-    ----------
-    size : int
-        Molecules. 64 and 216 times a cube are replicas of an equilibrated box; others are cut out of one
-        and relaxed.
-    seed : int
-        Of the velocities.
-    forces : {'', 'openmm', 'ase'}
-        OpenMM's PME, or ASE's own TIP3P calculator; by default the first where openmm is installed.
-
-    Raises
-    ------
-    InputError
-        Fewer than 8 molecules; unknown `forces`.
-    """
+def build(size: int, seed: int, *, forces: str = "") -> TestSystem:
+    """`size` molecules with forces of 'openmm' (PME; the default where it is installed) or of 'ase' (its TIP3P)."""
     if size < SMALLEST:
-        raise InputError(f"a box of {size} molecules is too small for periodic forces; use at least {SMALLEST}")
+        raise InputError(
+            f"a box of {size} molecules is too small for periodic forces; use at least {SMALLEST}", item="size"
+        )
     forces = forces or ("openmm" if find_spec("openmm") else "ase")
     x, box, equilibrated = _molecules(size)
     triples = np.arange(3 * size).reshape(-1, 3)
@@ -83,6 +70,7 @@ def build(size: int = 64, seed: int = 1, *, forces: str = "") -> TestSystem:
         tolerances=(1e-3, 1e-4, 1e-5),
         bonds=pairs,
         cell=cell,
+        thermal_energy=units.kB * TEMPERATURE,
         openmm=None
         if forces == "ase"
         else OpenMMEngine(lambda: _system(box, cutoff, masses, pairs, lengths), platform="CPU"),
@@ -158,3 +146,8 @@ def _system(box: float, cutoff: float, masses: FloatArray, pairs: Any = (), leng
     system = system_of(masses, force, pairs=pairs, lengths=np.asarray(lengths) * ASE_LENGTH)
     system.setDefaultPeriodicBoxVectors(*(np.eye(3) * box / 10))
     return system
+
+
+add_system(
+    "water", build, "box of rigid TIP3P water, PME forces", size=64, quick_size=8, unit="molecules", takes=("forces",)
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import beads as beads  # test systems of the tests alone
 import pytest
 from peer_packages import check_order_two, need
 

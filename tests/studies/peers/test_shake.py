@@ -42,5 +42,4 @@ def test_a_run_goes_back_to_its_start_and_repeats():
 def test_refusals():
     refuses = METHODS["shake-1e-8"].refuses
     assert "distances only" in refuses(test_systems.build("sphere", 2))
-    assert "no friction" in refuses(test_systems.build("fekete"))
     assert refuses(test_systems.build("slab")) is None

@@ -1,0 +1,108 @@
+"""Test systems by name: `add_system` registers them, `build` makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from kcons.comparison.test_systems.system import TestSystem
+from kcons.errors import InputError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A test system by name; see `add_system`."""
+
+    make: Callable[..., TestSystem]
+    text: str
+    size: int
+    quick_size: int
+    unit: str
+    only: bool
+    takes: Collection[str]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+SYSTEMS: dict[str, Entry] = {}
+#: Options that say what is held in molecules with forces of OpenMM.
+STRUCTURE_OPTIONS = ("constrain", "force_field", "platform", "add_hydrogens")
+
+
+def add_system(
+    name: str,
+    make: Callable[..., TestSystem],
+    text: str,
+    *,
+    size: int = 1,
+    quick_size: int | None = None,
+    unit: str = "system",
+    only: bool = False,
+    takes: Collection[str] = (),
+    **options: Any,
+) -> None:
+    """Register a test system for `build` and `kcons compare`.
+
+    Parameters
+    ----------
+    name : str
+        By which it is chosen. A test system of that name is replaced.
+    make : callable
+        Size, seed and options to a `TestSystem`.
+    text : str
+        For the list of test systems.
+    size, quick_size : int
+        By default, and with `quick`.
+    unit : str
+        What the size counts.
+    only : bool
+        Whether it has this size and no other.
+    takes : collection of str
+        Options of `make` that may be chosen.
+    **options
+        Options of `make` that belong to the name.
+    """
+    SYSTEMS[name] = Entry(make, text, size, size if quick_size is None else quick_size, unit, only, takes, options)
+
+
+def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False, **options: Any) -> TestSystem:
+    """The test system called `name`.
+
+    Parameters
+    ----------
+    name : str
+        A key of `SYSTEMS`.
+    size : int, optional
+        Number of molecules, bonds or particles.
+    seed : int
+    quick : bool
+        A smaller default size, half the horizon.
+    **options
+        What the test system takes, for example ``forces='ase'`` for water.
+
+    Raises
+    ------
+    InputError
+        Unknown name; a size the test system cannot be built at; an option that it does not take.
+    """
+    if name not in SYSTEMS:
+        raise InputError(
+            f"there is no test system {name!r}{did_you_mean(name, SYSTEMS)}; there are {', '.join(SYSTEMS)}",
+            item="scene",
+        )
+    entry = SYSTEMS[name]
+    if size is None:
+        size = entry.quick_size if quick else entry.size
+    if entry.only and size != entry.size:
+        raise InputError(f"{name} is one {entry.unit}; it cannot be built at size {size}", item="size")
+    for option in sorted(set(options) - set(entry.takes)):
+        if option in STRUCTURE_OPTIONS:
+            names = ", ".join(key for key, other in SYSTEMS.items() if option in other.takes)
+            raise InputError(
+                "what to hold, the force field and the platform can be chosen for "
+                f"{names or 'files'} and PDB files, not for {name!r}",
+                item=option,
+            )
+        raise InputError(f"{name} takes {', '.join(entry.takes) or 'no options'}, not {option}", item=option)
+    system = entry.make(size, seed, **{**entry.options, **options})
+    return system.shortened(2) if quick else system

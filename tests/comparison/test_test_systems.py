@@ -1,0 +1,363 @@
+"""Test systems: their contract, their geometry, and solutions that share nothing with the engine.
+
+Starts, forces, orders and stored solutions of all of them: tests/contracts/test_all_test_systems.py.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ase import Atoms, units
+from ase.calculators.calculator import CalculationFailed, Calculator
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+from small_test_systems import SMALL, end, small
+
+from kcons.comparison import Potential, add_system, compare, test_systems
+from kcons.comparison.test_systems import butane, chain, dumbbells, rotor, sphere, water
+from kcons.comparison.test_systems.minimal import integrated, spin, turned
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
+from kcons.comparison.test_systems.potential import of_calculator
+from kcons.comparison.test_systems.system import converged, thermal_velocities
+from kcons.constraints import Dihedral
+from kcons.errors import CalculatorError, InputError
+from kcons.steppers import State, System, run
+
+
+def apart(system):
+    """Distances of all atoms to their nearest images, shape (n, n)."""
+    d = system.positions[:, None] - system.positions
+    return np.linalg.norm(d - system.cell * np.round(d / system.cell), axis=2)
+
+
+# -- the contract -----------------------------------------------------------------------------------
+
+
+def test_a_test_system_of_ones_own():
+    def two(size, seed, *, stretch=1.0):
+        return replace(small("rotor"), name="mine", title=f"{size} {stretch}")
+
+    add_system("mine", two, "mine", size=3, quick_size=2, takes=("stretch",))
+    add_system("only", two, "one", unit="pair of atoms", only=True, stretch=2.0)
+    try:
+        assert test_systems.build("mine", stretch=4.0).title == "3 4.0"
+        assert test_systems.build("mine", quick=True).horizon == small("rotor").horizon / 2
+        assert test_systems.build("only").title == "1 2.0"
+        with pytest.raises(InputError, match="only is one pair of atoms; it cannot be built at size 2"):
+            test_systems.build("only", 2)
+        with pytest.raises(InputError, match="mine takes stretch, not bend"):
+            test_systems.build("mine", bend=1.0)
+        assert list(compare(test_systems.build("only"), ["rattle"], rounds=0).status) == ["ok"] * 4
+    finally:
+        del test_systems.SYSTEMS["mine"], test_systems.SYSTEMS["only"]
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_atoms_carry_the_system(name):
+    system = small(name)
+    atoms = system.atoms()
+    assert not atoms.constraints
+    np.testing.assert_array_equal(atoms.positions, system.positions)
+    np.testing.assert_allclose(atoms.get_velocities(), system.velocities, rtol=1e-14, atol=1e-300)
+    np.testing.assert_array_equal(atoms.get_forces(), system.potential.forces(system.positions))
+    assert atoms.get_potential_energy() == system.potential.energy(system.positions)
+    np.testing.assert_array_equal(atoms.get_masses(), system.masses)
+
+
+def test_error_estimate_of_the_converged_reference_is_honest():
+    system = small("chain")
+    fine = converged(system, min(system.time_steps) / 4)
+    assert fine.error < 1e-12
+    for dt in (4 * max(system.time_steps), 2 * max(system.time_steps)):
+        coarse = converged(system, dt)
+        assert 0.05 * coarse.error < system.deviation(coarse.positions, fine.positions) < coarse.error
+        assert coarse.error > 100 * fine.error
+    rng = np.random.default_rng(4)
+
+    def noisy(x):
+        energy, forces = system.potential.energy(x), system.potential.forces(x)
+        return energy, forces * (1 + 1e-6 * rng.standard_normal(forces.shape))
+
+    found = replace(system, potential=Potential(noisy, "noisy")).reference()
+    off = system.deviation(found.positions, fine.positions)
+    assert off > 1e3 * fine.error and 0.2 * off < found.error < 20 * off
+
+
+def test_thermal_velocities():
+    system = small("water")
+    draw = functools.partial(thermal_velocities, system.motion, system.positions, 300.0)
+    v, masses = draw(seed=3), system.masses[:, None]
+    assert np.abs(np.sum(masses * v, axis=0)).max() < 1e-12
+    assert 0.5 * np.sum(masses * v**2) == pytest.approx(0.5 * (6 * 8 - 3) * units.kB * 300.0, rel=1e-12)
+    assert np.array_equal(v, draw(seed=3)) and not np.allclose(v, draw(seed=4))
+
+
+@pytest.mark.parametrize(
+    ("dt", "words"), [(0.0, "positive step"), (-1.0, "positive"), (1e9, "positive"), (3.0, "does not divide")]
+)
+def test_bad_time_step(dt, words):
+    with pytest.raises(InputError, match=words):
+        small("chain").with_time_steps([dt])
+
+
+def test_time_steps_are_sorted_coarse_first():
+    system = small("chain").with_time_steps([2.5, 10.0, 5.0, 5.0])
+    np.testing.assert_allclose(np.array(system.time_steps) / units.fs, [10.0, 5.0, 2.5])
+
+
+@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "bead-rotating"])
+def test_shortened_system_has_its_solution_at_its_own_horizon(name):
+    half = small(name).shortened(2)
+    assert half.horizon == small(name).horizon / 2
+    system = System(half.motion, half.potential.forces)
+    last = run(system, State(half.positions, half.velocities), half.horizon / 800, 800)
+    assert half.deviation(last.positions, half.reference().positions) < 1e-4
+
+
+def test_a_moving_constraint_is_followed_in_time():
+    system = small("bead-rotating")
+    state = end(system, system.time_steps[-1])
+    assert system.residuals(state.positions, state.velocities, system.horizon) < (1e-12, 1e-12)
+    assert system.residuals(state.positions, state.velocities)[0] > 0.1
+
+
+# -- forces -----------------------------------------------------------------------------------------
+
+
+def test_a_potential_counts_points_not_calls_and_hands_out_copies():
+    potential, x = small("chain").potential, small("chain").positions
+    potential.forget()
+    first = potential.forces(x)
+    potential.energy(x)
+    first[:] = 0.0
+    assert potential.evaluations == 1 and np.abs(potential.forces(x.copy())).max() > 0
+    potential.watched(x + 0.2)
+    assert potential.evaluations == 1
+    potential.forces(x + 0.1)
+    assert potential.evaluations == 2
+
+
+def test_a_calculator_that_fails_is_told_of():
+    class Failing(Calculator):
+        implemented_properties = ["energy", "forces"]
+
+        def calculate(self, *_, **__):
+            raise CalculationFailed("SCF not\n converged")
+
+    potential = of_calculator(Atoms("H2", [[0, 0, 0], [0, 0, 1]]), Failing(), "ASE's failing")
+    with pytest.raises(CalculatorError, match="ASE's failing failed: SCF not converged; mend the start"):
+        potential.forces(np.zeros((2, 3)))
+
+
+@pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
+def test_openmm_forces_are_in_the_units_of_the_system():
+    """Two charges far apart without periodicity: Coulomb's law and Lennard-Jones by hand."""
+    import openmm
+
+    system, force = openmm.System(), openmm.NonbondedForce()
+    for q in (0.4, -0.4):
+        system.addParticle(1.0)
+        force.addParticle(q, 0.3, 0.5)
+    system.addForce(force)
+    pair, r = OpenMMEngine(lambda: system).potential(), 4.0
+    x = np.array([[0.0, 0, 0], [r, 0, 0]])
+    epsilon, s6 = 0.5 * units.kJ / units.mol, (3.0 / r) ** 6
+    coulomb = -0.16 * units.Hartree * units.Bohr / r
+    assert pair.energy(x) == pytest.approx(coulomb + 4 * epsilon * (s6**2 - s6), rel=1e-6)
+    pull = coulomb / r + 4 * epsilon * (12 * s6**2 - 6 * s6) / r
+    assert pair.forces(x)[1, 0] == pytest.approx(pull, rel=1e-6)
+    box = test_systems.build("water", 27, forces="openmm")
+    assert box.potential.name.startswith("PME, OpenMM")
+    assert np.abs(box.potential.forces(box.positions).sum(axis=0)).max() < 1e-2
+
+
+# -- what is built ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("shape", "angle"), [("zigzag", 112.0), ("175", 175.0), ("straight", 180.0)])
+def test_chain_shapes(shape, angle):
+    bonds = np.diff(chain.positions(7, shape), axis=0)
+    np.testing.assert_allclose(np.linalg.norm(bonds, axis=1), chain.BOND, rtol=1e-14)
+    cosine = np.sum(bonds[1:] * bonds[:-1], axis=1) / chain.BOND**2
+    np.testing.assert_allclose(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 180.0 - angle, atol=1e-5)
+    with pytest.raises(InputError, match="no chain shape 'bent'"):
+        chain.positions(4, "bent")
+
+
+def test_ethanol():
+    system = small("ethanol")
+    symbols = np.array(system.symbols)
+    bonds = sorted("".join(sorted(symbols[pair])) for pair in system.angle_bonds)
+    assert bonds == ["CC"] + ["CH"] * 5 + ["CO"] + ["HO"]
+    assert (len(system.angles), system.motion.rank, system.motion.degrees_of_freedom) == (13, 19, 8)
+    assert len(system.bonds) == 21  # the same set by distances alone
+    if find_spec("tblite") is not None:
+        assert "xTB" in test_systems.build("ethanol").potential.name
+
+
+@pytest.mark.parametrize("size", [64, 216, 512])
+def test_equilibrated_water_needs_no_relaxation(size):
+    x, box, equilibrated = water._molecules(size)
+    assert equilibrated and x.shape == (3 * size, 3)
+    assert size / box**3 * 18.0154 / 0.602214 == pytest.approx(0.98, abs=0.005)  # g/cm3
+    d = x[::3][:, None] - x[::3]
+    distance = np.linalg.norm(d - box * np.round(d / box), axis=2)[np.triu_indices(size, 1)]
+    assert 2.3 < distance.min() < 2.7
+    # First shell: four to five neighbours within 3.3 Å.
+    assert 4.0 < 2 * np.sum(distance < 3.3) / size < 5.5
+
+
+def test_cut_water_has_no_overlaps():
+    system = test_systems.build("water", 20, forces="ase")
+    assert apart(system)[::3, ::3][np.triu_indices(20, 1)].min() > 2.2
+    assert system.potential.energy(system.positions) / 20 < -0.2  # eV a molecule; ice is near -0.6
+
+
+@pytest.mark.parametrize("size", [8, 20])
+def test_box_of_dumbbells(size):
+    system = test_systems.build("dumbbells", size, seed=3)
+    assert (system.n_atoms, system.motion.rank) == (2 * size, size)
+    assert max(system.residuals(system.positions, system.velocities)) < 1e-14
+    other = np.arange(2 * size)[:, None] // 2 != np.arange(2 * size) // 2
+    assert apart(system)[other].min() > 1.0  # no overlaps
+    x, direction = system.positions, np.random.default_rng(1).standard_normal(system.positions.shape)
+    slope = (system.potential.energy(x + 1e-6 * direction) - system.potential.energy(x - 1e-6 * direction)) / 2e-6
+    assert slope == pytest.approx(-np.sum(system.potential.forces(x) * direction), rel=1e-6)
+    # Forces do not see where the box begins, nor by which image an atom is given.
+    moved = x + system.cell * np.array([0.3, 2.0, -1.0])
+    np.testing.assert_allclose(system.potential.forces(moved), system.potential.forces(x), atol=1e-11)
+    reference = system.reference()
+    errors = [system.deviation(end(system, dt).positions, reference.positions) for dt in system.time_steps[1:]]
+    np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.1)
+    assert reference.error < 1e-4 * errors[-1]
+
+
+def test_forces_of_dumbbells_vanish_smoothly_at_the_cutoff():
+    evaluate = dumbbells._with_cutoff(13.0, 2.5)
+    for r, share in ((1.6, 1.0), (2.125, 0.5), (2.5 - 1e-3, 0.0), (2.5 + 1e-3, 0.0)):
+        # Partners of both atoms out of reach; the pair meets through the boundary.
+        energy, forces = evaluate(np.array([[12.0, 0, 0], [12.0, 6, 0], [12.0 + r, 0, 0], [12.0 + r, 0, 6]]))
+        assert energy == pytest.approx(share * 4 * (r**-12 - r**-6), abs=1e-13)
+        if share == 1.0:
+            assert forces[2, 0] == pytest.approx(24 * (2 * r**-13 - r**-7), rel=1e-13)
+        elif share == 0.0:
+            assert np.abs(forces).max() < 1e-9
+        np.testing.assert_array_equal(forces[0], -forces[2])
+        assert not forces[[1, 3]].any()
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_slab_is_periodic_and_its_lower_layers_are_fixed(size):
+    system = test_systems.build("slab", size)
+    symbols, heights = np.array(system.symbols), system.positions[:, 2]
+    assert list(symbols[-2 * size :]) == ["C", "O"] * size
+    metal = np.flatnonzero(symbols == "Cu")
+    assert heights[system.fixed].max() < np.delete(heights, system.fixed).min()
+    assert len(system.fixed) == len(metal) // 2
+    assert system.motion.rank == size + 3 * len(system.fixed)
+    assert not system.velocities[system.fixed].any() and system.atoms().pbc.all()
+    # Of the molecule, carbon is the closer one, above an atom of the top layer.
+    for carbon, oxygen in system.bonds:
+        assert 1.5 < heights[carbon] - heights[metal].max() < 2.1
+        assert heights[oxygen] > heights[carbon] + 1.0
+    state = end(system, system.time_steps[0])
+    assert np.array_equal(state.positions[system.fixed], system.positions[system.fixed])
+
+
+# -- solutions --------------------------------------------------------------------------------------
+
+
+def test_quaternions_turn_vectors():
+    rng = np.random.default_rng(0)
+    q, omega, r, h = rng.standard_normal(4), rng.standard_normal(3), rng.standard_normal((5, 3)), 1e-5
+    np.testing.assert_allclose(turned(q, r), Rotation.from_quat(q).apply(r), atol=1e-14)
+    np.testing.assert_allclose(turned(3.0 * q, r), turned(q, r), atol=1e-14)
+    q /= np.linalg.norm(q)
+    change = (turned(q + h * spin(q, omega), r) - turned(q - h * spin(q, omega), r)) / (2 * h)
+    np.testing.assert_allclose(change, turned(q, np.cross(omega, r)), atol=1e-9)
+
+
+def test_integration_meets_the_exponential_and_states_an_honest_error():
+    matrix, start = np.array([[0.0, 1.0], [-4.0, -0.1]]), np.array([1.0, 0.5])
+    found = integrated(lambda t, y: matrix @ y, start, 7.0, lambda y: np.append(y, 0.0)[None], "a linear system")
+    off = np.linalg.norm(found.positions[0, :2] - expm(7.0 * matrix) @ start)
+    assert off < 1e-13 and off < found.error + 1e-15 < 1e-11
+    assert found.how == "a linear system, DOP853 at rtol 2.3e-14"
+
+
+def test_free_particles_stay_on_their_great_circles():
+    system = test_systems.build("sphere", 3, seed=5)
+    there, x, v = system.reference().positions[0], system.positions[0], system.velocities[0]
+    assert np.linalg.norm(there) == pytest.approx(1.0, abs=1e-14)
+    assert there @ np.cross(x, v) == pytest.approx(0.0, abs=1e-14)
+    # The angle covered is speed times time.
+    assert np.clip(there @ x, -1, 1) == pytest.approx(np.cos(np.linalg.norm(v) * system.horizon), abs=1e-13)
+
+
+def test_a_spherical_pendulum_meets_the_one_in_spherical_angles():
+    """45-digit solution."""
+    case = json.loads((Path(__file__).parents[1] / "reference/data/A02_spherical_pendulum_generic.json").read_text())
+    x, v = (np.array(case["initial"][key], dtype=float)[0] for key in ("positions", "velocities"))
+    (gravity,) = (force["g"] for force in case["forces"] if force["type"] == "uniform_acceleration")
+    (point,) = (np.array(c.get("point"), float) for c in case["constraints"] if c["type"] == "distance_to_point")
+    assert gravity[:2] == [0, 0]
+    for time, wanted in list(zip(case["times"], case["reference"]["positions"], strict=True))[1:4]:
+        found = sphere.swing(x - point, v, -gravity[2], time)
+        np.testing.assert_allclose(found + point, np.array(wanted, dtype=float)[0], atol=1e-11 * np.exp(0.3 * time))
+
+
+def test_a_symmetric_top_precesses_evenly():
+    """Four equal masses in a square: about its axis and about L, the body turns at two constant rates."""
+    x = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    omega, drift = np.array([0.5, 0.0, 0.8]), np.array([0.1, 0.2, 0.3])
+    about = np.array([2.0, 2.0, 4.0]) * omega / 2.0  # rate of precession L/I1, and what is left of the spin
+    own = np.array([0.0, 0.0, omega[2] - about[2]])
+    for time in (0.7, 5.0):
+        turn = Rotation.from_rotvec(about * time) * Rotation.from_rotvec(own * time)
+        found = rotor.flight(x, np.cross(omega, x) + drift, np.ones(4), time)
+        np.testing.assert_allclose(found.positions, turn.apply(x) + time * drift, atol=1e-12)
+        assert found.error < 1e-11
+
+
+@pytest.mark.parametrize("start", rotor.VELOCITIES)
+def test_distances_of_the_top_stay_and_the_start_is_the_start(start):
+    v, h, pairs = rotor.VELOCITIES[start], 1e-4, rotor.PAIRS
+    flight = functools.partial(rotor.flight, rotor.POSITIONS, v, rotor.MASSES)
+    np.testing.assert_allclose((flight(h).positions - flight(-h).positions) / (2 * h), v, atol=1e-7)
+    x = flight(test_systems.build(start).horizon).positions
+    was, now = (np.linalg.norm(y[pairs[:, 0]] - y[pairs[:, 1]], axis=1) for y in (rotor.POSITIONS, x))
+    np.testing.assert_allclose(now, was, atol=1e-12)
+
+
+def test_the_torsion_of_butane():
+    row = Dihedral([[0, 1, 2, 3]])
+    for seed in range(4):
+        x = butane.POSITIONS + 0.3 * np.random.default_rng(seed).normal(size=(4, 3))
+        phi = float(row.measure(x[row.atoms], 0.0)[0])
+        energy, forces = butane.torsion(x)
+        assert energy == pytest.approx(butane.BARRIER * (1 + np.cos(3 * phi)))
+        slope = 3 * butane.BARRIER * np.sin(3 * phi) * row.gradient(x[row.atoms], 0.0)[0]
+        np.testing.assert_allclose(forces, slope, atol=1e-12)
+
+
+def test_the_reference_of_butane_keeps_rows_momenta_and_energy():
+    rows, h, m = test_systems.build("butane").constraint_set, 2e-4, butane.MASSES
+    energies, spins = [], []
+    for time in (0.0, 1.0):
+        twist = functools.partial(butane.twist, butane.POSITIONS, butane.VELOCITIES, m)
+        before, here, after = (twist(time + s).positions for s in (-h, 0.0, h))
+        assert np.abs(rows.value(here)).max() < 1e-12
+        v = (after - before) / (2 * h)
+        if time == 0.0:
+            np.testing.assert_allclose(here, butane.POSITIONS, atol=1e-14)
+            np.testing.assert_allclose(v, butane.VELOCITIES, atol=1e-6)
+        energies.append(butane.torsion(here)[0] + 0.5 * np.sum(m[:, None] * v**2))
+        spins.append(m @ np.cross(here, v))
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-6)
+    np.testing.assert_allclose(spins, [spins[0]] * 2, atol=1e-5)
