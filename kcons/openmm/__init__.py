@@ -18,7 +18,7 @@ try:
     from kcons.openmm.carried.carried_constraints import CarriedConstraints
     from kcons.openmm.carried.hold import hold, take_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
-    from kcons.openmm.collective.row_forces import Row, each_term
+    from kcons.openmm.collective.coordinates import Row, each_term
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
     from kcons.openmm.ensembles.molecular_pressure import PressureReporter, molecular_pressure

@@ -25,7 +25,7 @@ from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, Proje
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.hold import constraints_about
 from kcons.openmm.carried.requirements import refuse_virtual_sites, with_massless_atoms
-from kcons.openmm.collective.formula_rows import formula_rows
+from kcons.openmm.collective.coordinates import formula_rows
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.quantities import masses_of, nanometers
 from kcons.openmm.topology import bonds_of

@@ -321,13 +321,8 @@ class StepWriter:
         """Fly freely for h with velocities u, and go from there back onto all constraints."""
         p = self.program
         u = u if u.isidentifier() else f"({u})"
-        foreseen = "+".join(filter(None, [part.foresee(p) for part in self.parts]))
-        if foreseen:
-            p.each("xu", f"x+{h}*{u}", "where free motion leads (drift)")
-            p.each("x", f"xu+{foreseen}", "there, with what is foreseen")
-        else:
-            p.each("x", f"x+{h}*{u}", "move freely (drift)")
-            p.each("xu", "x", "where that leads")
+        p.each("x", f"x+{h}*{u}", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
         for part in self.parts:
             if not (part.meets_system or part.lands_last):
                 part.land(p, h)

@@ -179,16 +179,22 @@ MUTANTS = [
         "tests/openmm/ensembles/test_langevin_ensemble.py",
     ),
     (
-        "openmm/collective/small_algebra.py",
-        "{self.inverse(i, j)}+weight{c}*(more{c}_{i}-expected{c}_{i})*left{c}_{j}",
-        "{self.inverse(i, j)}+weight{c}*(more{c}_{i}+expected{c}_{i})*left{c}_{j}",
-        "tests/openmm/collective/test_small_algebra.py",
+        "openmm/collective/row_program.py",
+        "weight{c}*({of('more', i)}-{of('expected', i)})",
+        "weight{c}*({of('more', i)}+{of('expected', i)})",
+        "tests/openmm/collective/test_row_program.py::test_the_iteration_learns_from_each_push",
     ),
     (
-        "openmm/collective/small_algebra.py",
+        "openmm/collective/row_program.py",
         'p.let(f"back{c}_{i}_{j}", f"-({done})*back{c}_{i}_{i}"',
         'p.let(f"back{c}_{i}_{j}", f"({done})*back{c}_{i}_{i}"',
-        "tests/openmm/collective/test_small_algebra.py",
+        "tests/openmm/collective/test_row_program.py::test_the_iteration_learns_from_each_push",
+    ),
+    (
+        "openmm/collective/row_program.py",
+        "select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)",
+        "0*follows{c}",
+        "tests/openmm/collective/test_row_program.py::test_many_steps_look_less_often",
     ),
     (
         "openmm/surfaces/surface_step_writer.py",
@@ -273,10 +279,10 @@ MUTANTS = [
         "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
-        "openmm/collective/clock.py",
-        'p.write(f"clock_start{self.code}", time)',
-        'p.write(f"clock_start{self.code}", 0.0)',
-        "tests/openmm/collective/test_clock.py::test_members_of_a_compound_integrator_pull_in_turn",
+        "openmm/collective/row_program.py",
+        'clock_of(variables_of(before), notes["code"])',
+        "0.0",
+        "tests/openmm/collective/test_row_program.py::test_members_of_a_compound_integrator_pull_in_turn",
     ),
     (
         "openmm/carried/carried_constraints.py",
