@@ -9,7 +9,7 @@ from openmm import app, unit
 
 from kcons.constraints import Dihedral
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.hold import hold
 
 NM, PS = unit.nanometer, unit.picosecond
 

@@ -203,9 +203,6 @@ class Part(ABC):
         Written where the applied forces are computed anew.
         """
 
-    def begin_early(self, program: Program) -> None:
-        """The same where velocities are projected before the first drift."""
-
     def renew(self, program: Program) -> None:
         """Before a drift that follows a step without `project`, where v is free to be used."""
 

@@ -194,8 +194,6 @@ class StepWriter:
                     p.each("force", "f", "applied forces")
                     for part in self.parts:
                         part.begin(p)
-                        if self.ensemble.stays_tangent:
-                            part.begin_early(p)
             else:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")

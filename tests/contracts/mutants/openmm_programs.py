@@ -285,15 +285,15 @@ MUTANTS = [
         "tests/openmm/collective/test_row_program.py::test_members_of_a_compound_integrator_pull_in_turn",
     ),
     (
-        "openmm/carried/carried_constraints.py",
+        "openmm/callback_rows/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",
         "tests/openmm/integrator/states/test_settings.py::test_a_run_goes_on_bit_for_bit",
     ),
     (
-        "openmm/carried/carried_constraints.py",
+        "openmm/callback_rows/carried_constraints.py",
         "return self.motion.rank - 3 * fixed",
         "return self.motion.rank",
-        "tests/openmm/carried/test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
+        "tests/openmm/callback_rows/test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
     ),
 ]

@@ -12,8 +12,8 @@ from openmm_systems import alanine, context_of, dumbbell, loose_alanine, started
 
 from kcons.constraints import Distance, Plane, Sphere
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, SurfaceIntegrator
-from kcons.openmm.carried.callbacks import Engine
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.callbacks import Engine
+from kcons.openmm.callback_rows.hold import hold
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.integrator.step_counts import count_step, forces_at_old_positions

@@ -1,53 +1,50 @@
-"""The constraint objects of kcons in OpenMM, carried to the engine by PythonForces (see `carried.callbacks`)."""
+"""The constraint objects of kcons as a part of an integrator of OpenMM (see `callback_rows.callbacks`)."""
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable
-from typing import Literal
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, Self
 
 import numpy as np
 import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraints import Constraint
+from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InfeasibleError, InputError, KconsError
+from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
-from kcons.openmm.carried.callbacks import (
+from kcons.openmm.callback_rows.callbacks import (
+    CARRY_SCALE,
     LIVE,
+    LOW_SCALE,
     PHASES,
-    PREFIX,
     SPEED_SCALE,
     Callback,
     Engine,
     cell_of,
     force_name,
+    forces_of_rows,
+    hands_over_all,
 )
-from kcons.openmm.carried.carried_program import CarriedProgram
-from kcons.openmm.carried.passage import hands_over_all
-from kcons.openmm.carried.requirements import (
-    free_groups,
-    refuse_agents,
-    refuse_shared_atoms,
-    refuse_single_precision,
-    refuse_some_particles,
-    refuse_virtual_sites,
-    warned_of_rounding,
-    with_massless_atoms,
-)
-from kcons.openmm.integrator.part import NEAR, Miss
+from kcons.openmm.collective.coordinates import free_groups
+from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import require_context, virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
+#: Rounding of positions, relative to the shortest row, that a run begins to show.
+COARSE = 1e-11
 
-class CarriedConstraints(CarriedProgram):
+
+class CarriedConstraints(Part):
     """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
 
     Most often made by `hold`, which also moves constraints of the System that share atoms with the rows.
@@ -80,6 +77,8 @@ class CarriedConstraints(CarriedProgram):
     `CarriedConstraints.of` then finds them.
     """
 
+    evaluates = lands_last = True
+    written = (*Part.written, "_early", "_begins_early")
     _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
@@ -105,7 +104,7 @@ class CarriedConstraints(CarriedProgram):
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
         engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, degenerate, time)
         refuse_virtual_sites(system, engine.atoms, masses)
-        self._bind(engine, free_groups(system, len(PHASES)))
+        self._bind(engine, free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1])
 
     def _bind(self, engine: Engine, groups: list[int]) -> None:
         self.code = 0
@@ -122,25 +121,22 @@ class CarriedConstraints(CarriedProgram):
         InputError
             It has none.
         """
-        found = {force.getName(): force for force in system.getForces() if isinstance(force, openmm.PythonForce)}
-        keys = sorted({name.split()[-1] for name in found if name.startswith(PREFIX)})
-        keys = [key for key in keys if key in LIVE]
-        if len(keys) != 1:
+        found = {key: forces for key, forces in forces_of_rows(system).items() if key in LIVE}
+        if len(found) != 1:
             raise InputError(
-                f"the System carries {len(keys) or 'no'} sets of rows of kcons; expected one", item="system"
+                f"the System carries {len(found) or 'no'} sets of rows of kcons; expected one", item="system"
             )
-        part = object.__new__(cls)
-        mine = [found[force_name(phase, keys[0])] for phase in PHASES]
+        ((key, forces),) = found.items()
         if hands_over_all():
-            for force in mine:
+            for force in forces.values():
                 force.setParticles([])
-        part._bind(LIVE[keys[0]], [force.getForceGroup() for force in mine])
+        part = object.__new__(cls)
+        part._bind(LIVE[key], [forces[phase].getForceGroup() for phase in PHASES])
         part._look_at(system)
         return part
 
-    def forces(self) -> list[openmm.PythonForce]:
-        """The forces that carry the rows; `add_to` puts them into the System."""
-        forces = []
+    def add_to(self, system: openmm.System) -> None:
+        """Put the forces that carry the rows into the System; before the Context is made."""
         engine = self._engine
         for phase in PHASES:
             force = openmm.PythonForce(Callback(engine, phase))
@@ -149,12 +145,6 @@ class CarriedConstraints(CarriedProgram):
             force.setUsesPeriodicBoundaryConditions(engine.cell is not None)
             force.setForceGroup(self._groups[phase])
             force.setName(force_name(phase, engine.key))
-            forces.append(force)
-        return forces
-
-    def add_to(self, system: openmm.System) -> None:
-        """Put the forces into the System; before the Context is made."""
-        for force in self.forces():
             system.addForce(force)
         self._look_at(system)
 
@@ -345,21 +335,111 @@ class CarriedConstraints(CarriedProgram):
         """The error that stopped the engine, with the number of the step."""
         return self._engine.explained_error(step)
 
+    # -- the program ----------------------------------------------------------------------------
+
+    def declare(self, program: Program) -> None:
+        self._engine.follow(program.integrator, self.lean)
+        #: Where a step may end without a projection, the solve for positions must tell of failures itself.
+        self._early = self.lean or getattr(program.integrator, "scheme", None) is None
+        self._begins_early = getattr(getattr(program.integrator, "ensemble", None), "stays_tangent", False)
+
+    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
+        """Times, stages and lengths of drifts are those of the integrator that makes steps."""
+        super().serve(integrator, notes)
+        self._engine.follow(integrator, self.lean)
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Refuse single precision; what passes through OpenMM is known now."""
+        refuse_single_precision(precision)
+        self._engine.take_precision(precision)
+        if f"rest{self.code}" in program.settings:
+            program.set(f"rest{self.code}", float(self._engine.carries_rest))
+
+    def begin(self, program: Program) -> None:
+        """Where x is not where the last step ended, and velocities are projected before the first drift."""
+        if self._begins_early:
+            self.remember(program)
+
+    def _guard(self, program: Program, phase: str, words: str) -> None:
+        group = self._groups[phase]
+        program.let("failed", f"select(energy{group}, {self.code}, failed)", words)
+
+    def begin_run(self) -> None:
+        self._engine.begin_run()
+
+    def remember(self, program: Program) -> None:
+        words = "carried rows: positions whose gradients are taken"
+        if not self.lean or self._engine.timed:
+            self._guard(program, "remember", words)
+            return
+        with program.when("looked+moving != 0", "x need not be where the last drift ended"):
+            self._guard(program, "remember", words)
+
+    def land(self, program: Program, h: str) -> None:
+        change = f"f{self._groups['land']}"
+        if self._early:
+            self._guard(program, "land", "carried rows: solve for positions")
+            force, change = change, program.vector(f"change{self.code}", "what brings carried particles onto the rows")
+            program.each(change, force, "from the evaluation that tells of failures")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: onto them")
+
+    def land_alone(self, program: Program, u: str, h: str) -> None:
+        """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""
+        group = self._groups["land"]
+        program.each("x", f"x+{h}*{u}", "move freely (drift)")
+        self._guard(program, "land", "carried rows: solve for positions")
+        # Force and energy come from one evaluation, for this moves no x.
+        program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
+
+    def project(self, program: Program) -> None:
+        change = f"f{self._groups['project']}"
+        # Thermostats stir more than rounding does.
+        rest = self._engine.carries_rest
+        program.each("xu", "x", "to come back to")
+        program.each("x", f"x+{1 / SPEED_SCALE!r}*v", "carries v, exactly as far as it can be told from x")
+        self._guard(program, "project", "carried rows: solve for velocities")
+        carried = f"(x-xu)*{SPEED_SCALE!r}"
+        if rest:
+            program.setting(f"rest{self.code}", "1 where the rest of v matters: forces are double", 1.0)
+            program.vector("v_low", "what of v was too small to be carried together with x")
+            program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
+        program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
+        if rest:
+            with program.when(f"rest{self.code} != 0", "all digits"):
+                program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
+                self._guard(program, "project", "carried rows: the same for the rest")
+                back = 1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)
+                program.each("v", f"v+v_low+{back!r}*{change}", "tangent, all of it")
+        program.each("x", "xu", "back")
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """The same: the forces of the System call this engine, whichever integrator makes steps."""
+        return self
+
+    def __reduce__(self) -> tuple[object, ...]:
+        raise UnsupportedError(
+            "rows of hold belong to their System and cannot be pickled with an integrator; pickle the System, and make "
+            "another integrator with parts=[CarriedConstraints.of(system)]"
+        )
+
     def __repr__(self) -> str:
         return f"<CarriedConstraints: {self.motion.constraint_set.n_rows} rows on {len(self.atoms)} particles>"
 
 
+# -- what a System must be like -------------------------------------------------------------------
+
+
 def _check_system(system: openmm.System, engine: Engine, precision: Precision, *, alone: bool) -> None:
     """Raise where the System is not the one that the rows were built for; `alone` if it had no constraints."""
-    forces = {force.getName(): force for force in system.getForces()}
-    missing = {force_name(phase, engine.key) for phase in PHASES} - set(forces)
-    if missing:
+    forces = forces_of_rows(system).get(engine.key, {})
+    if set(forces) != set(PHASES):
         raise InputError(
             "the System has no forces that carry these rows; call add_to(system), or hold(system, ...), before "
             "the Context is made; those of a copy of a System are CarriedConstraints.of(copy)",
             item="system",
         )
-    refuse_some_particles(forces[force_name(PHASES[0], engine.key)], precision)
+    refuse_some_particles(forces[PHASES[0]], precision)
     now = masses_of(system)
     if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
         raise InputError("masses have changed since the rows were built; build them again", item="masses")
@@ -370,3 +450,107 @@ def _check_system(system: openmm.System, engine: Engine, precision: Precision, *
             item="system",
         )
     refuse_shared_atoms(system, set(engine.atoms.tolist()))
+
+
+def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
+    """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
+    if not all(isinstance(item, Constraint) for item in given):
+        return given  # ConstraintSet says what is wrong
+    used = [item.atoms.ravel() for item in given]
+    touched = np.unique(np.concatenate(used))
+    still = touched[touched < len(masses)]
+    still = still[masses[still] == 0]
+    fixed = [item.atoms.ravel() for item in given if item.family == "FixedAtoms"]
+    still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
+    return (*given, FixedAtoms(still)) if len(still) else given
+
+
+def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatArray) -> None:
+    """Refuse virtual sites among `atoms`, and what is no particle of the System."""
+    if atoms.max(initial=0) >= len(masses):
+        raise InputError(f"there is no atom {atoms.max()}; the System has {len(masses)} particles", item="atoms")
+    for atom in atoms[masses[atoms] == 0].tolist():
+        if system.isVirtualSite(atom):
+            raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
+
+
+def refuse_single_precision(precision: Precision) -> None:
+    """Refuse single precision: GPUs hand positions to PythonForces in the precision in which they store them."""
+    if precision.name == "single":
+        raise UnsupportedError(
+            f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
+            "Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform computes"
+        )
+
+
+def refuse_some_particles(force: openmm.PythonForce, precision: Precision) -> None:
+    """Refuse forces on some particles in mixed precision: OpenMM hands over their positions in single precision."""
+    if precision.name == "mixed" and force.getParticles():
+        raise UnsupportedError(
+            f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
+            "that are too coarse; read the System by CarriedConstraints.of(system) before the Context is made"
+        )
+
+
+def refuse_shared_atoms(system: openmm.System, touched: set[int]) -> None:
+    """Constraints of the System are solved by OpenMM, and must not share atoms with the rows."""
+    for k in range(system.getNumConstraints()):
+        i, j, _ = system.getConstraintParameters(k)
+        if touched & {i, j}:
+            raise UnsupportedError(
+                f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
+                "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+            )
+
+
+def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
+    """Warn of coordinates so large that their rounding adds noise to the velocities."""
+    if grain <= COARSE * scale:
+        return False
+    warnings.warn(
+        f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; each "
+        "step turns this into velocity, and the energy wanders. Move the origin nearer",
+        stacklevel=4,
+    )
+    return True
+
+
+def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
+    """Refuse barostats and other forces that move particles off the rows between steps."""
+    bound = next((item for item in held.constraints if not item.translation_invariant), None)
+    for force in system.getForces():
+        name = type(force).__name__
+        if isinstance(force, openmm.CMMotionRemover) and bound is not None:
+            raise UnsupportedError(
+                f"{name} shifts all velocities, but {bound!r} ties atoms to a place, and momentum is not conserved; "
+                "remove that force (createSystem(..., removeCMMotion=False))"
+            )
+        if "Barostat" not in name:
+            continue
+        if bound is not None:
+            raise UnsupportedError(
+                f"{name} moves molecules, but {bound!r} ties atoms to a place; run at constant volume, or hold "
+                "differences of positions only"
+            )
+        rigid = getattr(force, "getScaleMoleculesAsRigid", None)
+        if rigid is not None and not rigid():
+            raise UnsupportedError(f"{name} scales atoms one by one; call setScaleMoleculesAsRigid(True)")
+        row = _row_between(held, molecules())
+        if row is not None:
+            raise UnsupportedError(
+                f"{name} moves molecules apart, but row {held.row_name(row)} holds atoms of two of them; let them "
+                "count as one molecule by hold(system, ..., join=True), or run at constant volume"
+            )
+
+
+def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
+    """A row with atoms of several molecules."""
+    label = np.zeros(held.n_atoms, dtype=np.int64)
+    for k, atoms in enumerate(molecules):
+        label[list(atoms)] = k
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        of = label[item.atoms]
+        apart = (of != of[:, :1]).any(axis=1)
+        if apart.any():
+            return int(start + np.argmax(apart))
+    return None

@@ -7,7 +7,7 @@ import openmm
 import pytest
 from openmm_systems import GPUS, context_of, state_of
 
-from kcons.openmm.carried.passage import CARRY_SCALE, Passage
+from kcons.openmm.callback_rows.callbacks import CARRY_SCALE, Passage
 from kcons.openmm.integrator.precision import Precision
 
 ATOMS = np.array([1, 3, 4])

@@ -8,7 +8,7 @@ from carried_systems import context_of, free, state_of
 
 from kcons.constraints import Distance
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.hold import hold
 from kcons.steppers import System, run
 
 

@@ -13,7 +13,7 @@ from openmm import app, unit
 from kcons.constraints import Dihedral, Distance, Plane
 from kcons.errors import ContradictionError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.hold import hold, take_constraints
+from kcons.openmm.callback_rows.hold import hold, take_constraints
 
 PEPTIDE = app.PDBFile(str(Path(__file__).parents[2] / "data" / "alanine-dipeptide-implicit.pdb"))
 TRIANGLE = np.array([[0, 0, 0], [0.09572, 0, 0], [-0.024, 0.09266, 0]])

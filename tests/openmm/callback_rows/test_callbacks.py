@@ -12,8 +12,8 @@ from carried_systems import context_of, free, peptide, state_of
 
 from kcons.constraints import Custom
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
+from kcons.openmm.callback_rows.hold import hold
 
 
 def _clumsy(r):

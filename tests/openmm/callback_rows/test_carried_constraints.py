@@ -14,8 +14,8 @@ from openmm import app, unit
 from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, RadiusOfGyration, Sphere
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
+from kcons.openmm.callback_rows.hold import hold
 from kcons.steppers import BlanesMoan6, Rattle, System
 
 # -- exactness ------------------------------------------------------------------------------------
