@@ -23,8 +23,8 @@ from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.callback_rows.callbacks import cell_of
-from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.callback_rows.carried_constraints import refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.quantities import masses_of, nanometers

@@ -170,8 +170,9 @@ class Engine:
         self.recipe = (held.constraints, positions, masses, cell, degenerate, time)
         self.atoms: IntArray = held.touched
         self.whole = len(self.atoms) == len(masses)
+        #: Where the carried particles are in arrays of all.
+        self._held: slice | IntArray = slice(None) if self.whole else self.atoms
         n, local = masses.shape[0], (len(self.atoms), 3)
-        self._nothing = np.zeros(local)
         #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
         self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self._moved = np.zeros((n, 3))
@@ -240,7 +241,7 @@ class Engine:
 
     # -- callbacks ------------------------------------------------------------------------------
 
-    def remember(self, state: openmm.State) -> FloatArray:
+    def remember(self, state: openmm.State) -> None:
         began = self._time(state), state.getStepCount()
         if self._between_steps or began != self._began:
             self._between_steps, self._began, self._stage, self._error = False, began, -1, None
@@ -249,7 +250,6 @@ class Engine:
         self._stage += 1
         self.passage.take(state, self._x)
         self._begin_drift()
-        return self._nothing
 
     def stand_at(self, x: FloatArray) -> None:
         """Particles are here, where others may have moved them: positions of all, shape (n_particles, 3)."""
@@ -257,27 +257,20 @@ class Engine:
         self._begin_drift()
 
     def _begin_drift(self) -> None:
-        self._landing = None
-        self._begun = True
-        if self.whole:
-            np.copyto(self._start, self._x)
-        else:
-            self._start[self.atoms] = self._x
+        self._landing, self._begun = None, True
+        self._start[self._held] = self._x
 
-    def land(self, state: openmm.State) -> FloatArray:
+    def land(self, state: openmm.State) -> FloatArray | None:
         there, read = self._there, self._read
         self.passage.take(state, read)
         if self._landing is not None and np.array_equal(read, self._landing[0]):
             return self._landing[1]  # force and energy are asked for one by one
         if not self.timed and self.passage.same(read, self._x):
-            return self._nothing  # at rest, or forces are asked for between steps
+            return None  # at rest, or forces are asked for between steps
         if not self._begun:
             self._begin_drift()  # where the last drift ended: nobody has moved x since
         self._begun = False
-        if self.whole:
-            np.copyto(there, read)
-        else:
-            there[self.atoms] = read
+        there[self._held] = read
         then, now, h = self._times(self._stage)
         impulse = self._impulse if len(self._fractions) == 1 else None
         # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
@@ -287,7 +280,7 @@ class Engine:
             there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there,
             multipliers=impulse,
         )  # fmt: skip
-        change = moved.copy() if self.whole else moved[self.atoms]
+        change = np.array(moved[self._held])
         fixed = self._fixed
         change[fixed] = there[self.atoms[fixed]] - read[fixed]
         # What the velocity stage before found belongs to the same positions as this impulse.
@@ -299,17 +292,17 @@ class Engine:
         self._landing = (read.copy(), change)
         return change
 
-    def project(self, state: openmm.State) -> FloatArray:
+    def project(self, state: openmm.State) -> FloatArray | None:
         read = self._read
         self.passage.take(state, read)
         read -= self._x
         if self._rest_to_come:
             self._rest_to_come = False
-            return self._project_rest(read) if read.any() else self._nothing
+            return self._project_rest(read) if read.any() else None
         # Thermostats project within a step, too.
         self._between_steps = not self._within or self._stage >= len(self._fractions) - 1
         if not self.timed and not read.any():
-            return self._nothing
+            return None
         self._rest_to_come = self.carries_rest
         read *= SPEED_SCALE
         push = self._push if len(self._fractions) == 1 else None
@@ -326,17 +319,11 @@ class Engine:
 
     def _tangent(self, read: FloatArray, multipliers: FloatArray | None) -> FloatArray:
         """Velocities of the carried particles, projected."""
-        v = self._v
-        if self.whole:
-            np.copyto(v, read)
-            x = self._x
-        else:
-            v[self.atoms] = read
-            x = self._start
-            x[self.atoms] = self._x
+        v, x = self._v, self._start
+        v[self._held], x[self._held] = read, self._x
         now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
         self.motion.project_velocities(x, v, time=now, out=v, multipliers=multipliers)
-        return v.copy() if self.whole else v[self.atoms]
+        return np.array(v[self._held])
 
     def _time(self, state: openmm.State) -> float:
         """Where a step begins. After setStepSize the clock of Reference and CPU goes on with the first step size."""
@@ -368,13 +355,12 @@ class Engine:
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
         """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
         self.passage.open(state)
+        change = None
         try:
-            change = self.remember(state) if phase == "remember" else None
-            if self._error is None:
-                if phase == "land":
-                    change = self.land(state)
-                elif phase == "project":
-                    change = self.project(state)
+            if phase == "remember":
+                self.remember(state)
+            elif self._error is None:
+                change = self.land(state) if phase == "land" else self.project(state)
             elif phase == "project":
                 self._between_steps, self._rest_to_come = True, False
         except BaseException as error:

@@ -191,31 +191,47 @@ class CarriedConstraints(Part):
             Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
         """
         require_context(context)
-        system, precision = context.getSystem(), Precision.of(context)
-        refuse_single_precision(precision)
-        _check_system(system, self._engine, precision, alone=self.alone)
+        system = context.getSystem()
+        self._check_system(system, Precision.of(context))
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
         self._tell_of_rounding(x)
-        miss = self._worst(x, None, time)
+        miss = self._worst(x, v if velocities else None, time)
         if miss is not None:
             raise InputError(
-                f"{miss}; bring them onto the rows by apply_positions(context), or correct them",
-                item="positions",
+                f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them",
+                item=miss.what,
                 atoms=miss.atoms,
             )
-        if not velocities:
-            return
-        tangent = self.motion.project_velocities(x, v, time=time)
-        away = np.abs(tangent - v)
-        if away.max() > self._engine.passage.limits[1] * max(np.abs(v).max(), np.abs(tangent).max()):
-            atom = int(np.argmax(away.max(axis=1)))
+
+    def _check_system(self, system: openmm.System, precision: Precision) -> None:
+        """Raise where the System is not the one that the rows were built for."""
+        engine = self._engine
+        forces = forces_of_rows(system).get(engine.key, {})
+        if set(forces) != set(PHASES):
             raise InputError(
-                f"velocities violate the rows: atom {atom} moves off them with {away[atom].max():.6g} nm/ps; "
-                "remove that part by apply_velocities(context)",
-                item="velocities",
-                atoms=[atom],
+                "the System has no forces that carry these rows; call add_to(system), or hold(system, ...), before "
+                "the Context is made; those of a copy of a System are CarriedConstraints.of(copy)",
+                item="system",
             )
+        refuse_single_precision(precision, forces[PHASES[0]])
+        now = masses_of(system)
+        if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
+            raise InputError("masses have changed since the rows were built; build them again", item="masses")
+        refuse_virtual_sites(system, engine.atoms, now)
+        if self.alone and system.getNumConstraints():
+            raise InputError(
+                "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
+                item="system",
+            )
+        touched = set(engine.atoms.tolist())
+        for k in range(system.getNumConstraints()):
+            i, j, _ = system.getConstraintParameters(k)
+            if touched & {i, j}:
+                raise UnsupportedError(
+                    f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
+                    "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+                )
 
     def take_place(self, program: Program, context: openmm.Context) -> None:
         """A State or checkpoint that was loaded is where its own steps ended, the engine is not."""
@@ -246,11 +262,19 @@ class CarriedConstraints(Part):
         return Miss.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
 
     def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Once."""
+        """Warn once of coordinates so large that their rounding adds noise to the velocities."""
         held = self.motion.constraint_set
-        if not self._told and held.n_rows:
-            reach = float(np.abs(x[held.touched]).max())
-            self._told = warned_of_rounding(reach, self._engine.passage.grain(reach), float(held.scale.min()))
+        if self._told or not held.n_rows:
+            return
+        reach = float(np.abs(x[held.touched]).max())
+        grain = self._engine.passage.grain(reach)
+        self._told = grain > COARSE * held.scale.min()
+        if self._told:
+            warnings.warn(
+                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; "
+                "each step turns this into velocity, and the energy wanders. Move the origin nearer",
+                stacklevel=3,
+            )
 
     def apply_positions(self, context: openmm.Context) -> None:
         """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
@@ -430,28 +454,6 @@ class CarriedConstraints(Part):
 # -- what a System must be like -------------------------------------------------------------------
 
 
-def _check_system(system: openmm.System, engine: Engine, precision: Precision, *, alone: bool) -> None:
-    """Raise where the System is not the one that the rows were built for; `alone` if it had no constraints."""
-    forces = forces_of_rows(system).get(engine.key, {})
-    if set(forces) != set(PHASES):
-        raise InputError(
-            "the System has no forces that carry these rows; call add_to(system), or hold(system, ...), before "
-            "the Context is made; those of a copy of a System are CarriedConstraints.of(copy)",
-            item="system",
-        )
-    refuse_some_particles(forces[PHASES[0]], precision)
-    now = masses_of(system)
-    if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
-        raise InputError("masses have changed since the rows were built; build them again", item="masses")
-    refuse_virtual_sites(system, engine.atoms, now)
-    if alone and system.getNumConstraints():
-        raise InputError(
-            "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
-            item="system",
-        )
-    refuse_shared_atoms(system, set(engine.atoms.tolist()))
-
-
 def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
     """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
     if not all(isinstance(item, Constraint) for item in given):
@@ -474,45 +476,18 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
 
 
-def refuse_single_precision(precision: Precision) -> None:
-    """Refuse single precision: GPUs hand positions to PythonForces in the precision in which they store them."""
+def refuse_single_precision(precision: Precision, force: openmm.PythonForce | None = None) -> None:
+    """Refuse positions in single precision: those of GPUs that have no others, and those of some particles in mixed."""
     if precision.name == "single":
         raise UnsupportedError(
             f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
             "Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform computes"
         )
-
-
-def refuse_some_particles(force: openmm.PythonForce, precision: Precision) -> None:
-    """Refuse forces on some particles in mixed precision: OpenMM hands over their positions in single precision."""
-    if precision.name == "mixed" and force.getParticles():
+    if precision.name == "mixed" and force is not None and force.getParticles():
         raise UnsupportedError(
             f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
             "that are too coarse; read the System by CarriedConstraints.of(system) before the Context is made"
         )
-
-
-def refuse_shared_atoms(system: openmm.System, touched: set[int]) -> None:
-    """Constraints of the System are solved by OpenMM, and must not share atoms with the rows."""
-    for k in range(system.getNumConstraints()):
-        i, j, _ = system.getConstraintParameters(k)
-        if touched & {i, j}:
-            raise UnsupportedError(
-                f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
-                "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
-            )
-
-
-def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
-    """Warn of coordinates so large that their rounding adds noise to the velocities."""
-    if grain <= COARSE * scale:
-        return False
-    warnings.warn(
-        f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; each "
-        "step turns this into velocity, and the energy wanders. Move the origin nearer",
-        stacklevel=4,
-    )
-    return True
 
 
 def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:

@@ -53,7 +53,7 @@ def test_energies_and_forces_of_the_context_are_those_of_the_system():
 def test_callbacks_keep_no_memory():
     part, integrator, _ = peptide()
     integrator.step(5)
-    nothing = part._engine._nothing
+    nothing = part._engine.passage._nothing
     before = sys.getrefcount(nothing)
     integrator.step(50)
     assert sys.getrefcount(nothing) == before

@@ -11,9 +11,8 @@ from openmm import unit
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_single_precision
 from kcons.openmm.callback_rows.hold import hold
-from kcons.openmm.callback_rows.carried_constraints import refuse_single_precision
 from kcons.openmm.integrator.precision import Precision
 
 # -- failure --------------------------------------------------------------------------------------
