@@ -270,13 +270,13 @@ MUTANTS = [
         "openmm/integrator/projected.py",
         "            part.forget()\n",
         "",
-        "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
+        "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
-        "openmm/surfaces/compiled_quadrics.py",
+        "openmm/surfaces/closed_forms.py",
         "super()._declare_solution(p)",
         "super()",
-        "tests/openmm/surfaces/test_compiled_quadrics.py::test_parts_that_are_compiled_go_where_the_others_go",
+        "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
         "openmm/collective/row_program.py",
