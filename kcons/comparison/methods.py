@@ -479,7 +479,7 @@ def _engine(system: TestSystem) -> OpenMMEngine:
 
 def only_water(system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.carried.hold import take_constraints
+    from kcons.openmm.callback_rows.hold import take_constraints
 
     engine = _engine(system)
     return not engine.surfaces and not take_constraints(engine.copy())

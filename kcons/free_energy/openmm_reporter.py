@@ -15,10 +15,9 @@ from kcons.constraints.constraint_set import ConstraintSet, same_rows
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.openmm.carried.callbacks import cell_of
-from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.hold import constraints_about
-from kcons.openmm.carried.requirements import refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.callback_rows.callbacks import cell_of
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.quantities import accepted, masses_of

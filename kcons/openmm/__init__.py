@@ -7,7 +7,7 @@ collective variables, surfaces and the constraint objects of kcons.
 - `topology`: constraints by name
 - `integrator`: the integrators and the programs they run
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover
-- `carried`: constraint objects of kcons
+- `callback_rows`: constraint objects of kcons
 - `collective`: collective variables
 - `surfaces`: particles on surfaces
 """
@@ -15,10 +15,10 @@ collective variables, surfaces and the constraint objects of kcons.
 from kcons.errors import with_extra
 
 try:
-    from kcons.openmm.carried.carried_constraints import CarriedConstraints
-    from kcons.openmm.carried.hold import hold, take_constraints
+    from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
+    from kcons.openmm.callback_rows.hold import hold, take_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
-    from kcons.openmm.collective.row_forces import Row, each_term
+    from kcons.openmm.collective.coordinates import Row, each_term
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
     from kcons.openmm.ensembles.molecular_pressure import PressureReporter, molecular_pressure

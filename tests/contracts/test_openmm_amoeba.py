@@ -13,7 +13,7 @@ from openmm_systems import started, state_of, total_energy
 
 from kcons.constraints import Angle, Distance
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.hold import hold
 
 #: A Context with AMOEBA takes OpenMM 13 s here.
 pytestmark = pytest.mark.validation

@@ -26,7 +26,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.hold import hold
 from kcons.steppers import System
 
 # -- kinds of rows --------------------------------------------------------------------------------

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints import Dihedral
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.hold import hold
+from kcons.constraints import Dihedral, Distance
+from kcons.openmm import ProjectedIntegrator, hold
 
 NM, PS = unit.nanometer, unit.picosecond
 
@@ -30,6 +30,14 @@ def state_of(context):
         state.getPositions(asNumpy=True).value_in_unit(NM).copy(),
         state.getVelocities(asNumpy=True).value_in_unit(NM / PS).copy(),
     )
+
+
+def started(context, x, v=None):
+    """The Context, at these positions and velocities."""
+    context.setPositions(x)
+    if v is not None:
+        context.setVelocities(v)
+    return context
 
 
 def start(context, part, x, temperature=300, seed=1):
@@ -67,3 +75,27 @@ def pull(strength, n):
     for k in range(n):
         force.addParticle(k, [])
     return force
+
+
+def _longer(t):
+    return 0.3 + 0.05 * t
+
+
+def driven():
+    """Two particles, a distance that grows."""
+    x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
+    system = free([12.0, 12.0])
+    return system, hold(system, Distance([[0, 1]], _longer), x), x
+
+
+def begun(system, part, x):
+    integrator = ProjectedIntegrator(0.01, parts=[part])
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.applyVelocityConstraints(context)
+    return integrator, context
+
+
+def off_target(context):
+    x = state_of(context)[0]
+    return abs(np.linalg.norm(x[0] - x[1]) - _longer(context.getTime()._value))

@@ -74,8 +74,8 @@ def some_velocities(scale=1.0, seed=1):
     return scale * np.random.default_rng(seed).normal(size=CHAIN.shape)
 
 
-def bond(i, j):
-    force = openmm.CustomBondForce("r")
+def bond(i, j, expression="r"):
+    force = openmm.CustomBondForce(expression)
     force.addBond(i, j)
     return force
 
@@ -92,17 +92,17 @@ def dihedral(*atoms):
     return force
 
 
-def centres(a, b):
-    force = openmm.CustomCentroidBondForce(2, "distance(g1, g2)")
-    force.addGroup(list(a))
-    force.addGroup(list(b))
-    force.addBond([0, 1])
+def points(expression, atoms):
+    force = openmm.CustomCompoundBondForce(len(atoms), expression)
+    force.addBond(list(atoms))
     return force
 
 
-def cosine(i, j, k):
-    force = openmm.CustomCompoundBondForce(3, "cos(angle(p1, p2, p3))")
-    force.addBond([i, j, k])
+def centres(a, b, weights=()):
+    force = openmm.CustomCentroidBondForce(2, "distance(g1, g2)")
+    force.addGroup(list(a), weights)
+    force.addGroup(list(b))
+    force.addBond([0, 1])
     return force
 
 
@@ -125,7 +125,7 @@ FORCES = {
     "centres": lambda: [centres([0, 1], [3, 4, 5])],
     "gyration": lambda: [openmm.RGForce([0, 1, 2, 3, 4])],
     "rmsd": lambda: [rmsd()],
-    "cosine": lambda: [cosine(0, 2, 5)],
+    "cosine": lambda: [points("cos(angle(p1, p2, p3))", (0, 2, 5))],
     "harmonic": lambda: [_harmonic(1, 5)],
     "variable": lambda: [with_variable("0.1*a + d^2", a=angle(0, 1, 2), d=bond(2, 5))],
     "three": lambda: [bond(0, 3), dihedral(0, 1, 2, 3), angle(2, 3, 4)],
@@ -164,3 +164,11 @@ def dipeptide(constraints=app.AllBonds, platform="Reference", scheme="rattle", d
     context.setVelocitiesToTemperature(300, 1)
     part.restore(context, 1e-13)
     return context, integrator, part
+
+
+def peptide(constraints=None):
+    """Alanine dipeptide, its positions and its bonds."""
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    system = app.ForceField("amber14-all.xml").createSystem(pdb.topology, constraints=constraints)
+    bonds = np.array([(b[0].index, b[1].index) for b in pdb.topology.bonds()])
+    return system, np.array(pdb.getPositions(asNumpy=True)._value), bonds

@@ -1,14 +1,8 @@
 """Collective coordinates held on OpenMM's own platforms.
 
-- `small_algebra`: small systems of equations in the language of CustomIntegrator
-- `forecast`: pushes that are foreseen
-- `clock`: the time of targets that move
-- `row_forces`: values and gradients of rows by OpenMM's forces
-- `formula_rows`: formulas as forces
-- `plain_rows`: rows that are internal coordinates, as constraints of kcons
-- `measured_rows`, `context_rows`: the rows in a Context, and what can be done to them
+- `coordinates`: Forces as coordinates
 - `row_program`: the part of the program that holds them
-- `reported_rows`: what they report, and why a step failed
+- `rows_in_context`: the rows at the state of a Context, and what can be done to them
 - `collective_rows`: `CollectiveRows`, what users make
 """
 

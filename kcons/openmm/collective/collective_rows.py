@@ -2,46 +2,55 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
 import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints import Formula
 from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.internal import MOST_TURNED
+from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
+    ConvergenceError,
     InputError,
+    KconsError,
+    NonFiniteError,
+    SingularGeometryError,
     UnsupportedError,
 )
-from kcons.openmm.collective.clock import Clock, require_holder, variables_of
-from kcons.openmm.collective.formula_rows import as_rows
-from kcons.openmm.collective.measured_rows import TOLERANCE
-from kcons.openmm.collective.reported_rows import ReportedRows
-from kcons.openmm.collective.row_forces import (
-    Rigid,
+from kcons.openmm.collective.coordinates import (
     Row,
+    as_rows,
+    chosen_groups,
     forces_in,
     found_values,
     moved_atoms,
     number,
     period_of,
-    place,
+    put_in_groups,
     unit_of,
 )
-from kcons.openmm.collective.small_algebra import PIVOT, blocks
-from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.collective.row_program import GroupRows, variables_of
+from kcons.openmm.collective.rows_in_context import TOLERANCE, RowsInContext
+from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import virtual_sites
+from kcons.steppers.compositions import Composition
+from kcons.steppers.rattle import Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 
-class CollectiveRows(ReportedRows):
+class CollectiveRows(GroupRows):
     """Any OpenMM Forces, each held as one row sigma = q - target = 0.
 
     The energy of a Force is its coordinate q, its forces are the gradient; each has a force group of its own, which
@@ -106,82 +115,88 @@ class CollectiveRows(ReportedRows):
         self.max_iterations = whole_number(max_iterations, "max_iterations")
         self.n_rows = len(given)
         forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
-        self._units = [unit_of(f[0]) if len(f) == 1 else None for f in forces]
-
-        def read(name: str, per: unit.Unit = unit.dimensionless) -> list[Any]:
-            """An attribute of all rows: numbers, None, and for targets and rates names."""
-            values = [getattr(row, name) for row in given]
-            kept = (str, type(None)) if name in ("target", "rate") else type(None)
-            return [
-                value if isinstance(value, kept) else number(value, f"{name} of row {k}", of, per)
-                for k, (value, of) in enumerate(zip(values, self._units, strict=True))
-            ]
-
-        self._targets, self._rates = read("target"), read("rate", unit.picosecond)
-        periods, scales = read("period"), read("scale")
-        for k, (target, rate, scale) in enumerate(zip(self._targets, self._rates, scales, strict=True)):
-            if target is None and positions is None:
-                raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
-            if isinstance(rate, str) and not isinstance(target, str):
-                raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
-            if isinstance(target, float) and self._units[k] == unit.radian and abs(target) > MOST_TURNED:
-                raise InputError(
-                    f"target of row {k} is {target:g}, over three turns, and in radian; give {target:g} * unit.degrees",
-                    item="target",
-                )
-            if scale is not None and not scale > 0:
-                raise InputError(f"scale of row {k} is {scale}; give a positive number", item="scale")
-        known = _context_parameters(system, [row.force for row in given])
-        for name in (n for n in (*self._targets, *self._rates) if isinstance(n, str)):
-            if name not in known:
-                raise InputError(
-                    f"{name!r} is no context parameter of the System (known: {', '.join(sorted(known)) or 'none'}); "
-                    "define it by addGlobalParameter of a Force",
-                    item="target",
-                )
+        only = [f[0] if len(f) == 1 else None for f in forces]
         self.names = tuple(_name(row, f) for row, f in zip(given, forces, strict=True))
+        self._units = [None if f is None else unit_of(f) for f in only]
+        scales = self._read_numbers(system, given, positions is not None)
+        own = [0.0 if f is None else period_of(f) for f in only]
         self.periods = tuple(
-            (period_of(f[0]) if len(f) == 1 else 0.0) if period is None else period
-            for period, f in zip(periods, forces, strict=True)
+            p if row.period is None else number(row.period, f"period of row {k}", self._units[k])
+            for k, (row, p) in enumerate(zip(given, own, strict=True))
         )
-        atoms = [moved_atoms(system, f) for f in forces]
-        self._refuse_sites(system, atoms)
-        self.sited = bool(virtual_sites(system))
         #: The particles of each row.
-        self.atoms = tuple(tuple(sorted(touched)) for touched in atoms)
-        rigid = Rigid(system)
-        meets = any(rigid.holds(touched) for touched in atoms)
-        if meets and meets_system is False:
-            row = next(k for k, touched in enumerate(atoms) if rigid.holds(touched))
-            raise InputError(
-                f"row {row} ({self.names[row]}) touches atoms that the System constrains; leave out meets_system=False",
-                item="meets_system",
-            )
-        self.meets_system = meets or bool(meets_system)
+        self.atoms = tuple(tuple(sorted(moved_atoms(system, f))) for f in forces)
+        self._find_what_meets(system, meets_system)
+        groups = chosen_groups(system, [row.force for row in given])
         if any(target is None for target in self._targets):
             found = found_values(system, forces, positions, box)
             self._targets = [f if t is None else t for t, f in zip(self._targets, found.tolist(), strict=True)]
-        placed = place(system, [row.force for row in given])
-        self._groups = tuple(placed)
-        self.groups = frozenset(placed)
-        touched = [rigid.bodies(a) for a in atoms] if self.meets_system else atoms
-        #: Rows whose gradients can have a product.
-        self._meet = [[bool(a & b) for b in touched] for a in touched]
-        self._block_rows = blocks(touched)
+        put_in_groups(system, [row.force for row in given], groups)
+        self._groups, self.groups = tuple(groups), frozenset(groups)
         self.scales = tuple(
             (max(1.0, abs(t)) if isinstance(t, float) else 1.0) if scale is None else scale
             for t, scale in zip(self._targets, scales, strict=True)
         )
         self._drives = any(isinstance(t, float) and r != 0.0 for t, r in zip(self._targets, self._rates, strict=True))
 
-    def _refuse_sites(self, system: openmm.System, atoms: Sequence[set[int]]) -> None:
-        for k, touched in enumerate(atoms):
-            sites = [atom for atom in sorted(touched) if system.isVirtualSite(atom)]
+    def _read_numbers(self, system: openmm.System, given: Sequence[Row], placed: bool) -> list[float | None]:
+        """Targets and rates, numbers or names of context parameters; returns the scales."""
+        self._targets, self._rates, scales = [], [], []
+        known = _context_parameters(system, [row.force for row in given])
+        for k, (row, of) in enumerate(zip(given, self._units, strict=True)):
+            target, rate = row.target, row.rate
+            if target is None and not placed:
+                raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
+            if isinstance(rate, str) and not isinstance(target, str):
+                raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
+            for name in (n for n in (target, rate) if isinstance(n, str) and n not in known):
+                raise InputError(
+                    f"{name!r} is no context parameter of the System (known: {', '.join(sorted(known)) or 'none'}); "
+                    "define it by addGlobalParameter of a Force",
+                    item="target",
+                )
+            if target is not None and not isinstance(target, str):
+                target = number(target, f"target of row {k}", of)
+                if of == unit.radian and abs(target) > MOST_TURNED:
+                    raise InputError(
+                        f"target of row {k} is {target:g}, over three turns, and in radian; give {target:g} * "
+                        "unit.degrees",
+                        item="target",
+                    )
+            scale = None if row.scale is None else number(row.scale, f"scale of row {k}", of)
+            if scale is not None and not scale > 0:
+                raise InputError(f"scale of row {k} is {scale}; give a positive number", item="scale")
+            rate = rate if isinstance(rate, str) else number(rate, f"rate of row {k}", of, unit.picosecond)
+            self._targets.append(target)
+            self._rates.append(rate)
+            scales.append(scale)
+        return scales
+
+    def _find_what_meets(self, system: openmm.System, asked: bool | None) -> None:
+        """Which rows touch the same bodies that the constraints of the System make, and whether they touch any."""
+        for k, touched in enumerate(self.atoms):
+            sites = [atom for atom in touched if system.isVirtualSite(atom)]
             if sites:
                 raise UnsupportedError(
                     f"row {k} ({self.names[k]}) depends on particle {sites[0]}, a virtual site, which OpenMM moves at "
                     "the end of a step only; build the coordinate from the particles that define the site"
                 )
+        self.sited = bool(virtual_sites(system))
+        pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
+        tied = {atom for pair in pairs for atom in pair}
+        meeting = [k for k, touched in enumerate(self.atoms) if tied.intersection(touched)]
+        if meeting and asked is False:
+            raise InputError(
+                f"row {meeting[0]} ({self.names[meeting[0]]}) touches atoms that the System constrains; leave out "
+                "meets_system=False",
+                item="meets_system",
+            )
+        self.meets_system = bool(meeting or asked)
+        body = _components(system.getNumParticles(), pairs if self.meets_system else [])
+        bodies = [{int(body[atom]) for atom in touched} for touched in self.atoms]
+        self._meet = [[bool(a & b) for b in bodies] for a in bodies]
+        together = _components(self.n_rows, [(i, j) for i, row in enumerate(self._meet) for j in range(i) if row[j]])
+        self._blocks = [np.flatnonzero(together == k).tolist() for k in range(int(together.max()) + 1)]
 
     # -- told by an integrator ------------------------------------------------------------------
 
@@ -195,21 +210,11 @@ class CollectiveRows(ReportedRows):
         """Whether a target is a context parameter, which others may set for the step to come."""
         return any(isinstance(target, str) for target in self._targets)
 
-    def take_precision(self, program: Program, precision: Precision) -> None:
-        """What counts as small is what Forces of the platform can tell."""
-        program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
-        self._forecast.take_precision(program, precision)
-
     def take_place(self, program: Program, context: openmm.Context) -> None:
         """A tolerance that was left open becomes what Forces can tell of coordinates of this size."""
         if self.asked_tolerance is None:
             self.tolerance = self.at(context).finest
             program.set(f"tolerance{self.code}", self.tolerance)
-
-    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
-        """Targets go on from where the other integrator has left them."""
-        if self._drives:
-            Clock(self.code).set(program, Clock(notes["code"]).now(variables_of(before)))
 
     def set_target(
         self, integrator: ProjectedIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
@@ -232,7 +237,7 @@ class CollectiveRows(ReportedRows):
         slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
-        require_holder(integrator)
+        variables_of(integrator)
         if slope is not None:
             integrator.program.set(self._of("rate", row, integrator), slope)
         if self._rates[row] != 0.0:
@@ -315,8 +320,141 @@ class CollectiveRows(ReportedRows):
         """
         self.at(context).check(velocities)
 
+    # -- at the state of a context --------------------------------------------------------------
+
+    def at(self, context: openmm.Context) -> RowsInContext:
+        """The rows at the state of a context: gradients, Gram matrix, projections."""
+        return RowsInContext(self, context)
+
+    def values(self, context: openmm.Context) -> FloatArray:
+        """q of each row, shape (n_rows,)."""
+        return self.at(context).values()
+
+    def residuals(self, context: openmm.Context) -> FloatArray:
+        """sigma = q - target of each row, shape (n_rows,), to the nearest image."""
+        return self.at(context).sigma()
+
+    def rates(self, context: openmm.Context) -> FloatArray:
+        """A v less the rate of the targets, shape (n_rows,), per ps."""
+        return self.at(context).slopes()
+
+    def rank(self, context: openmm.Context) -> int:
+        """How many degrees of freedom the rows take, beyond the constraints of the System."""
+        return self.at(context).rank()
+
+    def multipliers_at(self, context: openmm.Context) -> FloatArray:
+        """lambda at the positions and velocities of the context, as accurate as these; shape (n_rows,).
+
+        (A M_par^+ A^T) lambda = target'' - d(A v)/dt - A M_par^+ f (notes, eq. 104), M_par^+ that of the System's
+        constraints. d(A v)/dt along their free flight by central differences; needs nine evaluations of every row.
+        """
+        return self.at(context).multipliers()
+
+    def targets(self, context: openmm.Context) -> FloatArray:
+        """Where each target is now, shape (n_rows,)."""
+        return self.at(context).targets()
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v from the Forces themselves, at the state of the context."""
+        return self.at(context).worst_miss(velocities)
+
+    # -- of an integrator, after its last step --------------------------------------------------
+
+    def multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
+        """lambda at the positions where the last step began, to second order in the step; shape (n_rows,).
+
+        In kJ/mol per unit of q, z = A^T lambda. It is the mean of 2 L/h^2 of the first drift and 2 mu/h of the
+        velocity projection before it, at the same positions; after a start, or when somebody moved x, only the former,
+        to first order. NaN before the first step.
+
+        Raises
+        ------
+        UnsupportedError
+            Schemes in which these are not impulses of the same force; see `mean_multipliers`, `multipliers_at`.
+        """
+        scheme = getattr(integrator, "scheme", None)
+        if getattr(integrator, "thermostatted", False):
+            raise UnsupportedError(
+                "with a thermostat the impulses of a step are not those of the forces alone; read "
+                "multipliers_at(context)"
+            )
+        if scheme is not None and not isinstance(scheme, Rattle | Composition):
+            raise UnsupportedError(
+                f"{scheme!r} has no multipliers at a single point of the step; read mean_multipliers(integrator), the "
+                "mean over the last step, or multipliers_at(context), those at the state of a context"
+            )
+        return self._read(integrator, "lambda")
+
+    def mean_multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
+        """Impulses of the last step over its length, shape (n_rows,): lambda averaged over it, every scheme.
+
+        NaN before the first step.
+        """
+        return self._read(integrator, "mean")
+
+    def work(self, integrator: openmm.CustomIntegrator) -> FloatArray:
+        """What moving each target has added to the energy, in kJ/mol, shape (n_rows,): sum of lambda rate dt."""
+        return self._read(integrator, "work")
+
+    def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
+        variables_of(integrator)
+        return np.array([integrator.getGlobalVariableByName(self._of(name, k, integrator)) for k in range(self.n_rows)])
+
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        """The error for a step in which the rows failed."""
+        c = self.code
+        singular = int(integrator.getGlobalVariableByName(f"singular{c}"))
+        if singular:
+            row = singular - 1
+            return SingularGeometryError(
+                f"step {step}: row {row} ({self.names[row]}) vanishes, or depends on the rows before it or on the "
+                "constraints of the System. Leave out a row that others imply; a dihedral over a straight angle or an "
+                "RMSD of 0 has no direction",
+                rows=[row],
+            )
+        off = np.abs(self._read(integrator, "sigma")) / np.array(self.scales)
+        residual = integrator.getGlobalVariableByName(f"residual{c}")
+        row = int(np.argmax(np.where(np.isfinite(off), off, math.inf)))
+        if not math.isfinite(residual):
+            return NonFiniteError(
+                f"step {step}: row {row} ({self.names[row]}) is not a number; forces or time step too large",
+                item="position",
+                step=step,
+            )
+        if residual <= self.tolerance:
+            return NonFiniteError(
+                f"step {step}: forces or velocities are not finite; the time step is too large",
+                item="velocity",
+                step=step,
+            )
+        iterations = int(integrator.getGlobalVariableByName(f"iterations{c}"))
+        return ConvergenceError(
+            f"step {step}: row {row} ({self.names[row]}) is off by {off[row] * self.scales[row]:.3g} after "
+            f"{iterations} iterations (tolerance {self.tolerance:.3g}){self._digits(integrator.context)}; time step "
+            f"too large (dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
+            residual=float(residual),
+            tolerance=self.tolerance,
+            iterations=iterations,
+            row=row,
+            step=step,
+        )
+
+    def _digits(self, context: openmm.Context) -> str:
+        """What to do where the tolerance asks for more digits than Forces have."""
+        here = self.at(context)
+        if not self.tolerance < here.finest:
+            return ""
+        return f", but Forces tell no more than {here.finest:.0e} here in {here.precision}: leave the tolerance open"
+
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"
+
+
+def _components(n: int, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Number of the component of each of n things that pairs join."""
+    i, j = np.array(pairs, dtype=np.int32).reshape(-1, 2).T
+    links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
+    return np.asarray(connected_components(links, directed=False)[1])
 
 
 def _parts_of(system: openmm.System, force: openmm.Force | int, row: int) -> list[openmm.Force]:

@@ -1,18 +1,35 @@
-"""The computations that hold rows of which each is the energy of one force group."""
+"""The computations that hold rows of which each is the energy of one force group.
+
+Positions: from where free motion led, x moves along the gradients at the start of the drift by pushes L, which a
+quasi-Newton iteration finds; it begins with the inverse of the Gram matrix G = A M_par^+ A^T there, and Broyden's
+update makes it explain what each push did to sigma. Velocities: one push with the same inverse where the drift ends.
+
+In steps at whose end nobody looks, pushes begin with the line through those of the last two steps, G is computed again
+only where the iteration has become slow, and a last push that is good enough for sure is not measured: numbers are what
+the host of a GPU waits for.
+"""
 
 from __future__ import annotations
 
 import math
+import weakref
+from collections.abc import Iterable
 from typing import Any
 
 import openmm
 
-from kcons.openmm.collective.clock import Clock, variables_of
-from kcons.openmm.collective.forecast import Forecast, Measured
-from kcons.openmm.collective.small_algebra import Block
+from kcons.errors import InputError
 from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.steppers.operations import Exchange
+
+#: A pivot below this fraction of the row's own norm means that the row depends on others, in double precision.
+PIVOT = 1e-10
+#: A push leaves at most a tenth of sigma.
+_LEFT = 0.1
+#: Integrators whose programs hold rows, by the address of the object of OpenMM.
+_HOLDING: weakref.WeakValueDictionary[int, openmm.CustomIntegrator] = weakref.WeakValueDictionary()
 
 
 class GroupRows(Part):
@@ -29,7 +46,7 @@ class GroupRows(Part):
     """
 
     evaluates = stays_finite = solves_alone = True
-    written = (*Part.written, "_leapfrog", "_single", "_blocks", "_forecast", "_base", "_start")
+    written = (*Part.written, "_leapfrog", "_single", "_base", "_start")
     code = 1
     names: tuple[str, ...]
     atoms: tuple[tuple[int, ...], ...]
@@ -43,34 +60,68 @@ class GroupRows(Part):
     _targets: list[float | str | None]
     _rates: list[float | str]
     _drives: bool
+    #: Rows whose gradients can have a product, directly or through others.
+    _blocks: list[list[int]]
     _meet: list[list[bool]]
-    _block_rows: list[list[int]]
 
     # -- names in the program -------------------------------------------------------------------
 
     def _of(self, name: str, row: int, integrator: object = None) -> str:
         return f"{name}{self.code_in(integrator)}_{row}"
 
+    def _gram(self, i: int, j: int) -> str:
+        return f"gram{self.code}_{max(i, j)}_{min(i, j)}"
+
+    def _inverse(self, i: int, j: int) -> str:
+        """An entry of the inverse, which Broyden's updates make unsymmetric."""
+        return f"inverse{self.code}_{i}_{j}"
+
     def _target(self, row: int) -> str:
         """Expression of the target now."""
         target = self._targets[row]
         if isinstance(target, str):
             return target
-        return self._of("target", row) + (f"+{self._rate(row)}*clock{self.code}" if self._rates[row] != 0.0 else "")
+        moved = f"+{self._rate(row)}*(clock{self.code}+flown{self.code})" if self._rates[row] != 0.0 else ""
+        return self._of("target", row) + moved
 
     def _rate(self, row: int) -> str:
         rate = self._rates[row]
         return rate if isinstance(rate, str) else self._of("rate", row)
 
-    # -- program --------------------------------------------------------------------------------
+    @property
+    def _pushes(self) -> str:
+        return _sum(f"{self._of('push', k)}*{self._of('row', k)}" for k in range(self.n_rows))
+
+    def _solved(self, block: list[int], i: int, name: str) -> str:
+        """Expression for (inverse vector)_i."""
+        return _sum(f"{self._inverse(i, j)}*{self._of(name, j)}" for j in block)
+
+    # -- variables ------------------------------------------------------------------------------
 
     def declare(self, p: Program) -> None:
-        c = self.code
-        scheme = getattr(p.integrator, "scheme", None)
+        c, integrator = self.code, p.integrator
+        _HOLDING[int(integrator.this)] = integrator
+        scheme = getattr(integrator, "scheme", None)
+        alone = len(getattr(integrator, "parts", (self,))) == 1
         self._leapfrog = scheme is None
         self._single = scheme is None or len(scheme.drifts) * len(scheme.flight) == 1
-        alone = len(getattr(p.integrator, "parts", (self,))) == 1
-        self._blocks = [Block(rows, c) for rows in self._block_rows]
+        numbers = [
+            ("push", "L: x moves by L times the row", 0.0),
+            ("more", "change of L", 0.0),
+            ("sigma", "coordinate less target", 0.0),
+            ("now", "the same, after the last push", 0.0),
+            ("change", "what the push changed", 0.0),
+            ("expected", "push that the inverse at hand expects for that", 0.0),
+            ("left", "last push times the inverse", 0.0),
+            ("own", "size of the row alone, for its pivot", 0.0),
+            ("slope", "rate of the coordinate less that of the target", 0.0),
+            ("impulse", "multiplier times time, over this step", 0.0),
+            ("mean", "multiplier, mean over the last step", math.nan),  # none before it
+            ("lambda", "multiplier at the start of the last step, to second order", math.nan),
+            ("end", "multiplier of the last velocity projection", 0.0),
+            ("work", "work done by moving the target", 0.0),
+            *[("last", "L of the last step", 0.0), ("older", "L of the step before it", 0.0)] * self.lean,
+        ]
         for k, name in enumerate(self.names):
             p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
             target, rate = self._targets[k], self._rates[k]
@@ -78,41 +129,82 @@ class GroupRows(Part):
                 p.setting(self._of("target", k), f"target of row {k}", target)
             if isinstance(rate, float):
                 p.setting(self._of("rate", k), "change of this target in a ps", rate)
-            p.number(self._of("push", k), "L: x moves by L times the row")
-            p.number(self._of("more", k), "change of L")
-            p.number(self._of("sigma", k), "coordinate less target")
-            p.number(self._of("now", k), "the same, after the last push")
-            p.number(self._of("impulse", k), "multiplier times time, over this step")
-            p.number(self._of("mean", k), "multiplier, mean over the last step", math.nan)  # none before it
-            p.number(self._of("lambda", k), "multiplier at the start of the last step, to second order", math.nan)
-            p.number(self._of("end", k), "multiplier of the last velocity projection")
-            p.number(self._of("work", k), "work done by moving the target")
-            p.number(self._of("slope", k), "rate of the coordinate less that of the target")
+            for what, words, value in numbers:
+                p.number(self._of(what, k), words, value)
         for block in self._blocks:
-            block.declare(p)
-            block.declare_newton(p)
+            for i in block:
+                for j in block:
+                    p.number(self._inverse(i, j), f"inverse of G, then of d sigma{i}/d push{j}", float(i == j))
+                    if j <= i:
+                        p.number(self._gram(i, j), "gradient of one row . M_par^+ gradient of the other")
+                        p.number(f"factor{c}_{i}_{j}", "Cholesky factor of G")
+                        p.number(f"back{c}_{i}_{j}", "inverse of that factor")
+        p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
+        p.setting(f"tolerance{c}", "what the residual may be", self.tolerance)
+        p.number(f"pivot{c}", "what is left of a row beside those before it")
+        p.number(f"weight{c}", "denominator of the update")
+        p.number(f"length{c}", "square of the last push")
         p.number(f"known{c}", "whether the last velocity projection was at the start of this step")
         p.number(f"singular{c}", "1 + number of the first row that vanishes or depends on others")
         p.number(f"residual{c}", "size of sigma relative to the scales")
-        p.setting(f"tolerance{c}", "what it may be", self.tolerance)
         p.number(f"iterations{c}", "quasi-Newton iterations of the last drift")
-        p.number(f"state{c}", "of the iteration: 1 iterate, 2 give up, 0 done")
+        p.number(f"state{c}", "of the iteration: 1 iterate, 2 give up, 3 push without measuring, 0 done")
         p.number(f"held{c}", "whether the rows hold")
         p.number(f"bad_sum{c}", "not a number if a multiplier is none")
         if self._drives:
-            Clock(c).declare(p)
-        self._forecast = (Forecast if self.lean and alone else Measured)(c, self._blocks, self._meet)
-        self._forecast.declare(p)
-        self._base, self._start = "xu", "x_last"
-        if not alone:
-            self._base = p.vector(f"base{c}", "positions as other parts leave them")
+            p.number(f"clock{c}", "time of the targets where the step began")
+            p.number(f"flown{c}", "time of its drifts")
+            p.number(f"began{c}", "good_steps when it began")
+        if self.lean:
+            p.number(f"renew{c}", "1 if G is to be computed", 1.0)
+            p.number(f"follows{c}", "whether the last steps tell the next push")
+        self._base = "xu" if alone else p.vector(f"base{c}", "positions as other parts leave them")
+        self._start = "x_last"
         if self.meets_system:
             p.vector(f"v_kept{c}", "velocities while v is used to project rows")
-            if not self._single or _halved(p.integrator, scheme):
+            if not self._single or _halved(integrator, scheme):
                 self._start = p.vector(f"start{c}", "positions at the start of the drift")
 
-    def _gradients(self, p: Program, *, sizes: bool, slopes: bool, products: bool = True) -> None:
-        """row = M_par^+ gradient, its Gram matrix and the inverse of that, at x."""
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """What counts as small is what Forces of the platform can tell."""
+        program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
+
+    # -- gradients ------------------------------------------------------------------------------
+
+    def begin(self, p: Program) -> None:
+        """Gradients where x is not where the last step ended."""
+        if not self._leapfrog:
+            self._gradients(p)
+            p.let(f"known{self.code}", "0", "no projection was here")
+
+    def renew(self, p: Program) -> None:
+        """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
+        self._directions(p)
+        with p.when(f"renew{self.code} != 0", "G is old"):
+            self._invert(p)
+        self._refuse_dependent(p)
+        p.let(f"known{self.code}", "0", "no projection was here")
+
+    def remember(self, p: Program) -> None:
+        c = self.code
+        if self._drives:  # a step that failed is not counted in good_steps, and its time is not kept
+            first, kept = "delta(stage-first_stage)", f"1-delta(began{c}-good_steps)"
+            p.let(f"clock{c}", f"clock{c}+{first}*({kept})*flown{c}", "the step before was kept")
+            p.let(f"flown{c}", f"select({first}, 0, flown{c})", "a step begins")
+            p.let(f"began{c}", "good_steps", "to see whether it is kept")
+        if self._leapfrog:  # no velocity projection has computed them
+            self._gradients(p)
+        if self._start == f"start{c}":
+            p.each(self._start, "x", "to start again from")
+
+    def _gradients(self, p: Program, sizes: bool = True) -> None:
+        """Rows, their Gram matrix and its inverse at x; v stays."""
+        self._directions(p, sizes=sizes)
+        self._invert(p, sizes)
+        self._refuse_dependent(p)
+
+    def _directions(self, p: Program, *, sizes: bool = False, slopes: bool = False) -> None:
+        """row = M_par^+ gradient, at x. Where v is needed for that, lean programs keep it themselves."""
         keep = self.meets_system and not (self.lean and not slopes)
         if keep:
             p.each(f"v_kept{self.code}", "v", "v is needed to project the rows")
@@ -121,70 +213,67 @@ class GroupRows(Part):
             row = self._of("row", k)
             if slopes:
                 p.sum(self._of("slope", k), f"-f{group}*{v}", f"rate of {self.names[k]}")
-            if self.meets_system:
-                p.each("v", f"-f{group}/m", f"M^-1 gradient of {self.names[k]}")
-                p.hold_velocities("its part along the constraints of the System")
-                p.each(row, "v", "M_par^+ gradient")
-                if sizes:
-                    p.sum(self._of("own", k), f"f{group}*f{group}/m", "its size without those constraints")
-            else:
+            if not self.meets_system:
                 p.each(row, f"-f{group}/m", f"M^-1 gradient of {self.names[k]}")
+                continue
+            p.each("v", f"-f{group}/m", f"M^-1 gradient of {self.names[k]}")
+            p.hold_velocities("its part along the constraints of the System")
+            p.each(row, "v", "M_par^+ gradient")
+            if sizes:
+                p.sum(self._of("own", k), f"f{group}*f{group}/m", "its size without those constraints")
         if keep and not slopes:
             p.each("v", f"v_kept{self.code}", "v again")
-        if not products:
-            return
-        self._forecast.products(p)
-        for k in range(self.n_rows) if sizes and not self.meets_system else ():
-            gram = next(block.gram(k, k) for block in self._blocks if k in block.rows)
-            p.let(self._of("own", k), gram, "its size")
-        self._forecast.invert(p)
 
-    def begin(self, p: Program) -> None:
-        """Gradients where x is not where the last step ended."""
-        if not self._leapfrog:
-            self._gradients_kept(p)
-            p.let(f"known{self.code}", "0", "no projection was here")
-
-    def renew(self, p: Program) -> None:
-        """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
-        self._gradients(p, sizes=False, slopes=False, products=False)
-        self._forecast.renew(p)
-        self._refuse_dependent(p)
-        p.let(f"known{self.code}", "0", "no projection was here")
-
-    def remember(self, p: Program) -> None:
-        if self._drives:
-            Clock(self.code).begin(p)
-        if self._leapfrog:  # no velocity projection has computed them
-            self._gradients_kept(p)
-        if self._start == f"start{self.code}":
-            p.each(self._start, "x", "to start again from")
-
-    def _gradients_kept(self, p: Program, sizes: bool = True) -> None:
-        """Gradients for the drift; v stays."""
-        self._gradients(p, sizes=sizes, slopes=False)
-        self._refuse_dependent(p)
+    def _invert(self, p: Program, sizes: bool = False) -> None:
+        """G and its inverse, by Cholesky's factor; `singular` tells the first row whose pivot vanishes."""
+        c, singular = self.code, f"singular{self.code}"
+        for block in self._blocks:
+            for i in block:
+                for j in block:
+                    if j <= i and self._meet[i][j]:
+                        p.sum(self._gram(i, j), f"m*{self._of('row', i)}*{self._of('row', j)}", "G")
+        if sizes and not self.meets_system:
+            for k in range(self.n_rows):
+                p.let(self._of("own", k), self._gram(k, k), "its size")
+        p.let(singular, f"select(failed, {singular}, 0)", "nothing wrong yet")
+        for block in self._blocks:
+            for a, i in enumerate(block):
+                before = block[:a]
+                for b, j in enumerate(before):
+                    done = _sum(f"factor{c}_{i}_{k}*factor{c}_{j}_{k}" for k in block[:b])
+                    p.let(f"factor{c}_{i}_{j}", f"({self._gram(i, j)}-({done}))/factor{c}_{j}_{j}", "Cholesky factor")
+                left = _sum(f"factor{c}_{i}_{k}^2" for k in before)
+                p.let(f"pivot{c}", f"{self._gram(i, i)}-({left})", f"row {i} beside the rows before it")
+                # step(NaN) is 0: a row that is not a number is singular too. After a failure x may be anywhere; the
+                # row that failed is to be named, not this one.
+                good = f"step(pivot{c}-small{c}*{self._of('own', i)})*step(pivot{c}-1e-200)"
+                lost = f"select({singular}+failed, {singular}, select({good}, 0, {i + 1}))"
+                p.let(singular, lost, f"does row {i} vanish?")
+                p.let(f"factor{c}_{i}_{i}", f"sqrt(select({singular}, 1, pivot{c}))", "Cholesky factor")
+                p.let(f"back{c}_{i}_{i}", f"1/factor{c}_{i}_{i}", "inverse of the factor")
+                for b, j in enumerate(before):
+                    done = _sum(f"factor{c}_{i}_{k}*back{c}_{k}_{j}" for k in block[b:a])
+                    p.let(f"back{c}_{i}_{j}", f"-({done})*back{c}_{i}_{i}", "inverse of the factor")
+            for a, i in enumerate(block):
+                for j in block[: a + 1]:
+                    total = _sum(f"back{c}_{k}_{i}*back{c}_{k}_{j}" for k in block[a:])
+                    p.let(self._inverse(i, j), total, "inverse of G")
+                    if i != j:
+                        p.let(self._inverse(j, i), self._inverse(i, j), "symmetric")
 
     def _refuse_dependent(self, p: Program) -> None:
         singular = f"select(singular{self.code}, {self.code}, 0)"
         p.let("failed", f"select(failed, failed, {singular})", "rows must be independent")
 
-    def _clock(self, integrator: openmm.CustomIntegrator) -> float:
-        return Clock(self.code_in(integrator)).now(variables_of(integrator)) if self._drives else 0.0
-
-    @property
-    def _pushes(self) -> str:
-        return "+".join(f"{self._of('push', k)}*{self._of('row', k)}" for k in range(self.n_rows))
-
-    def foresee(self, p: Program) -> str:
-        return self._forecast.foresee(p, self._pushes)
+    # -- positions ------------------------------------------------------------------------------
 
     def land(self, p: Program, h: str) -> None:
         c = self.code
         if self._drives:
-            Clock(c).drift(p, h)
+            p.let(f"flown{c}", f"flown{c}+select(first_stage, 0, {h})", "targets at the end of the drift")
         if self._base != "xu":
             p.each(self._base, "x", "positions as other parts leave them")
+        self._extrapolate(p)
         p.let(f"iterations{c}", f"select(failed, iterations{c}, 0)", "a new solve")
         p.let(f"state{c}", "select(failed, 2, 1)", "after a failure only fly")
         # The first pass is written apart: a block within the loop makes the set-up of OpenMM take 15 times as long.
@@ -196,35 +285,30 @@ class GroupRows(Part):
             self._push(p)
             self._measure(p)
             self._decide(p, first=False)
-        if self._forecast.foresees:
-            with p.when(f"select(sparing{c}, state{c}, 0) > 2", "one more, which need not be measured", usual=True):
+        if self.lean:
+            with p.when(f"state{c} > 2", "one more, which need not be measured", usual=True):
                 self._push(p)
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
-        begins = "delta(stage)"  # not so where constraints are applied alone
-        for k in range(self.n_rows):
-            push, impulse = self._of("push", k), self._of("impulse", k)
-            before = f"select({begins}, 0, {impulse})"
-            if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
-                before = f"-select(behind*looked, 0.5*dt*{self._of('end', k)}, 0)"
-            p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
-            if self._leapfrog:
-                p.let(self._of("lambda", k), f"{push}/({h}*{h})", "multiplier where the drift began")
-            else:
-                at = f"select(known{c}, 0.5*({self._of('end', k)}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
-                if self.lean:
-                    at = f"select(behind, {push}/({h}*{h}), {at})"
-                p.let(
-                    self._of("lambda", k),
-                    f"select({begins}, {at}, {self._of('lambda', k)})",
-                    "multiplier where the step began",
-                )
-        self._forecast.keep(p)
-        p.let(f"known{c}", "0", "further drifts begin elsewhere")
+        self._note_multipliers(p, h)
         if not self._single:
-            self._gradients_kept(p)
+            self._gradients(p)
         if self._leapfrog:
             self._end_step(p)
+
+    def _extrapolate(self, p: Program) -> None:
+        """The first pushes: none, or on the line through the last ones."""
+        c = self.code
+        if not self.lean:
+            for k in range(self.n_rows):
+                p.let(self._of("push", k), "0", "first without")
+            return
+        p.let(f"follows{c}", f"led*follows{c}", "do the last steps tell this push?")
+        for k in range(self.n_rows):
+            line = f"select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)"
+            p.let(self._of("push", k), line, "on the line through the last ones")
+        with p.when(f"follows{c} != 0", "there is such a line", usual=True):
+            p.each("x", f"{self._base}+{self._pushes}", "there, with what is foreseen")
 
     def _push(self, p: Program) -> None:
         if self.meets_system:
@@ -235,13 +319,13 @@ class GroupRows(Part):
             p.hold_positions("onto the constraints of the System")
 
     def _measure(self, p: Program) -> None:
-        """sigma at x; what the last push did, for the quasi-Newton matrix."""
+        """sigma at x, and what the last push did to it."""
         c = self.code
         for k, group in enumerate(self._groups):
-            off = f"energy{group}-({self._target(k)})"
-            p.let(self._of("now", k), off, f"{self.names[k]} less its target")
+            now = self._of("now", k)
+            p.let(now, f"energy{group}-({self._target(k)})", f"{self.names[k]} less its target")
             if self.periods[k]:
-                now, period = self._of("now", k), repr(self.periods[k])
+                period = repr(self.periods[k])
                 p.let(now, f"{now}-{period}*floor({now}/{period}+0.5)", "nearest image")
         p.let(f"held{c}", f"delta(state{c}-1)", "is this an iteration?")
         for k in range(self.n_rows):
@@ -252,13 +336,18 @@ class GroupRows(Part):
     def _decide(self, p: Program, first: bool) -> None:
         """Done, once more, or give up: then a last pass leaves x where it flew to."""
         c, rows = self.code, range(self.n_rows)
-        squares = "+".join(f"({self._of('sigma', k)}/{self.scales[k]!r})^2" for k in rows)
+        squares = _sum(f"({self._of('sigma', k)}/{self.scales[k]!r})^2" for k in rows)
         p.let(f"residual{c}", f"sqrt({squares})", "size of sigma; not a number if one is none")
         p.let(f"held{c}", f"held{c}*step(tolerance{c}-residual{c})", "do the rows hold?")
-        for block in () if first else self._blocks:
-            block.update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
+        if not first:
+            self._update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
         p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")
-        going, again = self._forecast.judge(p, first)
+        going, again = f"(1-held{c})", "1"
+        if self.lean:
+            sure = f"between*step(tolerance{c}-{_LEFT!r}*residual{c})"
+            again = f"select({sure}, 3, 1)"
+            if first:  # of what is foreseen, sigma within the tolerance is taken away, too
+                going = f"max({going}, follows{c}*{sure})"
         p.let(
             f"state{c}",
             f"select(delta(state{c}-1)*{going}, select(step(1e10-residual{c})"
@@ -266,17 +355,63 @@ class GroupRows(Part):
             "done, or once more, or give up",
         )
         for block in self._blocks:
-            for k in block.rows:
-                more = f"select(delta(state{c}-1)+delta(state{c}-3), -({block.solve(k, 'sigma')}), 0)"
+            for k in block:
+                more = f"select(delta(state{c}-1)+delta(state{c}-3), -({self._solved(block, k, 'sigma')}), 0)"
                 p.let(self._of("more", k), more, "what is missing")
         for k in rows:
             push = self._of("push", k)
             p.let(push, f"select(delta(state{c}-2), 0, {push}+{self._of('more', k)})", "push more")
 
+    def _update(self, p: Program, active: str) -> None:
+        """Broyden: inverse += (more - inverse change) (more^T inverse) / (more^T inverse change).
+
+        Where `active` is not 0 and the denominator is safe.
+        """
+        c, of = self.code, self._of
+        for block in self._blocks:
+            for i in block:
+                p.let(of("expected", i), self._solved(block, i, "change"), "push that explains the change")
+                p.let(of("left", i), _sum(f"{of('more', j)}*{self._inverse(j, i)}" for j in block), "more^T inverse")
+            p.let(f"weight{c}", _sum(f"{of('left', j)}*{of('change', j)}" for j in block), "denominator of the update")
+            p.let(f"length{c}", _sum(f"{of('more', j)}^2" for j in block), "square of the push")
+            safe = f"{active}*step(length{c}-1e-300)*step(abs(weight{c})-0.1*length{c})"
+            p.let(f"weight{c}", f"select({safe}, 1/select({safe}, weight{c}, 1), 0)", "no update where it is not safe")
+            for i in block:
+                for j in block:
+                    new = f"{self._inverse(i, j)}+weight{c}*({of('more', i)}-{of('expected', i)})*{of('left', j)}"
+                    p.let(self._inverse(i, j), new, "Broyden's update")
+
+    def _note_multipliers(self, p: Program, h: str) -> None:
+        c, begins = self.code, "delta(stage)"  # not so where constraints are applied alone
+        for k in range(self.n_rows):
+            push, impulse, multiplier, end = (self._of(name, k) for name in ("push", "impulse", "lambda", "end"))
+            before = f"select({begins}, 0, {impulse})"
+            if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
+                before = f"-select(behind*looked, 0.5*dt*{end}, 0)"
+            p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
+            if self._leapfrog:
+                p.let(multiplier, f"{push}/({h}*{h})", "multiplier where the drift began")
+                continue
+            at = f"select(known{c}, 0.5*({end}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
+            if self.lean:
+                at = f"select(behind, {push}/({h}*{h}), {at})"
+            p.let(multiplier, f"select({begins}, {at}, {multiplier})", "multiplier where the step began")
+        if self.lean:
+            p.let(f"renew{c}", f"max(step(iterations{c}-2.5), 1-led)", "has it become slow?")
+            for k in range(self.n_rows):
+                older, last, push = (self._of(name, k) for name in ("older", "last", "push"))
+                p.let(older, f"select(follows{c}, {last}, {push})", "of the step before")
+                p.let(last, push, "of this step")
+            p.let(f"follows{c}", "1-step(failed-0.5)", "this step tells the next push")
+        p.let(f"known{c}", "0", "further drifts begin elsewhere")
+
+    # -- velocities -----------------------------------------------------------------------------
+
     def project(self, p: Program) -> None:
         c, rows = self.code, range(self.n_rows)
         if self._single:
-            self._gradients(p, sizes=False, slopes=True)
+            self._directions(p, slopes=True)
+            self._invert(p)
         else:
             for k, group in enumerate(self._groups):
                 p.sum(self._of("slope", k), f"-f{group}*v", f"rate of {self.names[k]}")
@@ -284,21 +419,20 @@ class GroupRows(Part):
             if self._rates[k] != 0.0:
                 p.let(self._of("slope", k), f"{self._of('slope', k)}-({self._rate(k)})", "less that of the target")
         for block in self._blocks:
-            for k in block.rows:
-                p.let(self._of("more", k), f"-({block.solve(k, 'slope')})", "multiplier times time")
-        p.let(f"bad_sum{c}", "+".join(f"abs({self._of('more', k)})" for k in rows), "to find what is no number")
+            for k in block:
+                p.let(self._of("more", k), f"-({self._solved(block, k, 'slope')})", "multiplier times time")
+        p.let(f"bad_sum{c}", _sum(f"abs({self._of('more', k)})" for k in rows), "to find what is no number")
         bad = f"select(singular{c}, {c}, select(step(1e200-bad_sum{c}), 0, {c}))"
         p.let("failed", f"select(failed, failed, {bad})", "independent rows, finite velocities?")
         for k in rows:
             p.let(self._of("more", k), f"select(failed, 0, {self._of('more', k)})", "nothing after a failure")
-        pushes = "+".join(f"{self._of('more', k)}*{self._of('row', k)}" for k in rows)
         v = f"v_kept{c}" if self.meets_system and self._single else "v"
+        pushes = _sum(f"{self._of('more', k)}*{self._of('row', k)}" for k in rows)
         p.each("v", f"{v}+{pushes}", "tangent to the rows")
         share = _last_share(p.integrator)
         for k in rows:
             p.let(self._of("end", k), f"2*{self._of('more', k)}/(dt*{share!r})", "multiplier at the end of the step")
-            impulse = f"{self._of('impulse', k)}+{self._of('more', k)}"
-            p.let(self._of("impulse", k), impulse, "all of this step")
+            p.let(self._of("impulse", k), f"{self._of('impulse', k)}+{self._of('more', k)}", "all of this step")
         p.let(f"known{c}", "delta(first_stage)", "the next step begins here")
         self._end_step(p)
 
@@ -315,6 +449,47 @@ class GroupRows(Part):
                 done = f"{work}+select(first_stage+failed, 0, {self._rate(k)}*{impulse})"
                 p.let(work, done, "force times speed of the target")
 
+    # -- seen from Python -----------------------------------------------------------------------
+
+    def _clock(self, integrator: openmm.CustomIntegrator) -> float:
+        """The time of the targets between steps."""
+        return clock_of(variables_of(integrator), self.code_in(integrator)) if self._drives else 0.0
+
+    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
+        """Targets go on from where the other integrator has left them."""
+        if self._drives:
+            program.write(f"clock{self.code}", clock_of(variables_of(before), notes["code"]))
+            program.write(f"flown{self.code}", 0.0)
+
+
+def clock_of(variables: dict[str, float], code: int) -> float:
+    """The time of the targets of the part with this number; the step made last counts where it was kept."""
+    kept = variables[f"began{code}"] != variables["good_steps"]
+    return variables[f"clock{code}"] + (variables[f"flown{code}"] if kept else 0.0)
+
+
+def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
+    """All global variables of the integrator that holds the rows, by name; `InputError` for what is none."""
+    if not isinstance(integrator, openmm.CustomIntegrator):
+        raise InputError(
+            f"integrator is a {type(integrator).__name__}; give the integrator that holds the rows", item="integrator"
+        )
+    numbers = range(integrator.getNumGlobalVariables())
+    return {integrator.getGlobalVariableName(k): integrator.getGlobalVariable(k) for k in numbers}
+
+
+def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
+    """The integrator of the context that holds the rows, None if it has none."""
+    integrator = context.getIntegrator()
+    members = [integrator]
+    if isinstance(integrator, openmm.CompoundIntegrator):
+        members = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
+    known = [_HOLDING.get(int(one.this), one) for one in members if isinstance(one, openmm.CustomIntegrator)]
+    holding = [one for one in known if rows._of("push", 0, one) in variables_of(one)]
+    # Of members of a CompoundIntegrator the one that made steps last.
+    ours = (one for one in holding if getattr(one, "identity", holding) is rows.serves)
+    return next(ours, next(iter(holding), None))
+
 
 def _halved(integrator: Any, scheme: Any) -> bool:
     """Whether a bath acts between two halves of the drift: the second one does not begin where the step does."""
@@ -326,3 +501,7 @@ def _last_share(integrator: openmm.CustomIntegrator) -> float:
     """Length of the last drift as a fraction of the step."""
     scheme = getattr(integrator, "scheme", None)
     return 1.0 if scheme is None else float(scheme.drifts[-1] * scheme.flight[-1])
+
+
+def _sum(terms: Iterable[str]) -> str:
+    return "+".join(terms) or "0"

@@ -184,10 +184,6 @@ class Part(ABC):
     def project(self, program: Program) -> None:
         """Make v tangent to the rows at x."""
 
-    def foresee(self, program: Program) -> str:
-        """Before a drift: what the part adds to where it leads, before it has looked there; '' for nothing."""
-        return ""
-
     def land_alone(self, program: Program, u: str, h: str) -> None:
         """For parts that may be `alone`: the whole drift with velocity u, after `remember`; v gets its impulse, too."""
         raise NotImplementedError
@@ -206,9 +202,6 @@ class Part(ABC):
 
         Written where the applied forces are computed anew.
         """
-
-    def begin_early(self, program: Program) -> None:
-        """The same where velocities are projected before the first drift."""
 
     def renew(self, program: Program) -> None:
         """Before a drift that follows a step without `project`, where v is free to be used."""

@@ -194,8 +194,6 @@ class StepWriter:
                     p.each("force", "f", "applied forces")
                     for part in self.parts:
                         part.begin(p)
-                        if self.ensemble.stays_tangent:
-                            part.begin_early(p)
             else:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")
@@ -321,13 +319,8 @@ class StepWriter:
         """Fly freely for h with velocities u, and go from there back onto all constraints."""
         p = self.program
         u = u if u.isidentifier() else f"({u})"
-        foreseen = "+".join(filter(None, [part.foresee(p) for part in self.parts]))
-        if foreseen:
-            p.each("xu", f"x+{h}*{u}", "where free motion leads (drift)")
-            p.each("x", f"xu+{foreseen}", "there, with what is foreseen")
-        else:
-            p.each("x", f"x+{h}*{u}", "move freely (drift)")
-            p.each("xu", "x", "where that leads")
+        p.each("x", f"x+{h}*{u}", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
         for part in self.parts:
             if not (part.meets_system or part.lands_last):
                 part.land(p, h)

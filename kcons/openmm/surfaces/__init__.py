@@ -1,8 +1,7 @@
 """Particles on surfaces in OpenMM.
 
 - `surface_rows`: what all surfaces share
-- `quadrics`, `compiled_quadrics`: spheres, cylinders, planes, ellipsoids
-- `tori`: tori
+- `closed_forms`: spheres, cylinders, planes, ellipsoids, tori
 - `formulas`: surfaces given by a formula
 - `surface_step_writer`: the program of a step
 - `surface_integrator`: `SurfaceIntegrator`

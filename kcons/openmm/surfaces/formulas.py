@@ -19,11 +19,11 @@ from kcons.constraints.arguments import ANY, without_units
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
+from kcons.openmm.collective.coordinates import free_groups
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SURFACE_NAME
 from kcons.openmm.quantities import number
-from kcons.openmm.surfaces.compiled_quadrics import free_groups
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 
 #: Newton steps at most. The loop ends after steps of less than this (nm): the number of right digits doubles.
@@ -154,7 +154,7 @@ class ImplicitRows(SurfaceRows):
 
     def __init__(self, surfaces: Sequence[ExpressionSurface], system: openmm.System) -> None:
         super().__init__([surface.rows() for surface in surfaces], system.getNumParticles())
-        free = free_groups(system, 2)
+        free = free_groups(system, 2, "these surfaces")[-2:]
         self._pair = tuple(free)
         self.groups = frozenset(free)
         for surface in surfaces:

@@ -19,12 +19,10 @@ from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.states.settings import picoseconds
 from kcons.openmm.quantities import accepted, nanometers
-from kcons.openmm.surfaces.compiled_quadrics import CompiledQuadricRows
+from kcons.openmm.surfaces.closed_forms import QUADRICS, CompiledQuadricRows, QuadricRows, TorusRows
 from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
-from kcons.openmm.surfaces.quadrics import QUADRICS, QuadricRows
 from kcons.openmm.surfaces.surface_rows import CARRIER, SurfaceRows, engine, positions_and_velocities, refuse_system
 from kcons.openmm.surfaces.surface_step_writer import SurfaceStepWriter
-from kcons.openmm.surfaces.tori import TorusRows
 from kcons.steppers import Splitting
 
 AnySurface: TypeAlias = Constraint | ExpressionSurface

@@ -131,21 +131,14 @@ class SurfaceRows(Part):
             item.check(x[item.atoms], 0.0, first)
             first += item.n_rows
         miss = self._worst(x, v if velocities else None)
-        if miss is not None and miss.what == "positions":
-            raise InputError(
-                f"particle {miss.atoms[0]} is {abs(miss.off):.3g} nm from its surface, {miss.name}; move it there "
-                "with integrator.apply_positions(context). (Surfaces are not repeated in periodic boxes: positions "
-                "must not be wrapped)",
-                item="positions",
-                atoms=miss.atoms,
-            )
-        if miss is not None:
-            raise InputError(
-                f"particle {miss.atoms[0]} has the velocity {abs(miss.off):.3g} nm/ps across its surface, "
-                f"{miss.name}; call integrator.apply_velocities(context) after velocities are set",
-                item="velocities",
-                atoms=miss.atoms,
-            )
+        if miss is None:
+            return
+        off = f"is {abs(miss.off):.3g} nm from its surface, {miss.name}; move it there with integrator.apply_positions("
+        off += "context). (Surfaces are not repeated in periodic boxes: positions must not be wrapped)"
+        if miss.what == "velocities":
+            off = f"has the velocity {abs(miss.off):.3g} nm/ps across its surface, {miss.name}; call "
+            off += "integrator.apply_velocities(context) after velocities are set"
+        raise InputError(f"particle {miss.atoms[0]} {off}", item=miss.what, atoms=miss.atoms)
 
     def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
         """Distances from the surfaces and velocities across them, by the objects that were given."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.step_variables import use
-from kcons.openmm.surfaces.quadrics import QuadricRows
+from kcons.openmm.surfaces.closed_forms import QuadricRows
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 from kcons.steppers.rattle import Rattle
 

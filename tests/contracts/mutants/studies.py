@@ -64,7 +64,7 @@ MUTANTS = [
     ),
     (
         "openmm/collective/row_program.py",
-        "if not self._single or _halved(p.integrator, scheme):",
+        "if not self._single or _halved(integrator, scheme):",
         "if not self._single:",
         "tests/openmm/collective/test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
     ),

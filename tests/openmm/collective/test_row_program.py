@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 
 import numpy as np
@@ -9,6 +11,7 @@ import openmm
 import pytest
 from collective_cases import (
     CHAIN,
+    FORCES,
     angle,
     bond,
     chain_system,
@@ -21,15 +24,78 @@ from collective_cases import (
     with_variable,
 )
 from openmm import app, unit
-from openmm_systems import DATA
+from openmm_systems import DATA, GPUS, started
 
 from kcons.constraints import Dihedral
-from kcons.errors import ConstraintError, ConvergenceError, InputError
+from kcons.errors import ConstraintError, ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.collective.row_forces import Row
+from kcons.openmm.collective.coordinates import Row
 
 # -- multipliers ----------------------------------------------------------------------------------------
+
+
+def rotor(scheme="rattle", dt=0.002, row=None):
+    """A dumbbell of two masses, turning freely: the bond pulls with lambda = -mu omega^2 d."""
+    system = openmm.System()
+    system.addParticle(2.0)
+    system.addParticle(3.0)
+    part = CollectiveRows(system, [Row(bond(0, 1), 0.2)] if row is None else [row])
+    integrator = ProjectedIntegrator(dt, scheme, parts=[part])
+    x = np.array([[0.0, 0, 0], [0.2, 0, 0]])
+    v = np.array([[0.0, -3.0, 0], [0.0, 2.0, 0]])
+    context = context_of(system, integrator, x, v)
+    return context, integrator, part
+
+
+ROTOR = -(2.0 * 3.0 / 5.0) * 5.0**2 / 0.2
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "suzuki4", "blanes-moan6", "geodesic"])
+def test_multiplier_of_a_rotor(scheme):
+    context, integrator, part = rotor(scheme, dt=0.001)
+    integrator.step(5)
+    assert part.multipliers_at(context) == pytest.approx([ROTOR], rel=1e-9)
+    # An impulse along a chord: (omega dt)^2 off.
+    assert part.mean_multipliers(integrator) == pytest.approx([ROTOR], rel=2e-3)
+
+
+def test_multipliers_have_second_order():
+    errors = []
+    for dt in (0.002, 0.001):
+        context, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], dt=dt, constrained=True)
+        integrator.step(round(0.04 / dt))
+        exact = part.multipliers_at(context)
+        integrator.step(1)
+        errors.append(np.abs(part.multipliers(integrator) - exact).max())
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.15)
+
+
+def test_multipliers_of_a_static_load():
+    # A weight hangs on a rod from a heavy anchor without motion: the rod pulls with its weight.
+    system = openmm.System()
+    system.addParticle(0.0)
+    system.addParticle(4.0)
+    load = openmm.CustomExternalForce("30*x")
+    load.addParticle(1)
+    system.addForce(load)
+    part = CollectiveRows(system, [Row(bond(0, 1), 0.3 * unit.nanometer)])
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    context = context_of(system, integrator, [[0, 0, 0], [-0.3, 0, 0]], np.zeros((2, 3)))
+    assert np.isnan([part.multipliers(integrator), part.mean_multipliers(integrator)]).all()
+    integrator.step(10)
+    # f = -30 along the rod, outwards: z = A^T lambda = +30, and grad r = -1 there.
+    assert part.multipliers(integrator) == pytest.approx([-30.0], abs=1e-9)
+    assert part.mean_multipliers(integrator) == pytest.approx([-30.0], abs=1e-9)
+    assert part.multipliers_at(context) == pytest.approx([-30.0], abs=1e-9)
+
+
+def test_multipliers_at_a_point_need_a_scheme_that_has_them():
+    _, integrator, part = held_chain([bond(0, 3)], scheme="blanes-moan6")
+    integrator.step(1)
+    with pytest.raises(UnsupportedError, match="mean_multipliers"):
+        part.multipliers(integrator)
+    assert np.isfinite(part.mean_multipliers(integrator)).all()
 
 
 # -- order, reversibility, energy -----------------------------------------------------------------------
@@ -226,3 +292,167 @@ def test_langevin_beside_constraints_of_the_system_goes_on():
     integrator.setVelocitiesToTemperature(context, 300, 1)
     integrator.step(1500)
     assert abs(rows.residuals(context)[0]) < 1e-12
+
+
+def molecule():
+    """A System of three particles, and a Force that is the distance of two of them."""
+    system, springs = openmm.System(), openmm.HarmonicBondForce()
+    for mass in (12.0, 16.0, 14.0):
+        system.addParticle(mass)
+    springs.addBond(1, 2, 0.15, 1e4)
+    system.addForce(springs)
+    return system, bond(0, 1)
+
+
+def test_members_of_a_compound_integrator_pull_in_turn():
+    """One goes on where the other has ended, and each is judged by the time that has passed in all."""
+    system, length = molecule()
+    rows = CollectiveRows(system, [Row(length, 0.15, 0.5)])
+    members = [
+        ProjectedIntegrator(0.002, parts=[rows], check_every=3),
+        ProjectedIntegrator(0.002, "geodesic", parts=[rows], check_every=3),
+    ]
+    compound = openmm.CompoundIntegrator()
+    for member in members:
+        compound.addIntegrator(member)
+    context = openmm.Context(system, compound, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
+    steps = 0
+    for number, block in ((0, 5), (1, 20), (0, 5), (1, 10), (0, 1)):
+        compound.setCurrentIntegrator(number)
+        compound.step(block)
+        steps += block
+        members[number].check()
+        assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
+        assert abs(rows.targets(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
+
+
+def test_a_state_of_another_program_has_no_time_of_targets():
+    """The pull begins anew there; the error says how to go on instead, and that way ends where one run would."""
+    states = []
+    for scheme in ("rattle", "geodesic"):
+        system, length = molecule()
+        rows = CollectiveRows(system, [Row(length, 0.15, 0.5)])
+        integrator = ProjectedIntegrator(0.002, scheme, parts=[rows])
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+        context.setPositions([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
+        if states:
+            context.setState(states[0])
+            with pytest.raises(ConstraintError, match=r"call restore.*set_target\(integrator, 0, 0\.17\)"):
+                integrator.step(1)
+            rows.set_target(integrator, 0, 0.17)
+        integrator.step(20)
+        states.append(context.getState(positions=True, velocities=True, integratorParameters=True))
+    assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * 40)) < 1e-12
+    context.setPositions([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.15, 0.0]])
+    with pytest.raises(ConstraintError) as caught:  # the time of these targets is known
+        rows.check(context)
+    assert "call restore" in str(caught.value) and "set_target" not in str(caught.value)
+
+
+# -- what programs do where nobody looks ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
+@pytest.mark.parametrize("kind", ["bond", "rmsd", "variable", "three"])
+def test_pushes_that_are_extrapolated_lead_where_others_do(kind, constrained):
+    """Calls of many steps, and calls of one, which begin without."""
+    ends = []
+    for block in (60, 1):
+        context, integrator, part = held_chain(FORCES[kind](), constrained=constrained)
+        for _ in range(60 // block):
+            integrator.step(block)
+        assert np.abs(part.residuals(context)).max() <= 1e-12
+        ends.append(state_of(context))
+    assert np.abs(np.array(ends[1]) - ends[0]).max() <= 1e-11
+
+
+def test_many_steps_look_less_often():
+    """At a row that counts how often it is asked."""
+    asked = []
+
+    def distance(state):
+        asked.append(1)
+        x = state.getPositions(asNumpy=True)._value
+        arm = x[3] - x[0]
+        r = np.linalg.norm(arm)
+        force = np.zeros_like(x)
+        force[0], force[3] = arm / r, -arm / r
+        return r, force
+
+    counts = []
+    for block in (100, 1):
+        context, integrator, part = held_chain([Row(openmm.PythonForce(distance), 0.3)], dt=1e-3)
+        integrator.step(2)
+        asked.clear()
+        for _ in range(100 // block):
+            integrator.step(block)
+        counts.append(len(asked))
+        assert np.abs(part.residuals(context)).max() <= 1e-13
+    assert counts[0] < 0.85 * counts[1]
+
+
+def test_a_target_that_jumps_is_reached_from_what_was_extrapolated():
+    context, integrator, part = held_chain([bond(0, 3)])
+    integrator.step(20)
+    part.set_target(integrator, 0, float(part.targets(context)[0]) + 1e-3)
+    integrator.step(20)
+    assert np.abs(part.residuals(context)).max() <= 1e-13
+
+
+@pytest.mark.parametrize("platform", [p for p in GPUS if p.id.endswith(("mixed", "none"))])
+def test_the_motion_on_a_gpu_is_that_of_steps_that_are_looked_at(platform):
+    """To what single numbers know."""
+    ends = []
+    for block in (100, 1):
+        system = chain_system()
+        part = CollectiveRows(system, FORCES["three"](), positions=CHAIN)
+        integrator = ProjectedIntegrator(1e-3, parts=[part])
+        context = started(system, integrator, CHAIN, some_velocities(), platform)
+        part.restore(context)
+        for _ in range(100 // block):
+            integrator.step(block)
+        assert np.abs(part.residuals(context)).max() < 5e-6
+        ends.append(state_of(context)[0])
+    assert np.abs(ends[1] - ends[0]).max() < 1e-4
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_the_iteration_learns_from_each_push(count):
+    """Rows that share particles, and pushes that turn their gradients: each takes far more iterations without."""
+    rows = [bond(i, j) for i, j in list(itertools.combinations(range(6), 2))[:count]]
+    context, integrator, part = held_chain(rows, dt=0.004)
+    for _ in range(5):
+        integrator.step(1)
+        assert integrator.getGlobalVariableByName("iterations1") <= 6
+    assert np.abs(part.rates(context)).max() <= 1e-12
+
+
+def test_products_are_summed_only_where_rows_meet():
+    system = openmm.System()
+    for _ in range(8):
+        system.addParticle(1.0)
+    part = CollectiveRows(system, [Row(bond(2 * k, 2 * k + 1), 0.1) for k in range(4)])
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    sums = [integrator.getComputationStep(k)[2] for k in range(integrator.getNumComputations())]
+    assert sum(text.startswith("m*row1_") for text in sums) == 3 * 4  # where a call begins, in it, where it ends
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_copies_of_an_integrator_have_its_clock(steps):
+    """Also after a single step."""
+    x = np.array([[0, 0, 0], [0.3, 0, 0]])
+    system, force = openmm.System(), openmm.CustomBondForce("r")
+    for _ in x:
+        system.addParticle(12.0)
+    force.addBond(0, 1)
+    part = CollectiveRows(system, [Row(force, 0.3, rate=1.0)])
+    integrator = ProjectedIntegrator(1e-3, parts=[part])
+    context = context_of(system, integrator, x)
+    part.restore(context)
+    integrator.step(steps)
+    again = copy.copy(integrator)
+    other = context_of(system, again, state_of(context)[0])
+    again.parts[0].restore(other)
+    again.step(1)
+    assert again.parts[0].values(other) == pytest.approx(0.3 + 1e-3 * (steps + 1), abs=1e-12)

@@ -13,7 +13,7 @@ from openmm_systems import PLATFORMS, alanine, holding, loose_alanine, masses_of
 from kcons.constraints import KnifeEdge, Plane
 from kcons.errors import ConvergenceError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
-from kcons.openmm.carried.hold import hold
+from kcons.openmm.callback_rows.hold import hold
 from tests.openmm.collective.test_collective_rows import bond
 
 KINDS = [

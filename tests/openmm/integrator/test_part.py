@@ -43,7 +43,7 @@ def test_a_part_needs_what_every_part_has():
 def test_what_a_part_does_not_have_writes_nothing():
     program = Program(integrator := openmm.CustomIntegrator(1e-3))
     part = HeldCoordinates([0], 0, 0.0, 1)
-    for method in (part.begin, part.begin_early, part.renew, part.passed):
+    for method in (part.begin, part.renew, part.passed):
         method(program)
     part.begin_run()
     assert program.operations == []
@@ -58,16 +58,12 @@ def test_hooks_are_called_where_they_belong():
         def begin(self, program):
             program.let("stage", "7", "begin")
 
-        def begin_early(self, program):
-            program.let("stage", "8", "early")
-
     from kcons.openmm import ProjectedIntegrator
 
     integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=[Telling([0], 0, 0.0, 2, evaluates=True)])
     lines = integrator.listing().splitlines()
     begin = next(k for k, line in enumerate(lines) if line.endswith("# begin"))
     assert "if moved+stale != 0:" in "".join(lines[begin - 4 : begin])
-    assert not any(line.endswith("# early") for line in lines)
     assert isinstance(integrator._plan, StepWriter)
 
 

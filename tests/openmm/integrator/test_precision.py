@@ -459,7 +459,7 @@ def test_a_system_made_where_no_gpu_was_is_made_fit_by_reading_it(platform, monk
     """Only mixed precision hands over less of some particles than of all."""
     system, x, v = free_alanine()
     with monkeypatch.context() as elsewhere:
-        elsewhere.setattr("kcons.openmm.carried.carried_constraints.hands_over_all", lambda: False)
+        elsewhere.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda: False)
         part = hold(system, Distance([4, 14]), x)
     context = started(system, ProjectedIntegrator(STEP, parts=[part]), x, v, platform)
     with pytest.raises(UnsupportedError, match=r"CarriedConstraints.of\(system\)"):
@@ -474,7 +474,7 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
     """What callbacks are given does not change a bit of what is computed."""
     ends = []
     for every in (False, True):
-        monkeypatch.setattr("kcons.openmm.carried.carried_constraints.hands_over_all", lambda every=every: every)
+        monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda every=every: every)
         system, x, v = free_alanine()
         integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
         context = started(system, integrator, x, v)

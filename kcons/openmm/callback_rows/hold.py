@@ -22,8 +22,7 @@ from kcons.constraints import Angle, Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.requirements import refuse_agents
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_agents
 from kcons.openmm.quantities import masses_of
 
 #: Hydrogens, also heavy ones, are lighter than this (dalton).

@@ -13,7 +13,7 @@ from openmm import app, unit
 from kcons.constraints import Dihedral, Distance, Plane
 from kcons.errors import ContradictionError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.hold import hold, take_constraints
+from kcons.openmm.callback_rows.hold import hold, take_constraints
 
 PEPTIDE = app.PDBFile(str(Path(__file__).parents[2] / "data" / "alanine-dipeptide-implicit.pdb"))
 TRIANGLE = np.array([[0, 0, 0], [0.09572, 0, 0], [-0.024, 0.09266, 0]])
@@ -155,12 +155,6 @@ def test_unknown_choices_change_nothing(which):
     before = content(system)
     with pytest.raises(InputError):
         take_constraints(system, which)
-    assert content(system) == before
-
-
-def test_an_empty_choice_takes_nothing():
-    system, _ = waters(1)
-    before = content(system)
     assert take_constraints(system, []) == []
     assert content(system) == before
 
@@ -290,12 +284,6 @@ def test_barostat_and_rows_within_molecules_go_together():
     context.getIntegrator().step(100)
     part.check(context)
     assert len(context.getMolecules()) == 3
-
-
-def test_positions_may_have_units():
-    system, x = waters(1)
-    part = hold(system, [], unit.Quantity(x * 10, unit.angstrom), take="all")
-    assert part.motion.constraint_set.target() == pytest.approx([0.15])
 
 
 # -- `apply_positions` of rows from `hold`, with far targets: bonds of the System lead, and stay as they are --

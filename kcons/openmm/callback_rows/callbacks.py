@@ -1,9 +1,7 @@
-"""The constraint objects of kcons in OpenMM: PythonForces that carry positions to the engine and corrections back.
+"""The functions that OpenMM calls: PythonForces that carry positions to the engine and corrections back.
 
-A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. On GPUs
-they are rounded on their way, see `carried.passage`.
-
-Three of these forces, each in a force group of its own, serve one set of rows:
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
+them, each in a force group of its own, serve one set of rows:
 
 * `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
   last drift has ended there for sure.
@@ -14,11 +12,18 @@ Three of these forces, each in a force group of its own, serve one set of rows:
 Each returns an 'energy' of 0, or 1 where the engine raised an error: nothing may be raised through OpenMM, so the
 error is kept and the integrator told to take the step back. Outside of steps all three return nothing to speak of:
 rows that are fulfilled need no correction.
+
+GPUs keep forces as multiples of 2^-32, and CustomIntegrator reads them divided by 2^32 - 1. In mixed precision
+positions are pairs of single numbers, 48 bits: a PythonForce of all particles gets both, one of some particles only the
+first. What it returns becomes single numbers: corrections have relative errors up to 6e-8. From the rounded correction
+the engine knows the positions in OpenMM, to rounding.
 """
 
 from __future__ import annotations
 
+import io
 import pickle
+import re
 import uuid
 import weakref
 from collections.abc import Callable
@@ -34,13 +39,12 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion.motion import Motion
-from kcons.openmm.carried.passage import Passage
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.schemes import operations_of, stages_of
-from kcons.openmm.integrator.states.hearing import wrapped
 from kcons.openmm.integrator.system_checks import ROW_NAME
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
+from kcons.steppers.state import START_TOLERANCE
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbour list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
@@ -50,12 +54,98 @@ SPEED_SCALE = 1024.0
 #: the origin.
 LOW_SCALE = 2.0**27
 
+#: Corrections are carried multiplied by this: on GPUs forces are whole multiples of 2^-32.
+CARRY_SCALE = 2.0**20
+#: What GPUs multiply forces with, and what CustomIntegrator divides them by.
+_TO_WHOLE, _FROM_WHOLE = 2.0**32, 2.0**32 - 1
+
 PHASES = ("remember", "land", "project")
 PREFIX = f"{ROW_NAME}s"
-#: Engines by the keys in the names of forces.
+#: Engines by their keys.
 LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
-#: Those read last, by the keys that forces bring along: that of the first System, whose copies' names begin with it.
+#: Those read last, by the keys of the engines that they are copies of.
 _READ: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
+
+
+def hands_over_all() -> bool:
+    """Whether callbacks are to be given the positions of all particles: a platform here may have mixed precision."""
+    platforms = range(openmm.Platform.getNumPlatforms())
+    return any("Precision" in openmm.Platform.getPlatform(k).getPropertyNames() for k in platforms)
+
+
+class Passage:
+    """Between OpenMM and an engine that knows some of its particles.
+
+    Parameters
+    ----------
+    atoms : ndarray of int, shape (n_atoms,)
+        The particles of the engine.
+    n_particles : int
+        Of the System.
+
+    Attributes
+    ----------
+    precision : Precision
+        That of the Context.
+    """
+
+    def __init__(self, atoms: IntArray, n_particles: int) -> None:
+        self.atoms, self._n = atoms, n_particles
+        self.precision = Precision("", "double")
+        #: Positions and corrections of all particles, where OpenMM hands over all.
+        self._all: tuple[FloatArray, FloatArray] | None = None
+        self._nothing = np.zeros((len(atoms), 3))
+        self._open = False
+
+    def open(self, state: openmm.State) -> None:
+        """At the first call: whether positions are those of all particles."""
+        if not self._open:
+            self._open = True
+            if len(self.atoms) < self._n == len(state.getPositions()):
+                self._all = np.zeros((self._n, 3)), np.zeros((self._n, 3))
+
+    def take(self, state: openmm.State, out: FloatArray) -> None:
+        """Positions of the engine's particles, shape (n_atoms, 3), nm."""
+        # The public getPositions(asNumpy=True) makes the same call, and a Quantity: 20 times as slow.
+        if self._all is None:
+            state._getVectorAsNumpy(openmm.State.Positions, out)
+        else:
+            state._getVectorAsNumpy(openmm.State.Positions, self._all[0])
+            np.take(self._all[0], self.atoms, axis=0, out=out)
+
+    def give(self, force: FloatArray | None) -> FloatArray:
+        """What is returned to OpenMM for a force on the engine's particles; None for no force."""
+        force = self._nothing if force is None else force
+        if self._all is None:
+            return force
+        self._all[1][self.atoms] = force
+        return self._all[1]
+
+    def carried(self, change: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The force that carries a change, and the change that arrives."""
+        if not self.precision.rounds_lengths:
+            return change * CARRY_SCALE, change
+        force = change * (CARRY_SCALE * _FROM_WHOLE / _TO_WHOLE)
+        if self.precision.name != "double":
+            force = force.astype(np.float32).astype(np.float64)
+        return force, np.trunc(force * _TO_WHOLE) / (_FROM_WHOLE * CARRY_SCALE)
+
+    def same(self, x: FloatArray, y: FloatArray) -> bool:
+        """Whether positions of a Context, and those it should have, are the same to its rounding."""
+        if not self.precision.rounds_lengths:
+            return np.array_equal(x, y)
+        return bool(np.abs(x - y).max(initial=0.0) <= 4 * self.precision.place * np.abs(y).max(initial=0.0))
+
+    def grain(self, reach: float) -> float:
+        """Spacing of coordinates at a distance from the origin."""
+        return float(np.spacing(reach)) if self.precision.name == "double" else 2 * self.precision.place * reach
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """What positions, of the scale of a row, and velocities, of their size, may be off."""
+        if self.precision.name == "double":
+            return START_TOLERANCE, START_TOLERANCE
+        return self.precision.tolerance, self.precision.speeds
 
 
 class Engine:
@@ -80,8 +170,9 @@ class Engine:
         self.recipe = (held.constraints, positions, masses, cell, degenerate, time)
         self.atoms: IntArray = held.touched
         self.whole = len(self.atoms) == len(masses)
+        #: Where the carried particles are in arrays of all.
+        self._held: slice | IntArray = slice(None) if self.whole else self.atoms
         n, local = masses.shape[0], (len(self.atoms), 3)
-        self._nothing = np.zeros(local)
         #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
         self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self._moved = np.zeros((n, 3))
@@ -150,7 +241,7 @@ class Engine:
 
     # -- callbacks ------------------------------------------------------------------------------
 
-    def remember(self, state: openmm.State) -> FloatArray:
+    def remember(self, state: openmm.State) -> None:
         began = self._time(state), state.getStepCount()
         if self._between_steps or began != self._began:
             self._between_steps, self._began, self._stage, self._error = False, began, -1, None
@@ -159,7 +250,6 @@ class Engine:
         self._stage += 1
         self.passage.take(state, self._x)
         self._begin_drift()
-        return self._nothing
 
     def stand_at(self, x: FloatArray) -> None:
         """Particles are here, where others may have moved them: positions of all, shape (n_particles, 3)."""
@@ -167,27 +257,20 @@ class Engine:
         self._begin_drift()
 
     def _begin_drift(self) -> None:
-        self._landing = None
-        self._begun = True
-        if self.whole:
-            np.copyto(self._start, self._x)
-        else:
-            self._start[self.atoms] = self._x
+        self._landing, self._begun = None, True
+        self._start[self._held] = self._x
 
-    def land(self, state: openmm.State) -> FloatArray:
+    def land(self, state: openmm.State) -> FloatArray | None:
         there, read = self._there, self._read
         self.passage.take(state, read)
         if self._landing is not None and np.array_equal(read, self._landing[0]):
             return self._landing[1]  # force and energy are asked for one by one
         if not self.timed and self.passage.same(read, self._x):
-            return self._nothing  # at rest, or forces are asked for between steps
+            return None  # at rest, or forces are asked for between steps
         if not self._begun:
             self._begin_drift()  # where the last drift ended: nobody has moved x since
         self._begun = False
-        if self.whole:
-            np.copyto(there, read)
-        else:
-            there[self.atoms] = read
+        there[self._held] = read
         then, now, h = self._times(self._stage)
         impulse = self._impulse if len(self._fractions) == 1 else None
         # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
@@ -197,7 +280,7 @@ class Engine:
             there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there,
             multipliers=impulse,
         )  # fmt: skip
-        change = moved.copy() if self.whole else moved[self.atoms]
+        change = np.array(moved[self._held])
         fixed = self._fixed
         change[fixed] = there[self.atoms[fixed]] - read[fixed]
         # What the velocity stage before found belongs to the same positions as this impulse.
@@ -209,17 +292,17 @@ class Engine:
         self._landing = (read.copy(), change)
         return change
 
-    def project(self, state: openmm.State) -> FloatArray:
+    def project(self, state: openmm.State) -> FloatArray | None:
         read = self._read
         self.passage.take(state, read)
         read -= self._x
         if self._rest_to_come:
             self._rest_to_come = False
-            return self._project_rest(read) if read.any() else self._nothing
+            return self._project_rest(read) if read.any() else None
         # Thermostats project within a step, too.
         self._between_steps = not self._within or self._stage >= len(self._fractions) - 1
         if not self.timed and not read.any():
-            return self._nothing
+            return None
         self._rest_to_come = self.carries_rest
         read *= SPEED_SCALE
         push = self._push if len(self._fractions) == 1 else None
@@ -236,17 +319,11 @@ class Engine:
 
     def _tangent(self, read: FloatArray, multipliers: FloatArray | None) -> FloatArray:
         """Velocities of the carried particles, projected."""
-        v = self._v
-        if self.whole:
-            np.copyto(v, read)
-            x = self._x
-        else:
-            v[self.atoms] = read
-            x = self._start
-            x[self.atoms] = self._x
+        v, x = self._v, self._start
+        v[self._held], x[self._held] = read, self._x
         now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
         self.motion.project_velocities(x, v, time=now, out=v, multipliers=multipliers)
-        return v.copy() if self.whole else v[self.atoms]
+        return np.array(v[self._held])
 
     def _time(self, state: openmm.State) -> float:
         """Where a step begins. After setStepSize the clock of Reference and CPU goes on with the first step size."""
@@ -278,13 +355,12 @@ class Engine:
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
         """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
         self.passage.open(state)
+        change = None
         try:
-            change = self.remember(state) if phase == "remember" else None
-            if self._error is None:
-                if phase == "land":
-                    change = self.land(state)
-                elif phase == "project":
-                    change = self.project(state)
+            if phase == "remember":
+                self.remember(state)
+            elif self._error is None:
+                change = self.land(state) if phase == "land" else self.project(state)
             elif phase == "project":
                 self._between_steps, self._rest_to_come = True, False
         except BaseException as error:
@@ -364,32 +440,45 @@ class Callback:
 
 
 def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
-    engine = _READ.get(key) if recipe is None else Engine(key, *recipe)
-    if engine is None:
+    """The function of a copy, whose engine has a key of its own."""
+    if recipe is not None:
+        _READ[key] = engine = Engine(uuid.uuid4().hex, *recipe)
+    elif key in _READ:
+        engine = _READ[key]
+    else:
         raise pickle.UnpicklingError(f"the force '{force_name(PHASES[0], key)}' must be read first")
-    _READ[key] = engine
     return Callback(engine, phase)
 
 
-def _read(original: Callable[..., openmm.System], given: Any) -> openmm.System:
-    """A System from XML, or a copy: its rows get a key of their own, by which no other copy's are found."""
-    system = original(given)
-    keys: dict[str, str] = {}
+class _KeyReader(pickle.Unpickler):
+    """Reads the key of a function and leaves out the rest."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        return (lambda key, *_: key) if name == _restored.__name__ else super().find_class(module, name)
+
+
+def key_of(force: openmm.Force) -> str:
+    """Of the engine that a force calls: copies of a System have the names of the first one, and engines of their own.
+
+    The force of a function that cannot be pickled is no copy.
+    """
+    try:
+        xml = openmm.XmlSerializer.serialize(force)
+    except openmm.OpenMMException:
+        return str(force.getName().split()[-1])
+    found = re.search(r' function="(\w+)"', xml)
+    assert found is not None
+    return str(_KeyReader(io.BytesIO(bytes.fromhex(found[1]))).load())
+
+
+def forces_of_rows(system: openmm.System) -> dict[str, dict[str, openmm.PythonForce]]:
+    """The forces of a System that carry rows, by phase, by the key of the engine that they call."""
+    named: dict[str, dict[str, openmm.PythonForce]] = {}
     for force in system.getForces():
         if isinstance(force, openmm.PythonForce) and force.getName().startswith(PREFIX):
-            phase, key = force.getName().split()[-2:]
-            first = key.partition("-")[0]
-            if key not in keys and first in _READ:
-                keys[key] = f"{first}-{uuid.uuid4().hex}"
-                LIVE[keys[key]] = _READ[first]
-                _READ[first].key = keys[key]
-            force.setName(force_name(phase, keys.get(key, key)))
-    return system
-
-
-for _name in ("deserializeSystem", "_cloneSystem"):
-    setattr(openmm.XmlSerializer, _name, staticmethod(wrapped(getattr(openmm.XmlSerializer, _name), _read)))
-openmm.System.__copy__ = wrapped(openmm.System.__copy__, _read)
+            phase, name = force.getName().split()[-2:]
+            named.setdefault(name, {})[phase] = force
+    return {key_of(forces[PHASES[1]]): forces for forces in named.values() if PHASES[1] in forces}
 
 
 # -- what OpenMM gives ----------------------------------------------------------------------------

@@ -1,0 +1,531 @@
+"""The constraint objects of kcons as a part of an integrator of OpenMM (see `callback_rows.callbacks`)."""
+
+from __future__ import annotations
+
+import uuid
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, Self
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import unit
+
+from kcons.constraints import Constraint, FixedAtoms
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.motion.report import Report
+from kcons.openmm.callback_rows.callbacks import (
+    CARRY_SCALE,
+    LIVE,
+    LOW_SCALE,
+    PHASES,
+    SPEED_SCALE,
+    Callback,
+    Engine,
+    cell_of,
+    force_name,
+    forces_of_rows,
+    hands_over_all,
+)
+from kcons.openmm.collective.coordinates import free_groups
+from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import require_context, virtual_sites
+from kcons.openmm.quantities import accepted, masses_of, nanometers
+from kcons.openmm.topology import bonds_of
+
+#: Rounding of positions, relative to the shortest row, that a run begins to show.
+COARSE = 1e-11
+
+
+class CarriedConstraints(Part):
+    """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
+
+    Most often made by `hold`, which also moves constraints of the System that share atoms with the rows.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Masses and periodicity are taken from it; it is not changed before `add_to`. Particles without mass stay
+        where they are.
+    constraints : Constraint or iterable of Constraint
+        What is held: Quantities, or numbers of nm, ps, dalton, radian. Functions get numbers and may return either.
+    positions : Quantity or array_like, shape (n_particles, 3)
+        On or near the constraints, in nm if without unit.
+    periodic : bool, optional
+        Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
+        half the box among molecules that are never cut.
+    degenerate : {'convert', 'raise'}
+        As for `Motion`.
+    time : float
+        Time of `positions` in ps, for targets that move.
+
+    Raises
+    ------
+    KconsError
+        What `ConstraintSet` and `Motion` raise; virtual sites; no free force groups.
+
+    Notes
+    -----
+    Pickling a System, or writing it to XML, takes the rows along if all of their functions can be pickled;
+    `CarriedConstraints.of` then finds them.
+    """
+
+    evaluates = lands_last = True
+    written = (*Part.written, "_early", "_begins_early")
+    _told = False
+    #: Sizes of the gradients, where velocities were looked at first.
+    _slopes: FloatArray | None = None
+
+    def __init__(
+        self,
+        system: openmm.System,
+        constraints: Constraint | Iterable[Constraint],
+        positions: unit.Quantity | ArrayLike,
+        *,
+        periodic: bool | None = None,
+        degenerate: Literal["convert", "raise"] = "convert",
+        time: unit.Quantity | float = 0.0,
+    ) -> None:
+        given = tuple(accepted((constraints,) if isinstance(constraints, Constraint) else constraints))
+        if sum(c.n_rows for c in given if isinstance(c, Constraint)) == 0 and all(
+            isinstance(c, Constraint) for c in given
+        ):
+            raise InputError("there are no rows to hold", item="constraints")
+        masses = masses_of(system)
+        x = nanometers(positions, len(masses))
+        wraps = system.usesPeriodicBoundaryConditions() if periodic is None else periodic
+        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
+        engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, degenerate, time)
+        refuse_virtual_sites(system, engine.atoms, masses)
+        self._bind(engine, free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1])
+
+    def _bind(self, engine: Engine, groups: list[int]) -> None:
+        self.code = 0
+        self._engine = engine
+        self._groups = dict(zip(PHASES, groups, strict=True))
+        self.groups = frozenset(groups)
+
+    @classmethod
+    def of(cls, system: openmm.System) -> CarriedConstraints:
+        """The rows that a System brings along which was read from XML or copied.
+
+        Raises
+        ------
+        InputError
+            It has none.
+        """
+        found = {key: forces for key, forces in forces_of_rows(system).items() if key in LIVE}
+        if len(found) != 1:
+            raise InputError(
+                f"the System carries {len(found) or 'no'} sets of rows of kcons; expected one", item="system"
+            )
+        ((key, forces),) = found.items()
+        if hands_over_all():
+            for force in forces.values():
+                force.setParticles([])
+        part = object.__new__(cls)
+        part._bind(LIVE[key], [forces[phase].getForceGroup() for phase in PHASES])
+        part._look_at(system)
+        return part
+
+    def add_to(self, system: openmm.System) -> None:
+        """Put the forces that carry the rows into the System; before the Context is made."""
+        engine = self._engine
+        for phase in PHASES:
+            force = openmm.PythonForce(Callback(engine, phase))
+            if not (engine.whole or hands_over_all()):
+                force.setParticles(engine.atoms.tolist())
+            force.setUsesPeriodicBoundaryConditions(engine.cell is not None)
+            force.setForceGroup(self._groups[phase])
+            force.setName(force_name(phase, engine.key))
+            system.addForce(force)
+        self._look_at(system)
+
+    def _look_at(self, system: openmm.System) -> None:
+        self.alone = system.getNumConstraints() == 0
+        self.sited = bool(virtual_sites(system))
+
+    # -- what is held ---------------------------------------------------------------------------
+
+    @property
+    def motion(self) -> Motion:
+        """The engine; its `constraint_set` has all rows, with the numbers of the System's particles."""
+        return self._engine.motion
+
+    @property
+    def driven(self) -> bool:
+        """Whether rows demand velocities that are not zero."""
+        return self.motion.plan.driven
+
+    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
+        """The engine, and the positions it takes."""
+        return self.motion, self._state(context)[0]
+
+    @property
+    def atoms(self) -> IntArray:
+        """Particles that a row touches."""
+        return self._engine.atoms
+
+    def rank(self, context: openmm.Context | None = None) -> int:
+        """Degrees of freedom that the rows take; particles without mass never had any."""
+        fixed = int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
+        return self.motion.rank - 3 * fixed
+
+    # -- in a context ---------------------------------------------------------------------------
+
+    def check(self, context: openmm.Context, velocities: bool = True) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
+
+        Raises
+        ------
+        InputError
+            Positions or velocities off the rows; forces that were not added; masses that have changed.
+        UnsupportedError
+            Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
+        """
+        require_context(context)
+        system = context.getSystem()
+        self._check_system(system, Precision.of(context))
+        refuse_agents(system, self.motion.constraint_set, context.getMolecules)
+        x, v, time = self._state(context)
+        self._tell_of_rounding(x)
+        miss = self._worst(x, v if velocities else None, time)
+        if miss is not None:
+            raise InputError(
+                f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them",
+                item=miss.what,
+                atoms=miss.atoms,
+            )
+
+    def _check_system(self, system: openmm.System, precision: Precision) -> None:
+        """Raise where the System is not the one that the rows were built for."""
+        engine = self._engine
+        forces = forces_of_rows(system).get(engine.key, {})
+        if set(forces) != set(PHASES):
+            raise InputError(
+                "the System has no forces that carry these rows; call add_to(system), or hold(system, ...), before "
+                "the Context is made; those of a copy of a System are CarriedConstraints.of(copy)",
+                item="system",
+            )
+        refuse_single_precision(precision, forces[PHASES[0]])
+        now = masses_of(system)
+        if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
+            raise InputError("masses have changed since the rows were built; build them again", item="masses")
+        refuse_virtual_sites(system, engine.atoms, now)
+        if self.alone and system.getNumConstraints():
+            raise InputError(
+                "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
+                item="system",
+            )
+        touched = set(engine.atoms.tolist())
+        for k in range(system.getNumConstraints()):
+            i, j, _ = system.getConstraintParameters(k)
+            if touched & {i, j}:
+                raise UnsupportedError(
+                    f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
+                    "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+                )
+
+    def take_place(self, program: Program, context: openmm.Context) -> None:
+        """A State or checkpoint that was loaded is where its own steps ended, the engine is not."""
+        self._engine.stand_at(self._state(context)[0])
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
+        x, v, time = self._state(context)
+        return self._worst(x, v if velocities else None, time)
+
+    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
+        held = self.motion.sources[0]
+        found = held.residuals(x, v, time)
+        near, slow = self._engine.passage.limits
+        allowed = np.maximum(near * held.scale, found.allowed)
+        reach = np.abs(x[held.touched]).max(initial=0.0)
+        if self._slopes is None:
+            gradients = held.jacobian(x, time)
+            self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+        if self._engine.rounded(x):
+            allowed += 2.0**-22 * reach * self._slopes
+        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        if miss is not None or found.rates is None or found.speeds is None:
+            return miss
+        size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
+        # What is taken from v where it is carried together with x: all there is of a body at rest.
+        lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
+        return Miss.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
+
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Warn once of coordinates so large that their rounding adds noise to the velocities."""
+        held = self.motion.constraint_set
+        if self._told or not held.n_rows:
+            return
+        reach = float(np.abs(x[held.touched]).max())
+        grain = self._engine.passage.grain(reach)
+        self._told = grain > COARSE * held.scale.min()
+        if self._told:
+            warnings.warn(
+                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; "
+                "each step turns this into velocity, and the energy wanders. Move the origin nearer",
+                stacklevel=3,
+            )
+
+    def apply_positions(self, context: openmm.Context) -> None:
+        """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
+
+        Bonds are those of the System's forces and constraints; see `Motion.restore_positions`.
+
+        Raises
+        ------
+        InfeasibleError, InputError
+            As `Motion.restore_positions`; nothing was changed.
+        """
+        x, _, time = self._state(context)
+        bonds = bonds_of(context.getSystem(), x)
+        brought = self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None)
+        miss = self._worst(brought, None, time)
+        if miss is not None:
+            raise InfeasibleError(
+                f"the rows cannot be reached from here: {miss}; nothing was changed. Start nearer to the targets",
+                residual=abs(miss.off),
+                row=miss.row,
+                atoms=miss.atoms,
+            )
+        context.setPositions(brought)
+        context.computeVirtualSites()
+
+    def apply_velocities(self, context: openmm.Context) -> None:
+        """Make velocities tangent to the rows: the nearest ones in the mass metric.
+
+        Raises
+        ------
+        ConvergenceError, InputError
+            As `Motion.project_velocities`; nothing was changed.
+        """
+        x, v, time = self._state(context)
+        context.setVelocities(self.motion.project_velocities(x, v, time=time))
+
+    def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+        require_context(context)
+        state = context.getState(positions=True, velocities=True)
+        if self._engine.cell is not None:
+            self._engine.follow_cell(state)
+        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
+        return x, v, state.getTime().value_in_unit(unit.picosecond)
+
+    # -- results --------------------------------------------------------------------------------
+
+    def multipliers(self, context: openmm.Context) -> FloatArray:
+        """Multipliers at the state of the context, shape (n_rows,): z = A^T lambda is the force that holds the rows.
+
+        In kJ/mol over the unit of the row (kJ/mol/nm for lengths, kJ/mol for angles). Exact for the state as it is,
+        at the price of a force evaluation where forces are not known.
+        """
+        x, v, time = self._state(context)
+        groups = {g for g in range(32) if g not in self.groups}
+        kept = context.getIntegrator().getIntegrationForceGroups()
+        state = context.getState(forces=True, groups=kept & sum(1 << g for g in groups))
+        f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        return self.motion.multipliers(x, v, f, time)
+
+    @property
+    def step_multipliers(self) -> FloatArray:
+        """Multipliers at the positions where the last step began, from the step itself, shape (n_rows,).
+
+        2 Lambda/dt^2 of the position stage and -2 mu/dt of the velocity stage before are each of first order in dt;
+        this is their mean, of second order. Costs nothing. For schemes with one drift a step, from the second step
+        on.
+
+        Raises
+        ------
+        InputError
+            No two steps of such a scheme have been made.
+        """
+        return self._engine.step_multipliers()
+
+    def report(self, context: openmm.Context, *, condition: bool = True) -> Report:
+        """Rank, condition, residuals and solvers at the state of the context."""
+        x, v, time = self._state(context)
+        return self.motion.report(x, v, time, condition=condition)
+
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        """The error that stopped the engine, with the number of the step."""
+        return self._engine.explained_error(step)
+
+    # -- the program ----------------------------------------------------------------------------
+
+    def declare(self, program: Program) -> None:
+        self._engine.follow(program.integrator, self.lean)
+        #: Where a step may end without a projection, the solve for positions must tell of failures itself.
+        self._early = self.lean or getattr(program.integrator, "scheme", None) is None
+        self._begins_early = getattr(getattr(program.integrator, "ensemble", None), "stays_tangent", False)
+
+    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
+        """Times, stages and lengths of drifts are those of the integrator that makes steps."""
+        super().serve(integrator, notes)
+        self._engine.follow(integrator, self.lean)
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Refuse single precision; what passes through OpenMM is known now."""
+        refuse_single_precision(precision)
+        self._engine.take_precision(precision)
+        if f"rest{self.code}" in program.settings:
+            program.set(f"rest{self.code}", float(self._engine.carries_rest))
+
+    def begin(self, program: Program) -> None:
+        """Where x is not where the last step ended, and velocities are projected before the first drift."""
+        if self._begins_early:
+            self.remember(program)
+
+    def _guard(self, program: Program, phase: str, words: str) -> None:
+        group = self._groups[phase]
+        program.let("failed", f"select(energy{group}, {self.code}, failed)", words)
+
+    def begin_run(self) -> None:
+        self._engine.begin_run()
+
+    def remember(self, program: Program) -> None:
+        words = "carried rows: positions whose gradients are taken"
+        if not self.lean or self._engine.timed:
+            self._guard(program, "remember", words)
+            return
+        with program.when("looked+moving != 0", "x need not be where the last drift ended"):
+            self._guard(program, "remember", words)
+
+    def land(self, program: Program, h: str) -> None:
+        change = f"f{self._groups['land']}"
+        if self._early:
+            self._guard(program, "land", "carried rows: solve for positions")
+            force, change = change, program.vector(f"change{self.code}", "what brings carried particles onto the rows")
+            program.each(change, force, "from the evaluation that tells of failures")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: onto them")
+
+    def land_alone(self, program: Program, u: str, h: str) -> None:
+        """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""
+        group = self._groups["land"]
+        program.each("x", f"x+{h}*{u}", "move freely (drift)")
+        self._guard(program, "land", "carried rows: solve for positions")
+        # Force and energy come from one evaluation, for this moves no x.
+        program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
+
+    def project(self, program: Program) -> None:
+        change = f"f{self._groups['project']}"
+        # Thermostats stir more than rounding does.
+        rest = self._engine.carries_rest
+        program.each("xu", "x", "to come back to")
+        program.each("x", f"x+{1 / SPEED_SCALE!r}*v", "carries v, exactly as far as it can be told from x")
+        self._guard(program, "project", "carried rows: solve for velocities")
+        carried = f"(x-xu)*{SPEED_SCALE!r}"
+        if rest:
+            program.setting(f"rest{self.code}", "1 where the rest of v matters: forces are double", 1.0)
+            program.vector("v_low", "what of v was too small to be carried together with x")
+            program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
+        program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
+        if rest:
+            with program.when(f"rest{self.code} != 0", "all digits"):
+                program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
+                self._guard(program, "project", "carried rows: the same for the rest")
+                back = 1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)
+                program.each("v", f"v+v_low+{back!r}*{change}", "tangent, all of it")
+        program.each("x", "xu", "back")
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """The same: the forces of the System call this engine, whichever integrator makes steps."""
+        return self
+
+    def __reduce__(self) -> tuple[object, ...]:
+        raise UnsupportedError(
+            "rows of hold belong to their System and cannot be pickled with an integrator; pickle the System, and make "
+            "another integrator with parts=[CarriedConstraints.of(system)]"
+        )
+
+    def __repr__(self) -> str:
+        return f"<CarriedConstraints: {self.motion.constraint_set.n_rows} rows on {len(self.atoms)} particles>"
+
+
+# -- what a System must be like -------------------------------------------------------------------
+
+
+def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
+    """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
+    if not all(isinstance(item, Constraint) for item in given):
+        return given  # ConstraintSet says what is wrong
+    used = [item.atoms.ravel() for item in given]
+    touched = np.unique(np.concatenate(used))
+    still = touched[touched < len(masses)]
+    still = still[masses[still] == 0]
+    fixed = [item.atoms.ravel() for item in given if item.family == "FixedAtoms"]
+    still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
+    return (*given, FixedAtoms(still)) if len(still) else given
+
+
+def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatArray) -> None:
+    """Refuse virtual sites among `atoms`, and what is no particle of the System."""
+    if atoms.max(initial=0) >= len(masses):
+        raise InputError(f"there is no atom {atoms.max()}; the System has {len(masses)} particles", item="atoms")
+    for atom in atoms[masses[atoms] == 0].tolist():
+        if system.isVirtualSite(atom):
+            raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
+
+
+def refuse_single_precision(precision: Precision, force: openmm.PythonForce | None = None) -> None:
+    """Refuse positions in single precision: those of GPUs that have no others, and those of some particles in mixed."""
+    if precision.name == "single":
+        raise UnsupportedError(
+            f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
+            "Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform computes"
+        )
+    if precision.name == "mixed" and force is not None and force.getParticles():
+        raise UnsupportedError(
+            f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
+            "that are too coarse; read the System by CarriedConstraints.of(system) before the Context is made"
+        )
+
+
+def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
+    """Refuse barostats and other forces that move particles off the rows between steps."""
+    bound = next((item for item in held.constraints if not item.translation_invariant), None)
+    for force in system.getForces():
+        name = type(force).__name__
+        if isinstance(force, openmm.CMMotionRemover) and bound is not None:
+            raise UnsupportedError(
+                f"{name} shifts all velocities, but {bound!r} ties atoms to a place, and momentum is not conserved; "
+                "remove that force (createSystem(..., removeCMMotion=False))"
+            )
+        if "Barostat" not in name:
+            continue
+        if bound is not None:
+            raise UnsupportedError(
+                f"{name} moves molecules, but {bound!r} ties atoms to a place; run at constant volume, or hold "
+                "differences of positions only"
+            )
+        rigid = getattr(force, "getScaleMoleculesAsRigid", None)
+        if rigid is not None and not rigid():
+            raise UnsupportedError(f"{name} scales atoms one by one; call setScaleMoleculesAsRigid(True)")
+        row = _row_between(held, molecules())
+        if row is not None:
+            raise UnsupportedError(
+                f"{name} moves molecules apart, but row {held.row_name(row)} holds atoms of two of them; let them "
+                "count as one molecule by hold(system, ..., join=True), or run at constant volume"
+            )
+
+
+def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
+    """A row with atoms of several molecules."""
+    label = np.zeros(held.n_atoms, dtype=np.int64)
+    for k, atoms in enumerate(molecules):
+        label[list(atoms)] = k
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        of = label[item.atoms]
+        apart = (of != of[:, :1]).any(axis=1)
+        if apart.any():
+            return int(start + np.argmax(apart))
+    return None

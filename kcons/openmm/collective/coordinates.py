@@ -1,0 +1,436 @@
+"""Forces as coordinates: what their energies are, which atoms they touch, and a force group for each."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula
+from kcons.constraints.constraint import Constraint
+from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.integrator.system_checks import ROW_NAME, groups_of
+from kcons.openmm.quantities import nanometers
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A Force as one row: its energy, as a plain number, is the coordinate q held at its target.
+
+    Lengths are in nm and angles in radian, whatever the expression of the Force makes of them.
+
+    Parameters
+    ----------
+    force : openmm.Force or int
+        A Force that is in no System yet, or one of the System, or the number of a force group of the System whose
+        Forces together are the coordinate.
+    target : float, Quantity, str or None
+        What q is held at, a Quantity in a unit of its kind; None takes the value at the initial positions. A name
+        stands for a context parameter.
+    rate : float, Quantity or str
+        Change of the target in a ps. With a number or None as target, the target is that + rate t, t the time
+        since the integrator was made, which States and checkpoints with the integrator's parameters carry to another
+        one with the same program, and to no other. With a name as target whoever sets that changes it; the rate (a
+        number or another name) then says how fast, so that velocities follow.
+    period : float or Quantity, optional
+        Period of q; differences are taken to the nearest image. Found where the coordinate is a plain dihedral.
+    scale : float or Quantity, optional
+        The tolerance is relative to this size; the larger of 1 and the target unless given.
+    name : str, optional
+        For messages.
+    """
+
+    force: openmm.Force | int
+    target: float | unit.Quantity | str | None = None
+    rate: float | unit.Quantity | str = 0.0
+    period: float | unit.Quantity | None = None
+    scale: float | unit.Quantity | None = None
+    name: str = ""
+
+
+def number(value: Any, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
+    """A finite number in nm, ps, radian, kJ/mol from a number or a Quantity.
+
+    Parameters
+    ----------
+    value : float or Quantity
+    item : str
+        For messages.
+    of : Unit, optional
+        What a Quantity must be a multiple of; if that is not known, of what is made of lengths, angles, masses, charges
+        and energies.
+    per : Unit
+        What that is divided by.
+
+    Raises
+    ------
+    InputError
+        It is neither, not finite, or of another unit.
+    """
+    if unit.is_quantity(value):
+        fits = _may_be_a_coordinate(value.unit * per) if of is None else value.unit.is_compatible(of / per)
+        if not fits:
+            wanted = f"in {of / per}" if of is not None else "in nm, radian, kJ/mol or what the coordinate is in"
+            raise InputError(f"{item} is {value}, and the coordinate is of another kind; give it {wanted}", item=item)
+        value = value.value_in_unit_system(unit.md_unit_system)
+    try:
+        result = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{item} is {value!r}; give a number or a Quantity", item=item) from None
+    if not math.isfinite(result):
+        raise InputError(f"{item} is {result}; give a finite number", item=item)
+    return result
+
+
+def _may_be_a_coordinate(of: unit.Unit) -> bool:
+    """Whether Forces can have such energies: time is there only as a part of energies."""
+    powers = {dimension.name: power for dimension, power in of.iter_base_dimensions() if power}
+    mass, time = powers.pop("mass", 0), powers.pop("time", 0)
+    return powers.keys() <= {"length", "angle", "amount", "charge"} and time in (0, -2 * mass)
+
+
+# -- formulas of kcons ------------------------------------------------------------------------------
+
+_POWERS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "^"}
+
+
+def as_rows(given: Row | openmm.Force | int | Formula | Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
+    """Whatever stands for rows, or for one, as rows; a formula is one for each of its rows.
+
+    Raises
+    ------
+    UnsupportedError
+        A formula, or its target, that moves with the time; one of velocities.
+    """
+    rows: list[Row] = []
+    for each in [given] if isinstance(given, Row | openmm.Force | int | Formula) else given:
+        if isinstance(each, Formula):
+            rows += formula_rows(each)
+        else:
+            rows.append(each if isinstance(each, Row) else Row(each))
+    return rows
+
+
+def formula_rows(item: Formula) -> list[Row]:
+    """A `Row` for each row of a formula; positions are taken as OpenMM has them, no images are looked for."""
+    if not item.holonomic:
+        raise UnsupportedError(f"{item!r} holds velocities, not positions; hold it by kcons.openmm.hold")
+    if item.moving or isinstance(item.target, MovingTarget):
+        raise UnsupportedError(
+            f"{item!r} moves with the time, which OpenMM's expressions do not know; hold it by kcons.openmm.hold"
+        )
+    rows = []
+    for k in range(item.n_rows):
+        numbers = dict(zip(item.names, item.values[k].tolist(), strict=True))
+        force = openmm.CustomCompoundBondForce(item.width, expression(item.code().tree, numbers))
+        force.addBond(item.atoms[k].tolist(), [])
+        target = None if item.target is None else float(item.target[k])
+        rows.append(Row(force, target, period=item.period, name=item.row_name(k)))
+    return rows
+
+
+def expression(tree: ast.expr, numbers: dict[str, float]) -> str:
+    """A tree as OpenMM reads it, with every operation in brackets and numbers for parameters."""
+    match tree:
+        case ast.Constant(value=value):
+            return repr(float(value))  # type: ignore[arg-type]
+        case ast.Name(id="pi"):
+            return "3.141592653589793"
+        case ast.Name(id=name):
+            return f"({numbers[name]!r})" if name in numbers else name
+        case ast.UnaryOp(op=operation, operand=operand):
+            inner = expression(operand, numbers)
+            return f"(-{inner})" if isinstance(operation, ast.USub) else inner
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return f"{name}({', '.join(expression(each, numbers) for each in args)})"
+        case ast.BinOp(left=left, op=operation, right=right):
+            return f"({expression(left, numbers)}{_POWERS[type(operation)]}{expression(right, numbers)})"
+    raise AssertionError(ast.dump(tree))
+
+
+# -- terms ------------------------------------------------------------------------------------------
+
+#: For Forces made of terms: what a term is called, and how many of its parameters are particles.
+_TERMS = {
+    "CustomBondForce": ("Bond", 2),
+    "CustomAngleForce": ("Angle", 3),
+    "CustomTorsionForce": ("Torsion", 4),
+    "CustomCompoundBondForce": ("Bond", 0),
+    "CustomCentroidBondForce": ("Bond", 0),
+    "CustomExternalForce": ("Particle", 1),
+    "HarmonicBondForce": ("Bond", 2),
+    "HarmonicAngleForce": ("Angle", 3),
+    "PeriodicTorsionForce": ("Torsion", 4),
+    "RBTorsionForce": ("Torsion", 4),
+}
+
+
+def _terms(force: openmm.Force) -> list[Any]:
+    """The parameters of each term of a Force that is made of terms."""
+    term, _ = _TERMS[type(force).__name__]
+    return [getattr(force, f"get{term}Parameters")(k) for k in range(getattr(force, f"getNum{term}s")())]
+
+
+def _variables(force: openmm.CustomCVForce) -> list[openmm.Force]:
+    return [force.getCollectiveVariable(k) for k in range(force.getNumCollectiveVariables())]
+
+
+def each_term(force: openmm.Force) -> list[openmm.Force]:
+    """One Force for each variable of a CustomCVForce, or for each term of a Force made of terms.
+
+    So a CustomBondForce with three bonds becomes three rows.
+
+    Parameters
+    ----------
+    force : openmm.Force
+        CustomCVForce (its energy expression plays no part), CustomBond-, CustomAngle-, CustomTorsion-,
+        CustomCompoundBond-, CustomCentroidBond-, CustomExternalForce, HarmonicBond-, HarmonicAngle-,
+        PeriodicTorsion- or RBTorsionForce. It is left as it is.
+
+    Raises
+    ------
+    UnsupportedError
+        The Force is none of these.
+    """
+    if isinstance(force, openmm.CustomCVForce):
+        return [deepcopy(variable) for variable in _variables(force)]
+    kind = type(force).__name__
+    if kind not in _TERMS:
+        raise UnsupportedError(f"a {kind} has no terms to hold one by one; make a Force for each row")
+    # OpenMM has no method to take terms away, but its XML has a list of them.
+    term, xml = _TERMS[kind][0], openmm.XmlSerializer.serialize(force)
+    emptied = re.sub(rf"<{term}s>.*?</{term}s>", f"<{term}s/>", xml, count=1, flags=re.DOTALL)
+    found = []
+    for parameters in _terms(force):
+        one = openmm.XmlSerializer.deserialize(emptied)
+        assert not _terms(one)
+        getattr(one, f"add{term}")(*parameters)
+        found.append(one)
+    return found
+
+
+def _atoms_of(force: openmm.Force) -> set[int] | None:
+    """The particles a Force depends on; None where that cannot be told, or where it is all of them."""
+    if isinstance(force, openmm.CustomCVForce):
+        return _united(map(_atoms_of, _variables(force)))
+    if isinstance(force, openmm.CustomCentroidBondForce):
+        return {atom for groups, *_ in _terms(force) for g in groups for atom in force.getGroupParameters(g)[0]}
+    if isinstance(force, openmm.CustomCompoundBondForce):
+        return {int(atom) for atoms, *_ in _terms(force) for atom in atoms}
+    if isinstance(force, openmm.RMSDForce | openmm.RGForce):
+        return set(force.getParticles()) or None
+    kind = type(force).__name__
+    return {int(a) for term in _terms(force) for a in term[: _TERMS[kind][1]]} if kind in _TERMS else None
+
+
+def _united(sets: Iterable[set[int] | None]) -> set[int] | None:
+    found = list(sets)
+    return None if None in found else set().union(*found)  # type: ignore[arg-type]
+
+
+def moved_atoms(system: openmm.System, forces: Sequence[openmm.Force]) -> set[int]:
+    """The particles whose positions determine the sum of the Forces; all where that cannot be told.
+
+    Raises
+    ------
+    InputError
+        One is not in the System.
+    """
+    atoms, every = _united(map(_atoms_of, forces)), set(range(system.getNumParticles()))
+    if atoms is not None and atoms - every:
+        raise InputError(
+            f"{forces[0].getName()} names particle {min(atoms - every)}; the System has {len(every)} particles",
+            item="force",
+            atoms=sorted(atoms - every),
+        )
+    return every if atoms is None else atoms
+
+
+# -- coordinates that are plain ---------------------------------------------------------------------
+
+_LENGTH = re.compile(r"^(r|x|y|z|distance\([pg]\d+,[pg]\d+\)|pointdistance\(.*\))$")
+_ANGLE = re.compile(r"^(theta|(angle|dihedral)\([pg]\d+(,[pg]\d+)*\)|pointangle\(.*\)|pointdihedral\(.*\))$")
+_DIHEDRAL = re.compile(r"^dihedral\([pg]\d+,[pg]\d+,[pg]\d+,[pg]\d+\)$")
+_CONSTRAINTS: dict[tuple[str, str], type[Constraint]] = {
+    ("CustomBondForce", "r"): Distance,
+    ("CustomAngleForce", "theta"): Angle,
+    ("CustomTorsionForce", "theta"): Dihedral,
+    ("CustomCompoundBondForce", "distance(p1,p2)"): Distance,
+    ("CustomCompoundBondForce", "angle(p1,p2,p3)"): Angle,
+    ("CustomCompoundBondForce", "dihedral(p1,p2,p3,p4)"): Dihedral,
+    ("CustomCentroidBondForce", "distance(g1,g2)"): CenterDistance,
+}
+
+
+def _plain(force: openmm.Force) -> tuple[openmm.Force, str]:
+    """A Force and its expression; of a CustomCVForce that is one of its variables, that variable's."""
+    expression = force.getEnergyFunction().replace(" ", "") if hasattr(force, "getEnergyFunction") else ""
+    if isinstance(force, openmm.CustomCVForce):
+        names = [force.getCollectiveVariableName(k) for k in range(force.getNumCollectiveVariables())]
+        return _plain(_variables(force)[names.index(expression)]) if expression in names else (force, "")
+    return force, expression
+
+
+def period_of(force: openmm.Force) -> float:
+    """2 pi where the coordinate is a dihedral and nothing else, 0 for no period."""
+    force, expression = _plain(force)
+    kind = type(force).__name__
+    torsion = kind == "CustomTorsionForce" and expression == "theta"
+    points = kind in ("CustomCompoundBondForce", "CustomCentroidBondForce") and _DIHEDRAL.match(expression)
+    return 2 * math.pi if (torsion or points) and len(_terms(force)) == 1 else 0.0
+
+
+def unit_of(force: openmm.Force) -> unit.Unit | None:
+    """Unit of the coordinate that a Force is, None where that cannot be told."""
+    force, expression = _plain(force)
+    if isinstance(force, openmm.RMSDForce | openmm.RGForce) or _LENGTH.match(expression):
+        return unit.nanometer
+    if _ANGLE.match(expression):
+        return unit.radian
+    return None if type(force).__name__.startswith(("Custom", "Python")) else unit.kilojoule_per_mole
+
+
+def as_constraint(force: openmm.Force, target: float) -> Constraint | None:
+    """The constraint of kcons that a Force of one term is; None where it is none of the plain ones.
+
+    Parameters
+    ----------
+    force : openmm.Force
+    target : float
+        In nm or radian.
+    """
+    force, expression = _plain(force)
+    kind = _CONSTRAINTS.get((type(force).__name__, expression))
+    terms = _terms(force) if kind is not None else []
+    if kind is None or len(terms) != 1:
+        return None
+    if isinstance(force, openmm.CustomCentroidBondForce):
+        groups = [force.getGroupParameters(g) for g in terms[0][0]]
+        if any(weights for _, weights in groups):  # by mass without them, as in kcons
+            return None
+        return kind(*(list(atoms) for atoms, _ in groups), target)
+    compound = isinstance(force, openmm.CustomCompoundBondForce)
+    return kind(list(terms[0][0] if compound else terms[0][: _TERMS[type(force).__name__][1]]), target)
+
+
+# -- force groups -----------------------------------------------------------------------------------
+
+
+def free_groups(system: openmm.System, count: int, what: str, remedy: str = "use fewer groups for forces") -> list[int]:
+    """The force groups that no force of the System uses, from 1 on.
+
+    Raises
+    ------
+    UnsupportedError
+        There are not so many; `what` needs them.
+    """
+    taken: set[int] = set().union(*(groups_of(force) for force in system.getForces()))
+    free = sorted(set(range(1, 32)) - taken)
+    if len(free) < count:
+        raise UnsupportedError(
+            f"{what} need {count} force groups, and {len(free)} are free ({sorted(taken)} are in use); {remedy}"
+        )
+    return free
+
+
+def forces_in(system: openmm.System, group: int) -> list[openmm.Force]:
+    """The Forces of a System that are in a group."""
+    return [force for force in system.getForces() if force.getForceGroup() == group]
+
+
+def chosen_groups(system: openmm.System, forces: Sequence[openmm.Force | int]) -> list[int]:
+    """A force group for each row; nothing is changed.
+
+    Raises
+    ------
+    InputError
+        A Force of another System, a group without Forces or named twice.
+    UnsupportedError
+        More rows than free force groups.
+    """
+    present = {int(force.this): force for force in system.getForces()}
+    named = [force for force in forces if isinstance(force, int)]
+    identities = [int(force.this) for force in forces if isinstance(force, openmm.Force)]
+    settled: list[int | None] = []
+    for k, force in enumerate(forces):
+        wrong = ""
+        if isinstance(force, int):
+            if not forces_in(system, force) or named.count(force) > 1:
+                reason = "is named more than once" if forces_in(system, force) else "has no Forces"
+                wrong = f"force group {force} of the System {reason}"
+        elif identities.count(int(force.this)) > 1:
+            wrong = f"this {type(force).__name__} is named more than once"
+        elif int(force.this) in present and force.getForceGroup() in named:
+            wrong = f"its Force is part of group {force.getForceGroup()}, a row too"
+        elif int(force.this) not in present and not force.thisown:
+            wrong = f"this {type(force).__name__} belongs to another System; give a copy of it"
+        if wrong:
+            raise InputError(f"row {k}: {wrong}", item="force")
+        if isinstance(force, int):
+            settled.append(force)
+            continue
+        group = force.getForceGroup()
+        users = [other for other in present.values() if group in groups_of(other)]
+        alone = len(users) == 1 and int(users[0].this) == int(force.this)
+        settled.append(group if alone and group != 0 else None)
+    more = (
+        "Put Forces of the System that are evaluated together into one group, or hold more rows as constraint objects"
+    )
+    free = free_groups(system, settled.count(None), f"{settled.count(None)} rows", more)
+    return [free.pop(0) if group is None else group for group in settled]
+
+
+def put_in_groups(system: openmm.System, forces: Sequence[openmm.Force | int], groups: Sequence[int]) -> None:
+    """Give Forces their groups, and add those that are in no System, by the name of rows."""
+    present = {int(force.this) for force in system.getForces()}
+    for force, group in zip(forces, groups, strict=True):
+        if isinstance(force, openmm.Force):
+            force.setForceGroup(group)
+            if int(force.this) not in present:
+                if force.getName() == type(force).__name__:
+                    force.setName(f"{ROW_NAME}: {force.getName()}")
+                system.addForce(force)
+
+
+def found_values(
+    system: openmm.System, rows: Sequence[Sequence[openmm.Force]], positions: object, box: Sequence | None = None
+) -> FloatArray:
+    """The energy of each row's Forces at the given positions, shape (len(rows),); evaluated apart from all else.
+
+    Raises
+    ------
+    InputError
+        Positions of the wrong shape, or at which a row is not a number.
+    """
+    x = nanometers(positions, system.getNumParticles())  # type: ignore[arg-type]
+    alone = openmm.System()
+    for k in range(system.getNumParticles()):
+        alone.addParticle(system.getParticleMass(k))
+    a, b, c = system.getDefaultPeriodicBoxVectors() if box is None else box
+    alone.setDefaultPeriodicBoxVectors(a, b, c)
+    for group, forces in enumerate(rows):
+        for force in forces:
+            copy = deepcopy(force)
+            copy.setForceGroup(group)
+            alone.addForce(copy)
+    context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    context.setPositions(x)
+    values = np.array([energy(context, group) for group in range(len(rows))])
+    for k, value in enumerate(values):
+        if not math.isfinite(value):
+            raise InputError(f"row {k} is {value} at these positions", item="positions")
+    return values
+
+
+def energy(context: openmm.Context, group: int) -> float:
+    """Energy of one force group in kJ/mol."""
+    return float(context.getState(getEnergy=True, groups=1 << group).getPotentialEnergy()._value)

@@ -1,0 +1,364 @@
+"""Between OpenMM and the engine: what passes, errors, copies of a System, what a System must be like."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import sys
+
+import numpy as np
+import openmm
+import pytest
+from carried_systems import begun, context_of, driven, free, off_target, peptide, started, state_of
+from openmm import unit
+from openmm_systems import GPUS
+from openmm_systems import context_of as context_on
+
+from kcons.constraints import Custom, Distance
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.openmm import CarriedConstraints, ProjectedIntegrator, hold
+from kcons.openmm.callback_rows.callbacks import CARRY_SCALE, Passage
+from kcons.openmm.callback_rows.carried_constraints import refuse_single_precision
+from kcons.openmm.integrator.precision import Precision
+
+# -- what passes ------------------------------------------------------------------------------------
+
+ATOMS = np.array([1, 3, 4])
+X = np.array([[3.0, -4.0, 5.0], [1 / 3, 2.7, -0.1], [8.0, 0.3, 1.0], [2e-3, 1.234567890123, 4.4], [-6.6, 0.7, 1e-9]])
+CHANGE = 1e-3 * np.random.default_rng(0).normal(size=(3, 3))
+
+
+class Messenger:
+    """Takes positions down, and gives the change back."""
+
+    def __init__(self, passage):
+        self.passage, self.taken = passage, np.zeros((3, 3))
+
+    def __call__(self, state):
+        self.passage.open(state)
+        self.passage.take(state, self.taken)
+        return 0.0, self.passage.give(self.passage.carried(CHANGE)[0])
+
+
+def sent(platform, some):
+    """Where particles are after the change, and what the messenger has seen."""
+    system = openmm.System()
+    for _ in X:
+        system.addParticle(1.0)
+    passage = Passage(ATOMS, len(X))
+    messenger = Messenger(passage)
+    force = openmm.PythonForce(messenger)
+    if some:
+        force.setParticles(ATOMS.tolist())
+    system.addForce(force)
+    integrator = openmm.CustomIntegrator(1.0)
+    integrator.addComputePerDof("x", f"x+f*{1 / CARRY_SCALE!r}")
+    context = context_on(system, integrator, platform)
+    passage.precision = Precision.of(context)
+    context.setPositions(X)
+    integrator.step(1)
+    return state_of(context)[0], messenger
+
+
+@pytest.mark.parametrize("platform", ["Reference", "CPU", *(p for p in GPUS if "single" not in str(p.id))])
+def test_what_arrives_is_known(platform):
+    there, messenger = sent(platform, some=False)
+    passage = messenger.passage
+    rounding = 2 * passage.precision.place * np.abs(X).max()
+    assert np.abs(messenger.taken - X[ATOMS]).max() <= rounding
+    expected = messenger.taken + passage.carried(CHANGE)[1]
+    assert np.abs(there[ATOMS] - expected).max() <= rounding
+    assert passage.same(there[ATOMS], expected)
+    assert not passage.same(there[ATOMS] + 1e-10, expected)
+    assert np.abs(there - X)[[0, 2]].max() <= rounding
+    # A correction keeps the digits of a single number, at least.
+    lost = np.abs(passage.carried(CHANGE)[1] - CHANGE) / np.abs(CHANGE)
+    assert lost.max() < (2.0**-24 if passage.precision.name == "mixed" else 1e-10)
+
+
+@pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
+def test_of_some_particles_mixed_precision_hands_over_single_numbers(platform):
+    """Why the positions of all are asked for."""
+    _, messenger = sent(platform, some=True)
+    np.testing.assert_array_equal(messenger.taken, X[ATOMS].astype(np.float32))
+
+
+def test_the_grain_of_coordinates():
+    passage = Passage(ATOMS, len(X))
+    assert passage.grain(5.0) == np.spacing(5.0)
+    passage.precision = Precision("CUDA", "mixed")
+    assert passage.grain(5.0) == pytest.approx(5 * 2.0**-47)
+    assert passage.limits[0] > 1e-9
+
+
+def test_positions_come_back_to_the_last_bit():
+    """Carrying v through x must not move x: without forces and rows in the way, x = x0 + v t exactly as without."""
+    system = free([12.0] * 4)
+    part = hold(system, Distance([[0, 1]]), np.eye(4, 3))
+    plain = context_of(free([12.0] * 4), ProjectedIntegrator(0.001))
+    carried = context_of(system, ProjectedIntegrator(0.001, parts=[part]))
+    x = np.eye(4, 3) + 1e-3
+    v = np.array([[0.1, 0.1, 0.3], [0.1, 0.1, 0.3], [0.7, -0.3, 0.123456789], [1 / 3, 1e-9, 1e5]])
+    for context in (plain, carried):
+        context.setPositions(x)
+        context.setVelocities(v)
+        context.getIntegrator().step(20)
+    (x_plain, v_plain), (x_carried, v_carried) = state_of(plain), state_of(carried)
+    assert np.array_equal(x_plain[2:], x_carried[2:])
+    assert np.array_equal(v_plain[2:], v_carried[2:])
+
+
+# -- errors -----------------------------------------------------------------------------------------
+
+
+def _clumsy(r):
+    if r[0, 0] > 0.05:
+        raise ZeroDivisionError("user code")
+    return r[0, 2]
+
+
+def _up(r):
+    return np.array([[0.0, 0.0, 1.0]])
+
+
+def test_errors_of_user_functions_come_through():
+    part = hold(system := free([1.0]), Custom([0], _clumsy, _up), [[0, 0, 0]])
+    integrator = ProjectedIntegrator(0.01, parts=[part])
+    context = context_of(system, integrator)
+    context.setPositions([[0, 0, 0]])
+    context.setVelocities([[1.0, 0, 0]])
+    with pytest.raises(ZeroDivisionError, match="user code") as caught:
+        integrator.step(100)
+    assert "in step 6" in caught.value.__notes__[0]
+    assert state_of(context)[0][0, 0] == pytest.approx(0.05, abs=1e-12)
+
+
+def test_energies_and_forces_of_the_context_are_those_of_the_system():
+    _, integrator, context = peptide()
+    integrator.step(10)
+    every = context.getState(energy=True, forces=True)
+    own = context.getState(energy=True, forces=True, groups=integrator.getIntegrationForceGroups())
+    assert every.getPotentialEnergy() == own.getPotentialEnergy()
+    difference = every.getForces(asNumpy=True)._value - own.getForces(asNumpy=True)._value
+    assert np.abs(difference).max() <= 1e-6
+    integrator.step(10)
+
+
+def test_callbacks_keep_no_memory():
+    part, integrator, _ = peptide()
+    integrator.step(5)
+    nothing = part._engine.passage._nothing
+    before = sys.getrefcount(nothing)
+    integrator.step(50)
+    assert sys.getrefcount(nothing) == before
+
+
+@pytest.mark.parametrize("platform", ["Reference", "CPU"])
+def test_a_step_too_large_is_taken_back(platform):
+    part = hold(system := free([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
+    integrator = ProjectedIntegrator(0.1 * unit.picosecond, parts=[part])
+    context = context_on(system, integrator, platform)
+    context.setPositions([[-0.5, 0, 0], [0.5, 0, 0]])
+    context.setVelocities([[0, -0.5, 0], [0, 0.5, 0]])
+    integrator.step(3)
+    integrator.setStepSize(1.5 * unit.picosecond)  # no solution where angle would be asin(1.5)
+    before = state_of(context)
+    with pytest.raises(ConvergenceError, match="step 4: time step too large") as caught:
+        integrator.step(5)
+    assert caught.value.step == 4
+    assert caught.value.atoms == (0, 1)
+    assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
+    integrator.setStepSize(0.1 * unit.picosecond)
+    integrator.step(3)
+    part.check(context)
+
+
+def test_states_off_the_rows_are_refused_and_put_right():
+    part = hold(system := free([1.0, 1.0]), Distance([[0, 1]], 1.0), [[0, 0, 0], [1.0, 0, 0]])
+    context = context_of(system, ProjectedIntegrator(0.01, parts=[part]))
+    context.setPositions([[0, 0, 0], [1.1, 0, 0]])
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0.1.*apply_positions"):
+        part.check(context)
+    part.apply_positions(context)
+    assert np.abs(state_of(context)[0] - [[0.05, 0, 0], [1.05, 0, 0]]).max() <= 1e-14
+    context.setVelocities([[0, 0, 0], [1.0, 1.0, 0]])
+    with pytest.raises(InputError, match="apply_velocities"):
+        part.check(context)
+    part.apply_velocities(context)
+    assert np.abs(state_of(context)[1] - [[0.5, 0, 0], [0.5, 1.0, 0]]).max() <= 1e-14
+    part.check(context)
+
+
+# -- copies -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda s: openmm.XmlSerializer.deserialize(_xml(s))])
+def test_rows_travel_with_the_system(copied):
+    part, integrator, context = peptide()
+    x, v = state_of(context)
+    system = copied(context.getSystem())
+    other = CarriedConstraints.of(system)
+    assert other.motion is not part.motion
+    again = context_of(system, ProjectedIntegrator(0.001, parts=[other]))
+    again.setPositions(x)
+    again.setVelocities(v)
+    other.check(again)
+    integrator.step(20)
+    again.getIntegrator().step(20)
+    assert np.array_equal(state_of(again)[0], state_of(context)[0])
+
+
+def _xml(system):
+    return openmm.XmlSerializer.serialize(system)
+
+
+def test_rows_with_functions_that_cannot_be_pickled_stay():
+    part = hold(system := free([1.0]), Custom([0], lambda r: r[0, 2], _up), [[0, 0, 0]])
+    with pytest.raises(openmm.OpenMMException, match="could not be pickled"):
+        openmm.XmlSerializer.serialize(system)
+    assert part.rank() == 1
+
+
+def test_copies_of_a_system_have_engines_of_their_own():
+    """All that `of` found was the engine of the copy made last: targets moved with a time of another Context."""
+    system, part, x = driven()
+    first = copy.deepcopy(system)
+    others = [system, first, copy.deepcopy(first), openmm.XmlSerializer.clone(system)]
+    parts = [CarriedConstraints.of(other) for other in others]
+    assert parts[0].motion is part.motion
+    assert len({id(each.motion) for each in parts}) == 4
+    for other, each in zip(others, parts, strict=True):
+        integrator, context = begun(other, each, x)
+        integrator.step(7)
+        assert off_target(context) < 1e-12
+
+
+def test_copies_of_an_integrator_take_turns_with_the_rows_of_the_system():
+    system, part, x = driven()
+    integrator, context = begun(system, part, x)
+    integrator.step(5)
+    other = copy.deepcopy(integrator)
+    again = context_of(system, other)
+    again.setPositions(x)
+    other.applyVelocityConstraints(again)
+    other.setStepSize(0.004)
+    for _ in range(2):
+        for one, place in ((other, again), (integrator, context)):
+            one.step(5)
+            assert off_target(place) < 1e-12
+
+
+def test_rows_are_no_others_in_a_copy_of_the_system():
+    system, part, x = driven()
+    integrator = ProjectedIntegrator(0.01, parts=[part])
+    copied = context_of(copy.deepcopy(system), integrator)
+    copied.setPositions(x)
+    with pytest.raises(InputError, match=r"CarriedConstraints\.of\(copy\)"):
+        integrator.step(1)
+    with pytest.raises(UnsupportedError, match="pickle the System"):
+        pickle.dumps(integrator)
+
+
+# -- what a System must be like -----------------------------------------------------------------------
+
+
+def _shares(system):
+    system.addConstraint(1, 2, 1.0)
+    part = CarriedConstraints(system, Distance([[0, 1]]), np.eye(3))
+    part.add_to(system)
+    return part
+
+
+def _not_added(system):
+    return CarriedConstraints(system, Distance([[0, 1]]), np.eye(3))
+
+
+def _lighter(system):
+    part = hold(system, Distance([[0, 1]]), np.eye(3))
+    system.setParticleMass(0, 4.0)
+    return part
+
+
+def _later(system):
+    part = hold(system, Distance([[0, 1]]), np.eye(3))
+    system.addConstraint(1, 2, 1.0)
+    return part
+
+
+@pytest.mark.parametrize(
+    ("made", "error", "words"),
+    [
+        (_shares, UnsupportedError, r"constraint 0 .* atoms 1 and 2.*hold\(system"),
+        (_not_added, InputError, "add_to"),
+        (_lighter, InputError, "masses have changed"),
+        (_later, InputError, "got constraints after"),
+    ],
+)
+def test_a_system_that_does_not_go_with_the_rows_is_refused(made, error, words):
+    system = free([12.0] * 3)
+    part = made(system)
+    context = started(context_of(system, ProjectedIntegrator(0.01, parts=[part])), np.eye(3))
+    with pytest.raises(error, match=words):
+        part.check(context)
+
+
+def _full(system):
+    for group in range(30):
+        force = openmm.HarmonicBondForce()
+        force.setForceGroup(group)
+        system.addForce(force)
+
+
+def _with_site(system):
+    system.setParticleMass(2, 0.0)
+    system.setVirtualSite(2, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("change", "rows", "x", "error", "words"),
+    [
+        (_with_site, Distance([[0, 2]]), np.eye(3), UnsupportedError, "atom 2 is a virtual site"),
+        (_full, Distance([[0, 1]]), np.eye(3), UnsupportedError, "3 force groups, and 2 are free"),
+        (None, [], np.eye(3), InputError, "no rows"),
+        (None, [Distance(np.zeros((0, 2), dtype=int))], np.eye(3), InputError, "no rows"),
+        (None, Distance([[0, 1]]), np.eye(2, 3), InputError, r"shape \(3, 3\)"),
+        (None, Distance([[0, 9]]), np.eye(3), InputError, "9"),
+    ],
+)
+def test_rows_that_cannot_be_held_are_refused(change, rows, x, error, words):
+    system = free([1.0] * 3)
+    if change:
+        change(system)
+    with pytest.raises(error, match=words):
+        CarriedConstraints(system, rows, x)
+
+
+def test_gpus_must_carry_positions_of_more_than_single_numbers():
+    for precision in ("mixed", "double"):
+        refuse_single_precision(Precision("CUDA", precision))
+    with pytest.raises(UnsupportedError, match=r"CUDA, single precision hands .*'mixed'.* or hold the rows by Coll"):
+        refuse_single_precision(Precision("CUDA", "single"))
+    some = openmm.PythonForce(_up)
+    some.setParticles([0])
+    with pytest.raises(UnsupportedError, match=r"CUDA, mixed precision would hand over.*CarriedConstraints\.of"):
+        refuse_single_precision(Precision("CUDA", "mixed"), some)
+
+
+def test_a_system_without_rows_is_said_so():
+    with pytest.raises(InputError, match="no sets of rows"):
+        CarriedConstraints.of(free([1.0]))
+
+
+def test_the_program_says_what_it_does():
+    listing = peptide()[1].listing()
+    for words in ("solve for positions", "solve for velocities", "positions whose gradients are taken"):
+        assert f"carried rows: {words}" in listing
+
+
+def test_coordinates_far_from_the_origin_are_warned_of():
+    x = 1e6 + np.eye(2, 3)
+    part = hold(system := free([12.0] * 2), Distance([[0, 1]]), x)
+    context = started(context_of(system, ProjectedIntegrator(0.01, parts=[part])), x)
+    with pytest.warns(UserWarning, match="nm from the origin"):
+        part.check(context)
+    part.check(context)  # once

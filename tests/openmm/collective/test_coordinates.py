@@ -1,0 +1,410 @@
+"""Forces and formulas as coordinates: units, terms, atoms, plain ones among them, force groups; what is refused."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import openmm
+import pytest
+from collective_cases import (
+    angle,
+    bond,
+    centres,
+    dihedral,
+    points,
+    with_variable,
+)
+from openmm import unit
+from openmm_systems import loose_alanine, started, state_of
+
+from kcons import ConstraintSet
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula, VelocityFormula
+from kcons.constraints.functions.expressions import FUNCTIONS, parsed
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, each_term, hold
+from kcons.openmm.collective.coordinates import (
+    as_constraint,
+    expression,
+    formula_rows,
+    found_values,
+    moved_atoms,
+    number,
+    period_of,
+    unit_of,
+)
+
+X = np.array([[0.0, 0, 0], [0.14, 0.03, 0], [0.2, 0.15, 0.02], [0.1, 0.22, 0.1]])
+
+
+def particles(n=4, *forces):
+    system = openmm.System()
+    for _ in range(n):
+        system.addParticle(1.0)
+    for force in forces:
+        system.addForce(force)
+    return system
+
+
+def torsion(text="theta"):
+    force = openmm.CustomTorsionForce(text)
+    force.addTorsion(0, 1, 2, 3)
+    return force
+
+
+# -- units ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (0.3, 0.3),
+        (3 * unit.angstrom, 0.3),
+        (3 * unit.angstrom**2, 0.03),
+        (90 * unit.degree, math.pi / 2),
+        (1 * unit.kilocalorie_per_mole, 4.184),
+    ],
+)
+def test_units_of_the_user(value, expected):
+    assert number(value, "target") == pytest.approx(expected, rel=1e-15)
+    if unit.is_quantity(value):
+        assert number(value / unit.femtosecond, "rate", per=unit.picosecond) == pytest.approx(1e3 * expected, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("force", "of"),
+    [
+        (lambda: openmm.CustomBondForce("r"), unit.nanometer),
+        (lambda: openmm.CustomExternalForce(" z "), unit.nanometer),
+        (lambda: openmm.CustomCompoundBondForce(2, "distance(p1, p2)"), unit.nanometer),
+        (lambda: openmm.CustomCentroidBondForce(2, "distance(g1,g2)"), unit.nanometer),
+        (lambda: openmm.RGForce([0, 1]), unit.nanometer),
+        (lambda: with_variable("q", q=openmm.RGForce([0, 1])), unit.nanometer),
+        (lambda: openmm.CustomAngleForce("theta"), unit.radian),
+        (lambda: openmm.CustomCompoundBondForce(4, "dihedral(p1,p2,p3,p4)"), unit.radian),
+        (openmm.HarmonicBondForce, unit.kilojoule_per_mole),
+        (lambda: openmm.CustomBondForce("r^2"), None),
+        (lambda: with_variable("q^2", q=openmm.RGForce([0, 1])), None),
+    ],
+)
+def test_unit_of_a_coordinate(force, of):
+    assert unit_of(force()) == of
+
+
+@pytest.mark.parametrize(
+    ("value", "of"),
+    [
+        (3 * unit.kelvin, None),
+        (3 * unit.picosecond, None),
+        (3 * unit.kelvin, unit.nanometer),
+        (90 * unit.degree, unit.nanometer),
+        (3 * unit.angstrom, unit.radian),
+        (3 * unit.angstrom / unit.picosecond, unit.nanometer),
+    ],
+)
+def test_a_target_of_another_kind_is_refused(value, of):
+    with pytest.raises(InputError, match=r"target is .* another kind"):
+        number(value, "target", of)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, "three", None, math.inf * unit.nanometer])
+def test_what_is_no_finite_number_is_refused(value):
+    with pytest.raises(InputError, match="target"):
+        number(value, "target")
+
+
+def test_rows_are_in_units_of_openmm():
+    system = particles(2)
+    rows = CollectiveRows(system, [Row(bond(0, 1), 3 * unit.angstrom, rate=1 * unit.nanometer / unit.nanosecond)])
+    integrator = ProjectedIntegrator(0.001, parts=[rows])
+    settings = integrator.program.settings
+    assert [settings["target1_0"], settings["rate1_0"]] == pytest.approx([0.3, 1e-3], rel=1e-15)
+    with pytest.raises(InputError, match="give it in nanometer"):
+        rows.set_target(integrator, 0, 3 * unit.degree)
+
+
+# -- terms and atoms --------------------------------------------------------------------------------
+
+MANY = {
+    "CustomAngleForce": (["theta"], "Angle", [(0, 1, 2), (1, 2, 3)]),
+    "CustomTorsionForce": (["cos(theta)"], "Torsion", [(0, 1, 2, 3), (3, 1, 0, 2)]),
+    "CustomCompoundBondForce": (
+        [4, "distance(p1, p2)*angle(p2, p3, p4)"],
+        "Bond",
+        [([3, 2, 1, 0],), ([0, 1, 2, 3],)],
+    ),
+    "CustomCentroidBondForce": ([2, "distance(g1, g2)"], "Bond", [([0, 1],), ([1, 2],)]),
+    "CustomExternalForce": (["x+y"], "Particle", [(1,), (2,)]),
+    "HarmonicBondForce": ([], "Bond", [(0, 1, 0.3, 5), (2, 3, 0.1, 7)]),
+    "HarmonicAngleForce": ([], "Angle", [(0, 1, 2, 1.0, 5), (1, 2, 3, 1.0, 5)]),
+    "PeriodicTorsionForce": ([], "Torsion", [(0, 1, 2, 3, 2, 0.3, 5), (0, 1, 2, 3, 3, 0.1, 5)]),
+    "RBTorsionForce": ([], "Torsion", [(0, 1, 2, 3, 1, 2, 3, 4, 5, 6), (3, 1, 2, 0, 1, 2, 3, 4, 5, 6)]),
+}
+
+
+def many(kind):
+    """A Force of two terms."""
+    arguments, term, parameters = MANY[kind]
+    force = getattr(openmm, kind)(*arguments)
+    if kind == "CustomCentroidBondForce":
+        for group in ([0, 1], [2, 3], [1, 2]):
+            force.addGroup(group)
+    for each in parameters:
+        getattr(force, f"add{term}")(*each)
+    return force
+
+
+@pytest.mark.parametrize("kind", MANY)
+def test_the_energies_of_the_terms_add_up(kind):
+    force = many(kind)
+    whole = found_values(particles(), [[force]], X)
+    parts = found_values(particles(), [[term] for term in each_term(force)], X)
+    assert len(parts) == 2
+    assert parts.sum() == pytest.approx(whole[0], rel=1e-14)
+    assert np.all(parts != 0.0)
+
+
+def test_terms_keep_their_parameters():
+    force = openmm.CustomBondForce("k*r")
+    force.addPerBondParameter("k")
+    force.setUsesPeriodicBoundaryConditions(True)
+    force.addBond(0, 1, [2.0])
+    force.addBond(2, 3, [3.0])
+    terms = each_term(force)
+    assert [term.getBondParameters(0) for term in terms] == [[0, 1, (2.0,)], [2, 3, (3.0,)]]
+    assert all(term.usesPeriodicBoundaryConditions() and term.getNumBonds() == 1 for term in terms)
+    assert force.getNumBonds() == 2
+    with pytest.raises(UnsupportedError, match="no terms"):
+        each_term(openmm.RGForce([0, 1]))
+
+
+def test_atoms_of_each_kind():
+    centroid = many("CustomCentroidBondForce")
+    centroid.addGroup([3])  # in no bond
+    of = lambda force: moved_atoms(particles(6), [force])  # noqa: E731
+    assert of(bond(0, 1)) == {0, 1}
+    assert of(torsion()) == of(many("CustomAngleForce")) == of(centroid) == {0, 1, 2, 3}
+    assert of(many("CustomExternalForce")) == {1, 2}
+    assert of(openmm.RGForce([2, 0])) == {0, 2}
+    assert of(openmm.RMSDForce(X, [1, 3])) == {1, 3}
+    assert of(with_variable("a+b", a=bond(0, 1), b=openmm.RGForce([3]))) == {0, 1, 3}
+    for force in (openmm.RGForce([]), openmm.NonbondedForce(), with_variable("a", a=openmm.RMSDForce(X, []))):
+        assert of(force) == set(range(6))
+
+
+# -- plain coordinates --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("force", "period"),
+    [
+        (torsion, 2 * math.pi),
+        (lambda: torsion("2*theta"), 0.0),
+        (lambda: points("dihedral(p1, p2, p3, p4)", [3, 2, 1, 0]), 2 * math.pi),
+        (lambda: points("sin(dihedral(p1, p2, p3, p4))", [3, 2, 1, 0]), 0.0),
+        (lambda: with_variable("phi", phi=torsion()), 2 * math.pi),
+        (lambda: with_variable("phi+d", phi=torsion(), d=bond(0, 1)), 0.0),
+        (lambda: bond(0, 1), 0.0),
+    ],
+)
+def test_plain_dihedrals_are_periodic(force, period):
+    assert period_of(force()) == period
+
+
+@pytest.mark.parametrize(
+    ("force", "kind"),
+    [
+        (bond(4, 14), Distance),
+        (angle(4, 6, 8), Angle),
+        (dihedral(4, 6, 8, 14), Dihedral),
+        (points("distance(p1, p2)", (3, 9)), Distance),
+        (points("angle(p1,p2,p3)", (3, 9, 12)), Angle),
+        (points("dihedral(p1,p2,p3,p4)", (6, 8, 14, 16)), Dihedral),
+        (centres([0, 1, 2], [14, 15, 16]), CenterDistance),
+        (with_variable("q", q=dihedral(4, 6, 8, 14)), Dihedral),
+    ],
+)
+def test_the_constraint_measures_what_the_force_does(force, kind):
+    system, x, _ = loose_alanine()
+    rows = CollectiveRows(system, [Row(force, 0.5)])
+    context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x)
+    row = as_constraint(next(f for f in system.getForces() if f.getForceGroup() in rows.groups), 0.5)
+    assert type(row) is kind
+    held = ConstraintSet([row], x, [system.getParticleMass(k)._value for k in range(len(x))])
+    off = held.residuals(x, None, 0.0).sigma[0]
+    np.testing.assert_allclose(off, rows.residuals(context)[0])
+
+
+def _two_terms():
+    force = bond(4, 14)
+    force.addBond(4, 16)
+    return force
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        bond(4, 14, "r^2"),
+        torsion("cos(theta)"),
+        points("distance(p1,p2)-distance(p2,p3)", (3, 9, 12)),
+        centres([0, 1, 2], [14, 15], (1.0, 2.0, 1.0)),
+        with_variable("sqrt(q)", q=bond(4, 14)),
+        openmm.HarmonicBondForce(),
+        _two_terms(),
+    ],
+)
+def test_others_are_no_plain_rows(force):
+    assert as_constraint(force, 0.5) is None
+
+
+# -- formulas -----------------------------------------------------------------------------------------
+
+
+def beads():
+    springs = openmm.HarmonicBondForce()
+    for i in range(4):
+        for j in range(i):
+            springs.addBond(j, i, 1.05 * float(np.linalg.norm(X[i] - X[j])), 900.0)
+    return particles(4, springs)
+
+
+def ran(system, part, steps=20):
+    context = started(system, ProjectedIntegrator(0.002, parts=[part]), X, 0.5 * X[::-1])
+    (part.restore if hasattr(part, "restore") else part.apply_velocities)(context)
+    context._integrator.step(steps)
+    return np.hstack(state_of(context))
+
+
+def test_every_operation_means_the_same():
+    text = " + ".join(
+        f"{name}(0.3 + x1*y2{', 2' if name == 'atan2' else ''})" for name in sorted(FUNCTIONS)
+    ) + " - -x1**2**z1*(a - z2)/3.5 - 2**-x2/pi + (x1 - 1)**3 - 4 - (2 - 1)"  # fmt: skip
+    force = points(expression(parsed(text, ["a"])[0], {"a": -1e-3}), [0, 1])
+    row = Formula(text, [0, 1], {"a": -1e-3}, None)
+    x = X + 0.1
+    assert found_values(particles(), [[force]], x)[0] == pytest.approx(row.measure(x[None, :2], 0.0)[0], rel=1e-13)
+
+
+def test_expressions_and_the_engine_hold_the_same():
+    row = Formula("a*(x1 - x2)*(z1 - y2) + sqrt((y1 - y2)**2 + z2**2)", [[0, 1], [2, 3]], {"a": [2.0, 1.5]}, None)
+    one, other = beads(), beads()
+    expressed = ran(one, CollectiveRows(one, [row], positions=X))
+    carried = ran(other, hold(other, copy.deepcopy(row), X))
+    np.testing.assert_allclose(expressed, carried, atol=1e-10)
+    values = row.measure(expressed[:, :3][row.atoms], 0.0)
+    np.testing.assert_allclose(values, row.measure(X[row.atoms], 0.0), atol=1e-12)
+    still = formula_rows(Formula("z1", 0, target=None))[0]
+    assert isinstance(still, Row) and still.target is None
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (Formula("z1 - 0.3 - 0.01*sin(5*t)", 0), "moves with the time"),
+        (VelocityFormula("x1*vy1 - y1*vx1", 0), "holds velocities, not positions"),
+    ],
+)
+def test_what_moves_is_carried_and_not_expressed(row, words):
+    system = beads()
+    with pytest.raises(UnsupportedError, match=rf"{words}.*hold it by kcons\.openmm\.hold"):
+        CollectiveRows(system, [row], positions=X)
+    assert system.getNumForces() == 1
+
+
+# -- force groups -------------------------------------------------------------------------------------
+
+
+def test_free_groups_are_taken_around_those_in_use():
+    first, second = bond(0, 1), openmm.NonbondedForce()
+    first.setForceGroup(1)
+    second.setReciprocalSpaceForceGroup(3)
+    for _ in range(4):
+        second.addParticle(0, 1, 0)
+    system = particles(4, first, second)
+    assert CollectiveRows(system, [bond(1, 2), bond(2, 3)], positions=X).groups == {2, 4}
+    assert system.getNumForces() == 4
+
+
+def test_a_force_of_the_system_keeps_a_group_of_its_own():
+    alone, shared, other = bond(0, 1), bond(1, 2), bond(2, 3)
+    alone.setForceGroup(5)
+    system = particles(4, alone, shared, other)
+    assert CollectiveRows(system, [alone, shared], positions=X)._groups == (5, 1)
+    assert other.getForceGroup() == 0
+    assert system.getNumForces() == 3
+
+
+def test_forces_of_one_group_are_one_row():
+    forces = bond(0, 1), bond(2, 3)
+    for force in forces:
+        force.setForceGroup(7)
+    system = particles(4, *forces)
+    part = CollectiveRows(system, [Row(7)], positions=X)
+    expected = np.linalg.norm(X[0] - X[1]) + np.linalg.norm(X[2] - X[3])
+    context = started(system, openmm.VerletIntegrator(0.001), X)
+    assert part.scales == (1.0,)
+    assert part.values(context) == pytest.approx([expected], rel=1e-14)
+
+
+# -- what is refused ------------------------------------------------------------------------------------
+
+_KEPT = []
+
+
+def _owned():
+    _KEPT.append(particles(4, force := bond(0, 1)))
+    return force
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "match"),
+    [
+        (lambda s: [9], {}, "has no Forces"),
+        (lambda s: [3, 3], {}, "more than once"),
+        (lambda s: [s.getForce(0), s.getForce(0)], {}, "more than once"),
+        (lambda s: [s.getForce(0), 3], {}, "a row too"),
+        (lambda s: [_owned()], {}, "another System"),
+        (lambda s: ["r"], {}, "neither a Force"),
+        (lambda s: [Distance([[0, 3]])], {}, r"kcons\.openmm\.hold holds constraints of kcons"),
+        (lambda s: [], {}, "no rows"),
+        (lambda s: [Row(bond(0, 1), math.nan)], {}, "target of row 0"),
+        (lambda s: [Row(bond(0, 1), 3 * unit.kelvin)], {}, "target of row 0"),
+        (lambda s: [Row(bond(0, 1), 0.3, rate=3 * unit.nanometer)], {}, "rate of row 0"),
+        (lambda s: [Row(bond(0, 1), 0.3, rate=3 * unit.degree / unit.picosecond)], {}, "rate of row 0"),
+        (lambda s: [Row(bond(0, 1), 0.3, scale=1 * unit.radian)], {}, "scale of row 0"),
+        (lambda s: [Row(bond(0, 1), 0.1, scale=0.0)], {}, "positive"),
+        (lambda s: [Row(bond(0, 1), 0.3, period=1 * unit.radian)], {}, "period of row 0"),
+        (lambda s: [Row(bond(0, 1), 0.3, period="name")], {}, "period of row 0"),
+        (lambda s: [Row(bond(0, 1), "nowhere")], {}, "no context parameter"),
+        (lambda s: [Row(bond(0, 1), 0.1, rate="nowhere")], {}, "needs a target with a name"),
+        (lambda s: [Row(dihedral(0, 1, 2, 3), 60.0)], {}, r"over three turns, and in radian; give 60 \* unit\.degrees"),
+        (lambda s: [Row(dihedral(0, 1, 2, 3), -60)], {}, r"over three turns, and in radian; give -60 \* unit\.degrees"),
+        (lambda s: [bond(0, 7)], {}, "names particle 7; the System has 5 particles"),
+        (lambda s: [bond(0, 1)], {"positions": None}, "positions"),
+        (lambda s: [bond(0, 1)], {"positions": X[:3]}, "shape"),
+        (lambda s: [bond(0, 1)], {"positions": np.full((5, 3), math.nan)}, "row 0 is nan"),
+        (lambda s: [bond(1, 3)], {"meets_system": False}, "meets_system"),
+        (lambda s: [Row(bond(0, 3), 0.3)], {"tolerance": "x"}, "tolerance"),
+        (lambda s: [Row(bond(0, 3), 0.3)], {"tolerance": 0.0}, "tolerance"),
+        (lambda s: [Row(bond(0, 3), 0.3)], {"max_iterations": 2.5}, "max_iterations"),
+    ],
+)
+def test_rows_that_make_no_sense_are_refused(rows, options, match):
+    system = particles(5, bond(0, 1))
+    system.getForce(0).setForceGroup(3)
+    system.addConstraint(0, 1, 0.14)
+    with pytest.raises(InputError, match=match):
+        CollectiveRows(system, rows(system), **{"positions": np.vstack([X, [1.0, 1, 1]])} | options)
+    assert system.getNumForces() == 1
+
+
+def test_too_many_rows_and_virtual_sites_are_refused_before_the_system_changes():
+    system = particles(64, openmm.HarmonicBondForce())
+    with pytest.raises(UnsupportedError, match="31 are free"):
+        CollectiveRows(system, [Row(bond(2 * k, 2 * k + 1), 0.1) for k in range(32)])
+    system.setParticleMass(4, 0.0)
+    system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+    with pytest.raises(UnsupportedError, match="particle 4, a virtual site"):
+        CollectiveRows(system, [Row(bond(2, 4), 0.1)])
+    assert system.getNumForces() == 1
