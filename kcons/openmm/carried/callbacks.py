@@ -19,7 +19,6 @@ rows that are fulfilled need no correction.
 from __future__ import annotations
 
 import pickle
-import uuid
 import weakref
 from collections.abc import Callable
 from typing import Any, Literal, cast
@@ -37,7 +36,6 @@ from kcons.motion.motion import Motion
 from kcons.openmm.carried.passage import Passage
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.schemes import operations_of, stages_of
-from kcons.openmm.integrator.states.hearing import wrapped
 from kcons.openmm.integrator.system_checks import ROW_NAME
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
@@ -52,10 +50,8 @@ LOW_SCALE = 2.0**27
 
 PHASES = ("remember", "land", "project")
 PREFIX = f"{ROW_NAME}s"
-#: Engines by the keys in the names of forces.
+#: Engines by the keys in the names of forces. Copies of a System, which have the same names, share one.
 LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
-#: Those read last, by the keys that forces bring along: that of the first System, whose copies' names begin with it.
-_READ: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
 
 
 class Engine:
@@ -116,7 +112,9 @@ class Engine:
         self._begun = False
         #: Free positions of the drift and what brings them onto the rows.
         self._landing: tuple[FloatArray, FloatArray] | None = None
-        LIVE.setdefault(key, self)
+        #: The part of integrators that has this engine.
+        self.part: Callable[[], Any] = lambda: None
+        LIVE[key] = self
 
     def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
         """Take times and step sizes from this integrator; `lean` as for parts."""
@@ -364,32 +362,10 @@ class Callback:
 
 
 def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
-    engine = _READ.get(key) if recipe is None else Engine(key, *recipe)
+    engine = LIVE.get(key) or (Engine(key, *recipe) if recipe else None)
     if engine is None:
         raise pickle.UnpicklingError(f"the force '{force_name(PHASES[0], key)}' must be read first")
-    _READ[key] = engine
     return Callback(engine, phase)
-
-
-def _read(original: Callable[..., openmm.System], given: Any) -> openmm.System:
-    """A System from XML, or a copy: its rows get a key of their own, by which no other copy's are found."""
-    system = original(given)
-    keys: dict[str, str] = {}
-    for force in system.getForces():
-        if isinstance(force, openmm.PythonForce) and force.getName().startswith(PREFIX):
-            phase, key = force.getName().split()[-2:]
-            first = key.partition("-")[0]
-            if key not in keys and first in _READ:
-                keys[key] = f"{first}-{uuid.uuid4().hex}"
-                LIVE[keys[key]] = _READ[first]
-                _READ[first].key = keys[key]
-            force.setName(force_name(phase, keys.get(key, key)))
-    return system
-
-
-for _name in ("deserializeSystem", "_cloneSystem"):
-    setattr(openmm.XmlSerializer, _name, staticmethod(wrapped(getattr(openmm.XmlSerializer, _name), _read)))
-openmm.System.__copy__ = wrapped(openmm.System.__copy__, _read)
 
 
 # -- what OpenMM gives ----------------------------------------------------------------------------

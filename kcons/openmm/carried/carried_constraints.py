@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+import weakref
 from collections.abc import Iterable
 from typing import Literal
 
@@ -112,10 +113,11 @@ class CarriedConstraints(CarriedProgram):
         self._engine = engine
         self._groups = dict(zip(PHASES, groups, strict=True))
         self.groups = frozenset(groups)
+        engine.part = weakref.ref(self)
 
     @classmethod
     def of(cls, system: openmm.System) -> CarriedConstraints:
-        """The rows that a System brings along which was read from XML or copied.
+        """The rows that a System brings along which was read from XML or copied; those of copies are one.
 
         Raises
         ------
@@ -129,7 +131,7 @@ class CarriedConstraints(CarriedProgram):
             raise InputError(
                 f"the System carries {len(keys) or 'no'} sets of rows of kcons; expected one", item="system"
             )
-        part = object.__new__(cls)
+        part = LIVE[keys[0]].part() or object.__new__(cls)
         mine = [found[force_name(phase, keys[0])] for phase in PHASES]
         if hands_over_all():
             for force in mine:

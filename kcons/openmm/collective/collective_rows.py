@@ -17,7 +17,7 @@ from kcons.errors import (
     InputError,
     UnsupportedError,
 )
-from kcons.openmm.collective.clock import Clock, require_holder, variables_of
+from kcons.openmm.collective.clock import require_holder
 from kcons.openmm.collective.formula_rows import as_rows
 from kcons.openmm.collective.measured_rows import TOLERANCE
 from kcons.openmm.collective.reported_rows import ReportedRows
@@ -205,11 +205,6 @@ class CollectiveRows(ReportedRows):
         if self.asked_tolerance is None:
             self.tolerance = self.at(context).finest
             program.set(f"tolerance{self.code}", self.tolerance)
-
-    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
-        """Targets go on from where the other integrator has left them."""
-        if self._drives:
-            Clock(self.code).set(program, Clock(notes["code"]).now(variables_of(before)))
 
     def set_target(
         self, integrator: ProjectedIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None

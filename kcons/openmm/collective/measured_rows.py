@@ -16,7 +16,6 @@ from kcons.openmm.collective.clock import variables_of
 from kcons.openmm.collective.row_forces import energy
 from kcons.openmm.integrator.guard import positions_of, velocities_of, width
 from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.integrator.system_checks import groups_in, require_context
 from kcons.openmm.quantities import masses_of
 
@@ -235,10 +234,9 @@ class MeasuredRows:
 
 def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
-    holding = [ours for ours in listeners(context) if rows._of("push", 0, ours) in ours.program.numbers]
-    if holding:  # of members of a CompoundIntegrator the one that made steps last
-        return next((ours for ours in holding if getattr(ours, "identity", None) is rows.serves), holding[0])
     integrator = context.getIntegrator()
+    if rows._of("push", 0, integrator) in getattr(getattr(integrator, "program", None), "numbers", ()):
+        return integrator
     found = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
         found = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]

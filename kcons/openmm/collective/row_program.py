@@ -197,7 +197,7 @@ class GroupRows(Part):
             self._measure(p)
             self._decide(p, first=False)
         if self._forecast.foresees:
-            with p.when(f"select(sparing{c}, state{c}, 0) > 2", "one more, which need not be measured", usual=True):
+            with p.when(f"select(sparing{c}, state{c}, 0) > 2", "one more, which need not be measured"):
                 self._push(p)
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")

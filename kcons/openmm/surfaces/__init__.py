@@ -4,6 +4,6 @@
 - `quadrics`, `compiled_quadrics`: spheres, cylinders, planes, ellipsoids
 - `tori`: tori
 - `formulas`: surfaces given by a formula
-- `surface_step_writer`: the program of a step
+- `surface_steps`: the program of a step
 - `surface_integrator`: `SurfaceIntegrator`
 """
