@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import openmm
@@ -14,6 +14,7 @@ from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
+from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.integrator.system_checks import (
     forces_of,
     groups_in,
@@ -23,9 +24,6 @@ from kcons.openmm.integrator.system_checks import (
 )
 from kcons.openmm.quantities import held_without_mass, masses_of
 from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, RigidMotions, open_directions
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 Momentum = Literal["auto", "conserved", "free"]
 
@@ -57,7 +55,7 @@ def check_momentum(momentum: str) -> None:
         raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
 
 
-def conserved_momenta(integrator: ProjectedIntegrator, context: openmm.Context, momentum: Momentum) -> Momenta:
+def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
     """Find conserved momenta from the forces and the constraints.
 
     Parameters

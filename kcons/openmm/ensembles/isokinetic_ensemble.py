@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import openmm
@@ -25,7 +25,7 @@ from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.steps import Ensemble, Step
+from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion, warn_of_barostat
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.compositions import Composition
@@ -33,9 +33,6 @@ from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import atom_numbers, warn_of_conserved_momenta
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
 #: is continued stays as it is, bit for bit.
@@ -211,7 +208,7 @@ class Isokinetic(Ensemble):
 
     # -- a run ----------------------------------------------------------------------------------
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Find g and K; scale the velocities, unless they are right to rounding.
 
         Raises
@@ -249,7 +246,7 @@ class Isokinetic(Ensemble):
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
 
-    def verify(self, integrator: ProjectedIntegrator) -> None:
+    def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if kicks have lost digits."""
         if integrator.getGlobalVariableByName("lost"):
             integrator.program.write("lost", 0.0)
@@ -258,7 +255,7 @@ class Isokinetic(Ensemble):
                 "step, and lost digits; take a smaller time step"
             )
 
-    def _momenta(self, integrator: ProjectedIntegrator, context: openmm.Context) -> Momenta:
+    def _momenta(self, integrator: Integrator, context: openmm.Context) -> Momenta:
         if not _everyone(self.atoms, integrator, context):
             return NONE
         return conserved_momenta(integrator, context, self.momentum)
@@ -280,14 +277,14 @@ class Isokinetic(Ensemble):
 
     # -- what can be read -----------------------------------------------------------------------
 
-    def count(self, integrator: ProjectedIntegrator) -> int:
+    def count(self, integrator: Integrator) -> int:
         """g of an integrator: its momenta that are thermostatted and independent."""
         guard = integrator._watch()
         if guard.thermal is None:
             return _count(self.atoms, integrator, guard.context, self._momenta(integrator, guard.context))
         return guard.thermal
 
-    def warmth(self, integrator: ProjectedIntegrator) -> float:
+    def warmth(self, integrator: Integrator) -> float:
         """2 K/(g k) times this is the temperature of the configurations."""
         count = self.count(integrator)
         if count < 2 or not _everyone(self.atoms, integrator, integrator.context):
@@ -298,7 +295,7 @@ class Isokinetic(Ensemble):
         atoms = None if self.atoms is None else np.asarray(self.atoms)
         return Isokinetic(temperature, convention=self.convention, atoms=atoms, momentum=self.momentum)
 
-    def follow(self, integrator: ProjectedIntegrator) -> None:
+    def follow(self, integrator: Integrator) -> None:
         """Kicks scale the velocities from the next step on."""
         guard = integrator._guard
         if guard is not None and guard.alive is not None and guard.started:
@@ -306,7 +303,7 @@ class Isokinetic(Ensemble):
             twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
             integrator.program.set("two_k", twice)
 
-    def friction(self, integrator: ProjectedIntegrator) -> float:
+    def friction(self, integrator: Integrator) -> float:
         """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
         context = integrator.context
         masses, v = _masses(self.atoms, integrator, context), velocities_of(context)
@@ -315,11 +312,11 @@ class Isokinetic(Ensemble):
         inside = masses > 0
         return float(np.sum(v[inside] * f[inside]) / (masses @ np.einsum("ij,ij->i", v, v)))
 
-    def compression_rate(self, integrator: ProjectedIntegrator) -> float:
+    def compression_rate(self, integrator: Integrator) -> float:
         """Divergence of the flow in phase space, -(g - 1) alpha, in 1/ps."""
         return -(self.count(integrator) - 1) * self.friction(integrator)
 
-    def conserved_energy(self, integrator: ProjectedIntegrator) -> float:
+    def conserved_energy(self, integrator: Integrator) -> float:
         """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""
         state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
         heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")
@@ -345,7 +342,7 @@ def _add_up(step: Step, of: str, q: str, along: str) -> None:
     p.let("qq", "max(qq-wq, wq^2/ww)", "size of the kick")
 
 
-def _masses(atoms: Atoms, integrator: ProjectedIntegrator, context: openmm.Context) -> np.ndarray:
+def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np.ndarray:
     """Of thermostatted particles; 0 for others."""
     system = context.getSystem()
     n = system.getNumParticles()
@@ -370,9 +367,7 @@ def _masses(atoms: Atoms, integrator: ProjectedIntegrator, context: openmm.Conte
     return np.where(inside, masses, 0.0)
 
 
-def _in_motion(
-    atoms: Atoms, integrator: ProjectedIntegrator, context: openmm.Context
-) -> tuple[FloatArray, FloatArray, float]:
+def _in_motion(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
     """Masses that are thermostatted, velocities as a CMMotionRemover leaves them, and 2K.
 
     Raises
@@ -393,13 +388,13 @@ def _in_motion(
     return masses, v, found
 
 
-def _everyone(atoms: Atoms, integrator: ProjectedIntegrator, context: openmm.Context) -> bool:
+def _everyone(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> bool:
     """Whether all particles with a mass are thermostatted: total momentum may be conserved then."""
     masses, everyones = (_masses(these, integrator, context) for these in (atoms, None))
     return np.array_equal(masses, everyones)
 
 
-def _count(atoms: Atoms, integrator: ProjectedIntegrator, context: openmm.Context, momenta: Momenta) -> int:
+def _count(atoms: Atoms, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:
     """g: momenta that are thermostatted and independent."""
     if atoms is None:
         count = integrator.independent_momenta(context)

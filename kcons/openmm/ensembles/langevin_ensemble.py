@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.steps import Ensemble, Step
+from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
 from kcons.openmm.integrator.system_checks import warn_of_barostat
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 
 class Langevin(Ensemble):
@@ -101,7 +96,7 @@ class Langevin(Ensemble):
             # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
             step.project()
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Compare with a barostat."""
         warn_of_barostat(context, self.temperature, stacklevel=6)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import openmm
@@ -14,16 +14,13 @@ from kcons.openmm.ensembles.conserved_momenta import Momenta, Momentum, check_mo
 from kcons.openmm.integrator.guard import velocities_of
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.steps import Ensemble, Step, use
+from kcons.openmm.integrator.steps import Ensemble, Integrator, Step, use
 from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion, warn_of_barostat
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import warn_of_conserved_momenta
 from kcons.thermostats.nose_hoover import HALF, chain_fractions
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
@@ -217,7 +214,7 @@ class NoseHoover(Ensemble):
 
     # -- a run ----------------------------------------------------------------------------------
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Find g.
 
         Raises
@@ -245,7 +242,7 @@ class NoseHoover(Ensemble):
         warn_of_barostat(context, self.temperature, stacklevel=6)
         integrator.program.set("momenta", count)
 
-    def _count(self, integrator: ProjectedIntegrator, momenta: Momenta) -> int:
+    def _count(self, integrator: Integrator, momenta: Momenta) -> int:
         count = integrator.independent_momenta() - len(momenta.directions)
         if count < 1:
             raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
@@ -254,14 +251,14 @@ class NoseHoover(Ensemble):
 
     # -- what can be read -----------------------------------------------------------------------
 
-    def count(self, integrator: ProjectedIntegrator) -> int:
+    def count(self, integrator: Integrator) -> int:
         """g of an integrator: its momenta that are thermostatted and independent."""
         guard = integrator._watch()
         if guard.thermal is not None:
             return int(guard.thermal)
         return self._count(integrator, conserved_momenta(integrator, guard.context, self.momentum))
 
-    def warmth(self, integrator: ProjectedIntegrator) -> float:
+    def warmth(self, integrator: Integrator) -> float:
         return integrator.degrees_of_freedom() / self.count(integrator)
 
     def settings(self) -> dict[str, float]:
@@ -271,7 +268,7 @@ class NoseHoover(Ensemble):
         given: dict[str, Any] = dict(self.__dict__)
         return type(self)(**{**given, "temperature": temperature})
 
-    def conserved_energy(self, integrator: ProjectedIntegrator) -> float:
+    def conserved_energy(self, integrator: Integrator) -> float:
         """Energy of the System and of the chain in kJ/mol; its fluctuation is of order dt^2."""
         state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
         energy = (state.getPotentialEnergy() + integrator.kinetic_energy()).value_in_unit(unit.kilojoule_per_mole)

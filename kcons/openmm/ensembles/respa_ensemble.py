@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
-from kcons.openmm.integrator.steps import Step
+from kcons.openmm.integrator.steps import Integrator, Step
 from kcons.openmm.integrator.system_checks import groups_in, groups_of
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.multistep.nesting import SlowKicks, levels_of, middle_of, nested
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Operations of an inner step: a kick, half a drift, the bath, half a drift, forces, a kick.
 _INNER = 6
@@ -109,7 +105,7 @@ class LangevinRespa(Langevin):
     def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
         return nested(self.levels, 2, (1.0,), middle=self.slow_kicks == "middle")
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
         super().begin(integrator, context)
         idle = set(self.groups) - groups_in(integrator)

@@ -7,7 +7,7 @@ import logging
 import weakref
 from collections.abc import Iterable
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import openmm
@@ -20,6 +20,7 @@ from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import SINGLE, Precision
 from kcons.openmm.integrator.program import forces_at_old_positions
+from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
@@ -30,9 +31,6 @@ from kcons.openmm.integrator.system_checks import (
     removes_centre_of_mass_motion,
 )
 from kcons.openmm.quantities import held_without_mass
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -87,7 +85,7 @@ class SystemConstraints:
     integrator : ProjectedIntegrator
     """
 
-    def __init__(self, context: openmm.Context, integrator: ProjectedIntegrator) -> None:
+    def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
         self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.precision = Precision.of(context)
         self.rows = SystemRows.of(context.getSystem(), rounded=self.precision.rounds_lengths)
@@ -177,7 +175,7 @@ class Guard:
         The System cannot be propagated, see `check_system`.
     """
 
-    def __init__(self, context: openmm.Context, integrator: ProjectedIntegrator) -> None:
+    def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
         self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
         self._size = _size(self.system)
@@ -228,7 +226,7 @@ class Guard:
         return self.constraints.context
 
     @property
-    def integrator(self) -> ProjectedIntegrator:
+    def integrator(self) -> Integrator:
         integrator = self._integrator()
         assert integrator is not None
         return integrator

@@ -22,7 +22,7 @@ from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import DOUBLE, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
-from kcons.openmm.integrator.steps import VARIABLES, ConstantEnergy, Ensemble, Step, write_step
+from kcons.openmm.integrator.steps import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step, write_step
 from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
 from kcons.openmm.quantities import kelvins, number, relative_tolerance
 from kcons.steppers.operations import Operation
@@ -56,7 +56,7 @@ class _OfEnsembles(Generic[_Given, _Found]):
         return MethodType(self.method, integrator)
 
 
-class ProjectedIntegrator(openmm.CustomIntegrator):
+class ProjectedIntegrator(Integrator):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a

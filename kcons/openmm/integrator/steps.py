@@ -19,21 +19,18 @@ What begins and ends a step, and what may be left out of it, goes by a few varia
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import openmm
 
 from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.steppers.operations import Exchange, Operation
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.splitting import Splitting
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.part import Part
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Schemes whose shortest drifts are less than this part of a step: what rounding does to x, divided by the length of
 #: the drift, must be kept out of v there.
@@ -91,6 +88,28 @@ def use(program: Program, *names: str, value: float | None = None) -> str:
         given = () if kind == "vector" else (first if value is None else value,)
         getattr(program, kind)(name, words, *given)
     return names[-1]
+
+
+class Integrator(openmm.CustomIntegrator):
+    """What ensembles and checks may ask of an integrator; `ProjectedIntegrator` answers, and says what each is."""
+
+    scheme: Splitting | None
+    parts: tuple[Part, ...]
+    program: Program
+    row_groups: frozenset[int]
+    spare: bool
+    check_every: int
+    ensemble: Ensemble
+    context: openmm.Context
+    _guard: Any
+    _watch: Callable[..., Any]
+    take_precision: Callable[..., None]
+    refresh: Callable[[], None]
+    applyConstraints: Callable[..., None]
+    applyVelocityConstraints: Callable[..., None]
+    independent_momenta: Callable[..., int]
+    degrees_of_freedom: Callable[..., int]
+    kinetic_energy: Callable[..., Any]
 
 
 class Ensemble:
@@ -185,7 +204,7 @@ class Ensemble:
 
     # -- a run ----------------------------------------------------------------------------------
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """At the first step of a run, x and v on the constraints.
 
         Raises
@@ -194,10 +213,10 @@ class Ensemble:
             The ensemble does not exist for this System or this start.
         """
 
-    def verify(self, integrator: ProjectedIntegrator) -> None:
+    def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if something went wrong since the last check."""
 
-    def warmth(self, integrator: ProjectedIntegrator) -> float:
+    def warmth(self, integrator: Integrator) -> float:
         """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
         return 1.0
 
@@ -209,7 +228,7 @@ class Ensemble:
         """The same at another temperature (K)."""
         raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
 
-    def follow(self, integrator: ProjectedIntegrator) -> None:
+    def follow(self, integrator: Integrator) -> None:
         """The integrator takes this ensemble, perhaps in the middle of a run; raise `KconsError` if it cannot."""
 
     # -- a value --------------------------------------------------------------------------------
@@ -603,6 +622,11 @@ def _up_to_forces(step: Step, then: Callable[[Step], None]) -> None:
                 p.each("x_last", "x", "start here")
             with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
                 p.each("force", "f", "applied forces")
+            if ensemble.noisy:
+                # Reference and CPU draw random numbers with each computation: how steps are divided into calls must
+                # not change the noise.
+                with p.when("moved+stale+abs(call-2) = 0", "forces are known"):
+                    p.each("force", "force", "as many random numbers are drawn")
             p.let("call", "select(call, 2, 0)", "forces are known in this call")
             with p.when("moved+stale != 0", "others did"):
                 for part in step.parts:

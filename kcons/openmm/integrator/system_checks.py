@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import openmm
@@ -21,11 +20,9 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 IntArray = NDArray[np.int64]
 
@@ -366,7 +363,7 @@ def virtual_sites(system: openmm.System) -> list[int]:
     return [k for k in range(system.getNumParticles()) if system.isVirtualSite(k)]
 
 
-def parts_of_steps(context: openmm.Context, integrator: ProjectedIntegrator) -> bool:
+def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     """Whether steps must be made in parts: forces are needed within the step, and virtual sites are placed at its end.
 
     Raises

@@ -35,6 +35,7 @@ def written(size, write):
         program.number(f"more3_{row}", "")
         program.number(f"result3_{row}", "")
     write(program, block)
+    program.hand_over()
     return integrator, block
 
 
