@@ -283,7 +283,7 @@ class Step:
     lazy : bool
         Whether `between` is of use.
     observed : int
-        How many steps at the end of a call must be complete, for multipliers of a step to be there.
+        How many steps at the end of a call must be complete: two where a part tells the mean over a step.
     force : str
         Name of the applied forces.
     """
@@ -303,7 +303,7 @@ class Step:
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = ensemble.adds_up and not self.parts and verlet
         self.lazy = self.lean or self.joined or (not self.parts and (ensemble.owes or scheme is None))
-        self.observed = 2 if self.lean else 1
+        self.observed = 2 if self.lean and any(hasattr(part, "mean_multipliers") for part in self.parts) else 1
         self.kept = scheme is not None and any(part.evaluates for part in self.parts) and not self.lean
         self.force = "f"
         #: Whether drifts change v by impulses without the rounding errors of positions.
