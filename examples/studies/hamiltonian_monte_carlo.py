@@ -176,10 +176,10 @@ def proposals_of(
     """Changes of energy of some proposals of about 120 fs, from an equilibrated start."""
     import openmm
 
-    from kcons.openmm import HamiltonianMonteCarlo, WaysBackIntegrator
+    from kcons.openmm import HamiltonianMonteCarlo
 
     length, platform, precision = how.get("length", 120.0), how.get("platform", "CPU"), how.get("precision", "")
-    integrator = WaysBackIntegrator(1e-3 * dt, scheme)
+    integrator = HamiltonianMonteCarlo.reversing_integrator(1e-3 * dt, scheme)
     given = {"Precision": precision} if precision else {"Threads": "1"} if platform == "CPU" else {}
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), given)
     context.setPositions(x)

@@ -427,17 +427,16 @@ class Guard:
             return
         begun = perf_counter()
         try:
-            now = self.check()
+            self.check()
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
             if isinstance(error, CertificateError):
                 error.state = self._good
             self._go_back(error)
             raise
-        self._remember(now)
         self._cost = self._checked - begun
 
-    def check(self) -> openmm.State:
-        """The State, if positions and velocities are finite and on all that is held; the Context stays as it is.
+    def check(self) -> None:
+        """Whether positions and velocities are finite and on all that is held: the state to come back to.
 
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
@@ -462,7 +461,7 @@ class Guard:
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
             error.step = step
             raise
-        return now
+        self._remember(now)
 
     def _go_back(self, error: KconsError) -> None:
         """The state that was checked last, and the error says so."""

@@ -19,7 +19,7 @@ from kcons.constraints.arguments import whole_number
 from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
-from kcons.openmm.integrator.steps import Step, single_step
+from kcons.openmm.integrator.steps import Step, single_step, use
 
 #: What one execution of the program of `Ends` does.
 _STEP, _BEGIN, _END = 0.0, 1.0, 2.0
@@ -31,6 +31,7 @@ _CLOSED = "a RattleIntegrator has its integrators; make a CompoundIntegrator wit
 def _step_or_end(step: Step) -> bool:
     """A whole step; or, to order, what begins and what ends a row of leapfrog steps made by others."""
     p = step.program
+    use(p, "xu")
     p.control("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
     with p.when("end = 0", "a step"):
         single_step(step)

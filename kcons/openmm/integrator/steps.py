@@ -428,7 +428,6 @@ def write_step(step: Step, own: Callable[[Step], bool] | None = None) -> None:
         A kind of step of the integrator's own, which returns False where it leaves the step to the others.
     """
     p, ensemble = step.program, step.ensemble
-    use(p, "xu")
     if step.scheme is None:
         # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
         # impulse of the forces at x is added, and half that of the constraints in the drift to x.
@@ -441,8 +440,10 @@ def write_step(step: Step, own: Callable[[Step], bool] | None = None) -> None:
         use(p, "v_middle", "v_end")
         # Where others have set v since, it is theirs that counts.
         p.kinetic_energy = "m*u*u/2; u=select(spread*delta(v-v_end), v_middle, v)"
-    if not (own is not None and own(step)) and not ensemble.write(step):
-        _kind(step)(step)
+    if not (own is not None and own(step)):
+        use(p, "xu")
+        if not ensemble.write(step):
+            _kind(step)(step)
     use(p, "ending", "motion")
     with p.when("ending != 0", "a call ends"):
         p.sum("motion", "v*v", "are velocities finite?")
@@ -566,13 +567,14 @@ def _joined_step(step: Step) -> None:
 # -- steps that are taken back when a part fails --------------------------------------------------
 
 
-def declare_guards(step: Step) -> None:
-    """Variables of steps with parts: what to come back to, and the stages at which constraints are applied alone."""
+def declare_guards(step: Step, *, shares: bool = True) -> None:
+    """Variables of steps with parts, and their stages; `shares` where drifts have lengths of their own."""
     p, n = step.program, len(step.drifts)
     use(p, "failed", "good_steps", "first_stage")
     use(p, "end_stage", value=n)
     use(p, "stage", "stale")
-    p.table("drift_share", [*step.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
+    if shares:
+        p.table("drift_share", [*step.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
     p.table("kick_share", [*step.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
     if step.kept or step.lean:
         use(p, "call", "moved")

@@ -387,6 +387,12 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
             f"{where}: {platform} places virtual sites at the end of a program only, and beside parts= steps of "
             f"several drifts ({integrator.scheme!r}) are not made in parts; use scheme='rattle'"
         )
+    if late and type(context.getIntegrator()) is openmm.CompoundIntegrator:
+        raise UnsupportedError(
+            f"{where}: {platform} places virtual sites at the end of a program only, and within a CompoundIntegrator "
+            "OpenMM runs it as a whole, with forces of sites that are one step old. Use scheme='leapfrog', or the "
+            "integrator alone"
+        )
     return late
 
 

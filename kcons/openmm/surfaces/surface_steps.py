@@ -34,8 +34,8 @@ def surface_step(step: Step) -> bool:
     # x and v stay as they are until the only landing of the step is known: nothing to come back to.
     untouched = isinstance(step.scheme, Rattle) and not step.kept and circles is None
     use(p, "between")
-    declare_guards(step)
-    use(p, *["behind", "kick"] if untouched else ["h", "x_last", "v_last"])
+    declare_guards(step, shares=not untouched)
+    use(p, *["behind", "kick"] if untouched else ["h", "x_last", "v_last"], *["xu"] * bonded)
     if step.kept:
         step.force = use(p, "force")
     for part in surfaces:
