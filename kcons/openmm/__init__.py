@@ -24,8 +24,7 @@ try:
     from kcons.openmm.ensembles.molecular_pressure import PressureReporter, molecular_pressure
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-    from kcons.openmm.ensembles.respa_ensemble import IsokineticCircles, LangevinRespa
-    from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
+    from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
     from kcons.openmm.integrator.guard import positions_of, velocities_of
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -46,7 +45,6 @@ __all__ = [
     "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",
-    "IsokineticCircles",
     "Langevin",
     "LangevinRespa",
     "NoseHoover",
@@ -57,7 +55,6 @@ __all__ = [
     "RattleIntegrator",
     "Row",
     "SurfaceIntegrator",
-    "WaysBackIntegrator",
     "constraints_of",
     "each_term",
     "hold",

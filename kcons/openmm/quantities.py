@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
@@ -15,6 +16,9 @@ from kcons.constraints.arguments import ANY, Unitless, has_units, shown
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
+
+#: Boltzmann's constant times Avogadro's number, kJ/mol/K.
+GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 
 
 def plain(value: Any, of: unit.Unit, item: str) -> Any:
@@ -67,6 +71,20 @@ def relative_tolerance(value: Any) -> float:
     if not 0 < found < 1:
         raise InputError(f"the tolerance is {value}; give a positive number, such as 1e-10", item="tolerance")
     return found
+
+
+def kelvins(temperature: unit.Quantity | float) -> float:
+    """A temperature in K, not below zero.
+
+    Raises
+    ------
+    InputError
+        It is none.
+    """
+    value = number(temperature, unit.kelvin, "temperature")
+    if not 0 <= value < math.inf:
+        raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
+    return value
 
 
 def array(values: Any, of: unit.Unit, item: str) -> FloatArray:

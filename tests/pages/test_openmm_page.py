@@ -25,12 +25,3 @@ def test_table_of_schemes():
         table |= {k: (int(order), int(e)) for k, e in zip(keys, evaluations.split(","), strict=True)}
     assert table.pop("leapfrog") == (2, 1)
     assert table == {name: (make().order, make().force_evaluations) for name, make in SCHEMES.items()}
-
-
-def test_table_of_costs():
-    rows = re.findall(r"^\| ([a-z0-9-]+) \| (\d+) \| (\d+) \| (\d+) \|$", PAGE, re.MULTILINE)
-    assert {name for name, *_ in rows} == {*SCHEMES, "leapfrog"}
-    for name, *numbers in rows:
-        counts = ProjectedIntegrator(0.002, name).counts()
-        found = [counts.passes, counts.constraint_solves, counts.force_evaluations]
-        assert [int(n) for n in numbers] == found, name

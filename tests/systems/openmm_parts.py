@@ -25,11 +25,10 @@ class HeldCoordinates(Part):
         self.particles, self.axis = list(particles), axis
 
     def declare(self, program):
-        program.vector("held", "1 where a coordinate is held")
+        program.vector_setting("held", "1 where a coordinate is held", self.mask)
         program.setting("level", "where it is held", self.value)
         program.number("steepest", "longest way accepted", self.steepest)
         program.number("off", "how far off it was")
-        program.integrator.setPerDofVariableByName("held", [list(row) for row in self.mask])
         if self.groups:
             program.vector("row", "gradient")
 

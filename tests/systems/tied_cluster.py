@@ -7,8 +7,16 @@ import numpy as np
 import openmm
 from openmm_systems import context_of
 
+from kcons.constraints import Distance, Sphere
 from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
     ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    SurfaceIntegrator,
+    hold,
 )
 
 X = np.random.default_rng(3).random((8, 3)) * 0.3
@@ -62,3 +70,56 @@ def begun(system, integrator, restore=None, part=None):
     if restore is not None:
         restore(context)
     return Made(integrator, context, part)
+
+
+#: Radius of the sphere that holds particle 0, about a centre that is not the origin.
+RADIUS, CENTRE = 0.2, X[0] - [0.2, 0, 0]
+
+
+def bond(i=0, j=7):
+    force = openmm.CustomBondForce("r")
+    force.addBond(i, j)
+    return force
+
+
+def rattle(strength=200.0):
+    return begun(cluster(strength, bonded=True), RattleIntegrator(0.002))
+
+
+def on_a_sphere(radius=RADIUS, strength=200.0, **options):
+    system = cluster(strength)
+    surface = Sphere([0], CENTRE, radius)
+    integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
+    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
+
+
+def row_at(target=0.30, strength=200.0, **options):
+    system = cluster(strength)
+    rows = CollectiveRows(system, [Row(bond(), target)], positions=X)
+    return begun(system, ProjectedIntegrator(0.002, parts=[rows], **options), rows.restore, rows)
+
+
+def carried_at(target=0.30, strength=200.0, **options):
+    system = cluster(strength)
+    part = hold(system, [Distance([[0, 7]], target)], X)
+    return begun(system, ProjectedIntegrator(0.002, parts=[part], **options), part.apply_positions, part)
+
+
+#: Every class and ensemble, each as often as wanted.
+KINDS = {
+    "constant energy": thermostatted(None),
+    "suzuki4": thermostatted(None, scheme="suzuki4"),
+    "leapfrog": thermostatted(None, scheme="leapfrog"),
+    "Langevin": thermostatted(Langevin(300, 1.0)),
+    "Isokinetic": thermostatted(Isokinetic(300)),
+    "isokinetic4": thermostatted(Isokinetic(300), scheme="isokinetic4"),
+    "RattleIntegrator": rattle,
+    "sphere": on_a_sphere,
+    "sphere, compiled": lambda **given: on_a_sphere(compiled=True, **given),
+    "sphere, Langevin": lambda **given: on_a_sphere(ensemble=Langevin(300, 1.0), **given),
+    "collective": row_at,
+    "collective, leapfrog": lambda **given: row_at(scheme="leapfrog", **given),
+    "collective, Langevin": lambda **given: row_at(ensemble=Langevin(300, 1.0), **given),
+    "carried": carried_at,
+    "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),
+}

@@ -286,7 +286,7 @@ class GroupRows(Part):
             self._measure(p)
             self._decide(p, first=False)
         if self.lean:
-            with p.when(f"state{c} > 2", "one more, which need not be measured", usual=True):
+            with p.when(f"state{c} > 2", "one more, which need not be measured"):
                 self._push(p)
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
@@ -307,7 +307,7 @@ class GroupRows(Part):
         for k in range(self.n_rows):
             line = f"select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)"
             p.let(self._of("push", k), line, "on the line through the last ones")
-        with p.when(f"follows{c} != 0", "there is such a line", usual=True):
+        with p.when(f"follows{c} != 0", "there is such a line"):
             p.each("x", f"{self._base}+{self._pushes}", "there, with what is foreseen")
 
     def _push(self, p: Program) -> None:
@@ -454,12 +454,6 @@ class GroupRows(Part):
     def _clock(self, integrator: openmm.CustomIntegrator) -> float:
         """The time of the targets between steps."""
         return clock_of(variables_of(integrator), self.code_in(integrator)) if self._drives else 0.0
-
-    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
-        """Targets go on from where the other integrator has left them."""
-        if self._drives:
-            program.write(f"clock{self.code}", clock_of(variables_of(before), notes["code"]))
-            program.write(f"flown{self.code}", 0.0)
 
 
 def clock_of(variables: dict[str, float], code: int) -> float:

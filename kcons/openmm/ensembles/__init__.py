@@ -4,8 +4,7 @@
 - `langevin_ensemble`: Langevin dynamics
 - `isokinetic_ensemble`: constant kinetic energy
 - `nose_hoover_ensemble`: Nosé-Hoover chains
-- `barostat_temperature`: whether a barostat has the temperature of the thermostat
 - `molecular_pressure`: the pressure of molecules as points
 - `respa_ensemble`: several time steps
-- `ways_back`, `monte_carlo_sampler`: Monte Carlo without any error of the time step
+- `monte_carlo_sampler`: Monte Carlo without any error of the time step
 """

@@ -14,7 +14,7 @@ from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
-from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.integrator.system_checks import (
     forces_of,
     groups_in,

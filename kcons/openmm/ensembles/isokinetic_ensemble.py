@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -15,7 +14,6 @@ from openmm import unit
 from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.conserved_momenta import (
     NONE,
     Momenta,
@@ -23,14 +21,13 @@ from kcons.openmm.ensembles.conserved_momenta import (
     check_momentum,
     conserved_momenta,
 )
-from kcons.openmm.integrator.ensemble import Value
 from kcons.openmm.integrator.guard import positions_of, velocities_of
-from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
-from kcons.openmm.quantities import number
+from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
+from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion, warn_of_barostat
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
@@ -42,13 +39,11 @@ from kcons.thermostats.freedom import atom_numbers, warn_of_conserved_momenta
 ROUNDING = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 #: Where velocities run against a strong force, s' is a small difference; below this, digits are lost.
 _CANCELS = 1e-4
-#: Boltzmann's constant times Avogadro's number, kJ/mol/K.
-GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 #: Particles by number, or True and False for each; None for all.
 Atoms: TypeAlias = tuple[int, ...] | tuple[bool, ...] | None
 
 
-class Isokinetic(Value):
+class Isokinetic(Ensemble):
     """Constant kinetic energy, for `ProjectedIntegrator(ensemble=...)`.
 
     Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
@@ -152,8 +147,8 @@ class Isokinetic(Value):
 
     def declare(self, program: Program) -> None:
         p = program
-        p.number("two_k", "2K, kept; 0 until the first step")
-        p.number("exact", "whether v is made tangent before unseen kicks, and 2K summed")
+        p.setting("two_k", "2K, kept; 0 until the first step", 0.0)
+        p.setting("exact", "whether v is made tangent before unseen kicks, and 2K summed", 0.0)
         p.remember("growth", "integral of alpha over time")
         p.number("lost", "kicks that turned velocities round and lost digits")
         p.vector("w", "velocities before a kick")
@@ -173,34 +168,25 @@ class Isokinetic(Value):
             p.number(name, words)
         if self.atoms is not None:
             p.vector("share", "1 for thermostatted particles, 0 for others")
-        if p.integrator.getKineticEnergyExpression().startswith("m*u*u"):
-            p.integrator.setKineticEnergyExpression("m*u*u/2; u=v-impulse")
+        if "impulse" in p.vectors:  # of the leapfrog
+            p.kinetic_energy = "m*u*u/2; u=v-impulse"
 
-    def kick(
-        self,
-        program: Program,
-        h: str,
-        force: str,
-        impulse: str,
-        project: Callable[[], None],
-        tangent: bool,
-        unseen: bool = False,
-    ) -> str:
+    def kick(self, step: Step, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
         """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
         """
-        p, of, q = program, "" if self.atoms is None else "share*", f"{h}*{force}/m"
+        p, of, q = step.program, "" if self.atoms is None else "share*", f"{h}*{step.force}/m"
         if unseen:
-            _add_up(p, of, q, f"{of}{h}*{force}*v", project)
+            _add_up(step, of, q, f"{of}{h}*{step.force}*v")
         else:
             if impulse:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
             if impulse or not tangent:
-                project()
+                step.project()
             p.each("w", "v", "velocities before the kick")
             p.each("v", q, "kick by the applied forces alone")
-            project()
+            step.project()
             p.sum("wq", f"{of}m*w*v", "along the kick")
             p.sum("ww", f"{of}m*w*w", "2K before")
             p.sum("qq", f"{of}m*v*v", "size of the kick")
@@ -219,9 +205,6 @@ class Isokinetic(Value):
         p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")
         turned, plain = (f"keep*v+(push-keep)*{q}", "v") if unseen else ("keep*w+push*v", "w+v")
         return turned if self.atoms is None else f"select(share, {turned}, {plain})"
-
-    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
-        raise NotImplementedError
 
     # -- a run ----------------------------------------------------------------------------------
 
@@ -249,23 +232,19 @@ class Isokinetic(Value):
         momenta = self._momenta(integrator, context)
         twice = self._twice_kinetic(_count(self.atoms, integrator, context, momenta), int(np.sum(masses > 0)), found)
         turns = momenta.turns and self.temperature is not None
-        warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=6)
-        warn_of_barostat(context, self.temperature, stacklevel=5)
+        warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=7)
+        warn_of_barostat(context, self.temperature, stacklevel=6)
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())
         precision = Precision.of(context).name
-        integrator.program.write("two_k", twice)
+        integrator.program.set("two_k", twice)
         # Drifts keep the 2K of rigid bodies, and rounding is larger than what they change where it is not double.
         rigid = SystemRows.of(context.getSystem()).rigid
-        integrator.program.write("exact", float(precision == "double" and not rigid))
+        integrator.program.set("exact", float(precision == "double" and not rigid))
         if abs(found / twice - 1) > ROUNDING[precision]:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
-
-    def go_on(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Raise `InputError` for velocities that are all zero: K cannot be brought back by scaling them."""
-        _in_motion(self.atoms, integrator, context)
 
     def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if kicks have lost digits."""
@@ -312,19 +291,17 @@ class Isokinetic(Value):
             return 1.0
         return integrator.degrees_of_freedom() / (count - 1)
 
-    def settings(self) -> dict[str, float]:
-        return {}
-
     def at(self, temperature: float) -> Isokinetic:
         atoms = None if self.atoms is None else np.asarray(self.atoms)
         return Isokinetic(temperature, convention=self.convention, atoms=atoms, momentum=self.momentum)
 
     def follow(self, integrator: Integrator) -> None:
         """Kicks scale the velocities from the next step on."""
-        if integrator.getGlobalVariableByName("two_k"):
+        guard = integrator._guard
+        if guard is not None and guard.alive is not None and guard.started:
             masses = _masses(self.atoms, integrator, integrator.context)
             twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
-            integrator.program.write("two_k", twice)
+            integrator.program.set("two_k", twice)
 
     def friction(self, integrator: Integrator) -> float:
         """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
@@ -346,19 +323,19 @@ class Isokinetic(Value):
         return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)) + heat
 
 
-def _add_up(program: Program, of: str, q: str, along: str, project: Callable[[], None]) -> None:
+def _add_up(step: Step, of: str, q: str, along: str) -> None:
     """Make v w + q, and find the lengths of a kick that is not seen, without telling w and q apart.
 
     w + q is v + h f/m made tangent; what v has across the constraints the next drift absorbs. Unless `exact`, v is not
     made tangent between such kicks, and w.M.w is taken to be 2K, which drifts keep to third order (rigid bodies: to
     rounding); the length of w + q shows what it is off by, and the kick takes that back.
     """
-    p = program
+    p = step.program
     p.let("ww", "two_k", "2K before, as drifts keep it")
     with p.when("select(behind, exact, 1) != 0", "to rounding; v may have been changed by whom ever"):
         p.sum("ww", f"{of}m*v*v", "2K before")
     p.each("v", f"v+{q}", "the applied forces act")
-    project()
+    step.project()
     p.sum("wq", f"{of}m*v*v", "(w+q).M.(w+q)")
     p.sum("qq", along, "q.M.(w+q)")
     p.let("wq", "wq-qq-ww", "along the kick")
@@ -432,20 +409,6 @@ def _count(atoms: Atoms, integrator: Integrator, context: openmm.Context, moment
         raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
     integrator._watch().thermal = count
     return count
-
-
-def kelvins(temperature: unit.Quantity | float) -> float:
-    """A temperature in K, not below zero.
-
-    Raises
-    ------
-    InputError
-        It is none.
-    """
-    value = number(temperature, unit.kelvin, "temperature")
-    if not 0 <= value < math.inf:
-        raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
-    return value
 
 
 def _energy(energy: unit.Quantity | float) -> float:

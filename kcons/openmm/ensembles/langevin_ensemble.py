@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
-from kcons.openmm.integrator.ensemble import ConstantEnergy
-from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import number
+from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
+from kcons.openmm.integrator.system_checks import warn_of_barostat
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
 
 
-class Langevin(ConstantEnergy):
+class Langevin(Ensemble):
     """Canonical ensemble, for `ProjectedIntegrator(ensemble=...)`: half a kick, half a drift along the constraints,
 
         v = P (exp(-gamma h) v + sqrt((1 - exp(-2 gamma h)) kT/m) noise),    P = M_par^+ M,
@@ -90,17 +86,19 @@ class Langevin(ConstantEnergy):
         program.number("kept_share", "what friction leaves of v in a step")
         program.number("spread", "size of the noise")
 
-    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
-        p = program
+    def middle(self, step: Step, u: str) -> None:
+        p = step.program
         p.let("kept_share", "exp(-friction*dt)", "friction")
         # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
         p.let("spread", "sqrt(2*kT*kept_share*sinh(friction*dt))", "noise")
         p.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
-        project()
+        if step.parts:
+            # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
+            step.project()
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Compare with a barostat."""
-        warn_of_barostat(context, self.temperature, stacklevel=5)
+        warn_of_barostat(context, self.temperature, stacklevel=6)
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}

@@ -13,9 +13,8 @@ from kcons.constraints.arguments import finite_number, positive, refuse_other, w
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.system_checks import virtual_sites
-from kcons.openmm.quantities import masses_of
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 
 #: kJ/mol/nm^3 in bar.
 BAR = 16.6053906717
@@ -164,7 +163,7 @@ def _cells_to_whole(system: openmm.System, x: FloatArray, box: FloatArray, label
 
 def _require_on_rows(context: openmm.Context) -> None:
     """Refuse rows that molecules leave where they move as wholes."""
-    for part in getattr(getattr(context, "_integrator", None), "parts", ()):
+    for part in getattr(context.getIntegrator(), "parts", ()):
         miss = part.worst_miss(context, False)
         if miss is not None:
             raise UnsupportedError(

@@ -21,14 +21,14 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
-from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
-from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.integrator.steps import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.system_checks import forces_of
-from kcons.openmm.quantities import masses_of
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.steppers import State
+from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts, best_share
 from kcons.thermostats.freedom import drift_velocity
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
@@ -54,6 +54,54 @@ from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
 
 
+class ReversedDrifts(Ensemble):
+    """Constant energy, with the way back of each drift: see `HamiltonianMonteCarlo.reversing_integrator`.
+
+    A kick undoes itself when velocities are turned round, but for what it does across the constraints; only drifts can
+    fail to, where their projection finds another solution on the way back. So it is enough to take back drifts, which
+    costs projections and no force. Each drift begins with velocities made tangent, which does not change where it has
+    to end: so the way back is that of the step from the end, whatever its kicks do across, to the place where solvers
+    start.
+    """
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Refuse the leapfrog."""
+        if scheme is None:
+            raise UnsupportedError("the leapfrog makes no reversible steps; use 'rattle' or 'blanes-moan4'")
+
+    def declare(self, program: Program) -> None:
+        program.number("missed", "square of how far the worst way back has missed its start")
+        program.number("miss", "the same for one drift")
+        program.vector("x_begin", "where a drift begins")
+        program.vector("x_land", "where it ends")
+        program.vector("v_land", "the velocities there")
+
+    def drift(self, step: Step, h: str, u: str) -> str:
+        """The drift, taken back and made again."""
+        p = step.program
+        if step.parts:
+            raise UnsupportedError(
+                "drifts are taken back in steps without parts; give HamiltonianMonteCarlo a ProjectedIntegrator with "
+                "these parts, and it takes back whole trajectories"
+            )
+        p.each("x_begin", "x", "where the drift begins")
+        if u != "v":
+            p.each("v", u, "the velocities it begins with")
+        p.hold_velocities("the drift begins tangent to the constraints, as its way back does")
+        p.each("v", f"v+{step.flight(h, 'v')}", "the constraint forces act on v as well")
+        p.each("v_land", "v", "to come back to")
+        p.each("x_land", "x", "to come back to")
+        p.hold_velocities("the way back begins tangent to the constraints")
+        p.each("x", f"x-{h}*v", "move back freely")
+        p.hold_positions("back onto the constraints of the System")
+        p.sum("miss", "(x-x_begin)^2", "how far from where the drift began")
+        p.let("missed", "select(step(missed-miss), missed, miss)", "the worst, and what is no number")
+        p.each("x", "x_land", "where the drift ends")
+        p.hold_positions("the solver of the System takes its directions from here")
+        p.each("v", "v_land", "the velocities there")
+        return "0"
+
+
 class HamiltonianMonteCarlo:
     """Canonical sampling on the constraints without any error of the time step.
 
@@ -61,9 +109,9 @@ class HamiltonianMonteCarlo:
     of energy over kT; otherwise positions stay, and velocities turn round. The states after the proposals are samples
     of exp(-H/kT) on the constraints, for the energy that the platform computes.
 
-    With a `WaysBackIntegrator` every drift is taken back within the step, which costs no force. With a plain
-    `ProjectedIntegrator`, also one that holds parts, the whole trajectory is taken back, which takes as many forces
-    again. What cannot be taken back is rejected and counted.
+    With an integrator of `HamiltonianMonteCarlo.reversing_integrator(timestep, scheme)` every drift is taken back
+    within the step, which costs no force. With a plain `ProjectedIntegrator`, also one that holds parts, the whole
+    trajectory is taken back, which takes as many forces again. What cannot be taken back is rejected and counted.
 
     Parameters
     ----------
@@ -131,6 +179,19 @@ class HamiltonianMonteCarlo:
         if restart is not None:
             self.take(State.load(restart))
 
+    @staticmethod
+    def reversing_integrator(
+        timestep: unit.Quantity | float, scheme: str | Splitting = "rattle", **arguments: Any
+    ) -> ProjectedIntegrator:
+        """A ProjectedIntegrator without parts each of whose drifts is taken back, which costs no force.
+
+        Parameters
+        ----------
+        timestep, scheme, **arguments
+            As for `ProjectedIntegrator`.
+        """
+        return ProjectedIntegrator(timestep, scheme, ensemble=ReversedDrifts(), **arguments)
+
     # -- what a person asks for -----------------------------------------------------------------
 
     def setTemperature(self, temperature: unit.Quantity | float) -> None:
@@ -184,6 +245,7 @@ class HamiltonianMonteCarlo:
         InputError, UnsupportedError
             As for the first step of the integrator.
         """
+        self._expected = None  # forces may be others than in the last call
         for _ in range(whole_number(proposals, "proposals", 0)):
             due = [] if self.simulation is None else [r for r in self.simulation.reporters if self._next(r) == 1]
             self._propose()
@@ -234,8 +296,7 @@ class HamiltonianMonteCarlo:
         held, context = self._held, self.context
         number = self.number + 1
         guard = self.integrator._watch(context)
-        if guard.disturbed:  # positions near the constraints are brought onto them
-            guard.begin()
+        guard.enter()  # positions near the constraints are brought onto them
         x, time = positions_of(context), context.getTime()
         if math.isnan(held[POTENTIAL]) or self._others_acted(x):
             held[POTENTIAL] = self._potential()
@@ -299,8 +360,9 @@ class HamiltonianMonteCarlo:
             There is no such trajectory, or no way back.
         """
         integrator, context = self.integrator, self.context
-        if isinstance(integrator, WaysBackIntegrator):
-            integrator.forget_ways()
+        reversing = isinstance(integrator.ensemble, ReversedDrifts)
+        if reversing:
+            integrator.program.write("missed", 0.0)
         integrator.step(count)
         integrator.check(context)
         end = velocities_of(context)
@@ -308,8 +370,8 @@ class HamiltonianMonteCarlo:
         change = self._kinetic(end) - self._kinetic(v) + (potential - float(self._held[POTENTIAL]))
         if not math.isfinite(change):
             raise NonFiniteError("the energy is not finite", item="energy")
-        if isinstance(integrator, WaysBackIntegrator):
-            missed = integrator.missed()
+        if reversing:
+            missed = math.sqrt(integrator.getGlobalVariableByName("missed"))
         else:
             there, time = positions_of(context), context.getTime()
             context.setVelocities(-end)
@@ -341,15 +403,16 @@ class HamiltonianMonteCarlo:
         self._note()
 
     def _note(self) -> None:
+        self.integrator._watch().leave()
         self._expected = positions_of(self.context), self._surroundings()
 
     def _others_acted(self, x: FloatArray) -> bool:
-        """Whether positions, box, parameters or forces are not what this object left, as far as it knows."""
+        """Whether positions, box or parameters are not what this object left; forces are looked at in each call."""
         known = self._expected
         return known is None or not np.array_equal(x, known[0]) or self._surroundings() != known[1]
 
-    def _surroundings(self) -> tuple[Any, dict[str, float], int]:
-        return _box(self.context), dict(self.context.getParameters()), self.integrator.refreshed
+    def _surroundings(self) -> tuple[Any, dict[str, float]]:
+        return _box(self.context), dict(self.context.getParameters())
 
     def _next(self, reporter: Any) -> int:
         told = reporter.describeNextReport(self.simulation)
@@ -368,15 +431,14 @@ def _box(context: openmm.Context) -> Any:
 
 def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:
     integrator = context.getIntegrator()
-    integrator = getattr(context, "_integrator", integrator)
     if not isinstance(integrator, ProjectedIntegrator):
         raise UnsupportedError(
             f"{type(integrator).__name__} is no ProjectedIntegrator: make the Context or Simulation with "
-            "WaysBackIntegrator(0.009, 'blanes-moan4')"
+            "HamiltonianMonteCarlo.reversing_integrator(0.009, 'blanes-moan4')"
         )
     if integrator.scheme is None or not (integrator.scheme.reversible and integrator.scheme.symplectic):
         raise UnsupportedError(f"{integrator!r} makes no reversible steps; use 'rattle' or 'blanes-moan4'")
-    if type(integrator.ensemble) is not ConstantEnergy:
+    if not isinstance(integrator.ensemble, ConstantEnergy | ReversedDrifts):
         raise UnsupportedError(f"{integrator.ensemble!r} has no energy to accept or reject by; leave out ensemble")
     moving = [part for part in integrator.parts if part.driven]
     if moving:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,17 +10,13 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm.ensembles.barostat_temperature import warn_of_barostat
 from kcons.openmm.ensembles.conserved_momenta import Momenta, Momentum, check_momentum, conserved_momenta
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
-from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.guard import velocities_of
-from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.step_variables import use
-from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion
-from kcons.openmm.quantities import number
+from kcons.openmm.integrator.steps import Ensemble, Integrator, Step, use
+from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion, warn_of_barostat
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import warn_of_conserved_momenta
@@ -31,7 +26,7 @@ from kcons.thermostats.nose_hoover import HALF, chain_fractions
 _FASTEST = 1.4
 
 
-class NoseHoover(ConstantEnergy):
+class NoseHoover(Ensemble):
     """Canonical ensemble without noise, for `ProjectedIntegrator(ensemble=...)`: a chain that scales velocities.
 
     Half a step of the chain, a step on the constraints, half a step of the chain: the trajectory is that of
@@ -136,7 +131,7 @@ class NoseHoover(ConstantEnergy):
         p = program
         p.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", self.settings()["kT"])
         p.setting("frequency", "of the chain, 1/ps", self.frequency)
-        p.number("momenta", "g, independent momenta; 0 until the first step")
+        p.setting("momenta", "g, independent momenta; 0 until the first step", 0.0)
         for name in self._links():
             p.remember(name, "velocity of a link of the chain, 1/ps")
         p.remember("chain_place", "g times the place of the first link, and those of the others")
@@ -243,9 +238,9 @@ class NoseHoover(ConstantEnergy):
         masses, v = integrator._watch().rows.masses, velocities_of(context)
         if removes_centre_of_mass_motion(system):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
-        warn_of_conserved_momenta(masses, v, momenta.directions, momenta.turns, stacklevel=6)
-        warn_of_barostat(context, self.temperature, stacklevel=5)
-        integrator.program.write("momenta", count)
+        warn_of_conserved_momenta(masses, v, momenta.directions, momenta.turns, stacklevel=7)
+        warn_of_barostat(context, self.temperature, stacklevel=6)
+        integrator.program.set("momenta", count)
 
     def _count(self, integrator: Integrator, momenta: Momenta) -> int:
         count = integrator.independent_momenta() - len(momenta.directions)
@@ -308,7 +303,6 @@ class NoseHooverMiddle(NoseHoover):
     """
 
     owes = False
-    measures = True
 
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for all schemes but 'rattle'."""
@@ -329,10 +323,10 @@ class NoseHooverMiddle(NoseHoover):
     def close(self, program: Program) -> None:
         pass
 
-    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
-        program.each("v", u, "the constraint forces act on v as well")
-        project()
-        self._advance(program, "2")
+    def middle(self, step: Step, u: str) -> None:
+        step.program.each("v", u, "the constraint forces act on v as well")
+        step.project()
+        self._advance(step.program, "2")
 
 
 def _before(name: str) -> str:

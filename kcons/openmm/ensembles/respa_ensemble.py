@@ -1,20 +1,16 @@
-"""Several time steps in OpenMM: force groups at steps of their own, under Langevin dynamics and on spheres."""
+"""Several time steps in OpenMM: force groups at steps of their own, under Langevin dynamics."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import Any, Self
 
 import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
-from kcons.openmm.integrator.interface import Integrator
-from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.step_variables import use
+from kcons.openmm.integrator.steps import Integrator, Step
 from kcons.openmm.integrator.system_checks import groups_in, groups_of
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
@@ -22,54 +18,6 @@ from kcons.thermostats.multistep.nesting import SlowKicks, levels_of, middle_of,
 
 #: Operations of an inner step: a kick, half a drift, the bath, half a drift, forces, a kick.
 _INNER = 6
-
-
-class RespaWriter(LeanStepWriter):
-    """Writes the operations of an ensemble with several time steps, inner steps alike as loops."""
-
-    ensemble: LangevinRespa
-
-    def write(self) -> None:
-        if self.parts:
-            raise UnsupportedError(
-                f"{self.ensemble!r} holds the constraints of the System only, and no parts: use one time step, or "
-                "kcons.thermostats.LangevinRespa with forces from OpenMM"
-            )
-        p = self.program
-        use(p, "xu")
-        p.number("inner_left", "inner steps that are left")
-        self._declare_ensemble()
-        p.let_others_act()
-        done = self.operations
-        last = max(k for k, operation in enumerate(done) if isinstance(operation, Fly)) - (_INNER - 3)
-        fastest = self.ensemble.levels[-1].group
-        for block, times in _loops(done[:last], fastest):
-            if times == 1:
-                self._write_all(block)
-                continue
-            p.let("inner_left", str(times), "inner steps alike follow")
-            with p.loop("inner_left > 0", "inner steps"):
-                self._write_all(block)
-                p.let("inner_left", "inner_left-1", "one is made")
-        ends = last + _INNER - 2
-        self._write_all(done[last:ends])
-        self._note_middle("v")
-        self._write_all(done[ends:])
-        self._note_end()
-
-    def _write_all(self, operations: Sequence[Operation]) -> None:
-        p = self.program
-        for operation in operations:
-            if isinstance(operation, Kick):
-                self.ensemble.push(p, f"f{operation.group}", f"{operation.fraction!r}*dt", operation.group)
-            elif isinstance(operation, Fly):
-                for length in operation.flights:
-                    impulse = self._drift(f"({length!r}*dt)")
-                    p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
-            elif isinstance(operation, Exchange):
-                self.ensemble.exchange(p, f"{operation.fraction!r}*dt")
-            elif isinstance(operation, Project):
-                self._project()
 
 
 def _loops(operations: Sequence[Operation], fastest: str) -> Iterator[tuple[Sequence[Operation], int]]:
@@ -119,7 +67,6 @@ class LangevinRespa(Langevin):
     keeps those of one group only.
     """
 
-    writer = RespaWriter
     adds_up = False
     groups: tuple[int, ...]
     counts: tuple[int, ...]
@@ -144,12 +91,6 @@ class LangevinRespa(Langevin):
         middle_of(levels, slow_kicks)
         counts = tuple(level.steps for level in levels)
         self._keep(groups=tuple(int(level.group) for level in levels), counts=counts, slow_kicks=slow_kicks)
-
-    @classmethod
-    def of(cls, values: dict[str, Any]) -> Self:
-        rest = dict(values)
-        steps = dict(zip(rest.pop("groups"), rest.pop("counts"), strict=True))
-        return cls(**rest, steps=steps)
 
     def __repr__(self) -> str:
         steps = dict(zip(self.groups, self.counts, strict=True))
@@ -187,16 +128,35 @@ class LangevinRespa(Langevin):
         if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
             raise UnsupportedError(f"{self!r} has no virtual sites: they are placed at the end of a step; use Langevin")
 
-    def push(self, program: Program, force: str, h: str, name: str) -> None:
-        """Write a kick."""
-        program.each("v", f"v+{h}*{force}/m", f"forces of group {name} act (kick)")
+    # -- program --------------------------------------------------------------------------------
 
-    def exchange(self, program: Program, h: str) -> None:
-        """Write friction and noise for a time; the drift that follows absorbs what noise has across constraints."""
-        p = program
-        p.let("kept_share", f"exp(-friction*{h})", "friction")
-        p.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{h}))", "noise")
-        p.each("v", "kept_share*v+spread*gaussian/sqrt(m)", "friction and noise act")
+    def write(self, step: Step) -> bool:
+        """The operations of a step, inner steps alike as loops."""
+        if step.parts:
+            raise UnsupportedError(
+                f"{self!r} holds the constraints of the System only, and no parts: use one time step, or "
+                "kcons.thermostats.LangevinRespa with forces from OpenMM"
+            )
+        p = step.program
+        step.filtered = False
+        p.number("inner_left", "inner steps that are left")
+        p.let_others_act()
+        done = step.operations
+        last = max(k for k, operation in enumerate(done) if isinstance(operation, Fly)) - (_INNER - 3)
+        for block, times in _loops(done[:last], self.levels[-1].group):
+            if times == 1:
+                _write_all(step, block)
+                continue
+            p.let("inner_left", str(times), "inner steps alike follow")
+            with p.loop("inner_left > 0", "inner steps"):
+                _write_all(step, block)
+                p.let("inner_left", "inner_left-1", "one is made")
+        ends = last + _INNER - 2
+        _write_all(step, done[last:ends])
+        step.note_middle("v")
+        _write_all(step, done[ends:])
+        step.note_end()
+        return True
 
     def at(self, temperature: float) -> LangevinRespa:
         return type(self)(temperature, self.friction, dict(zip(self.groups, self.counts, strict=True)), self.slow_kicks)
@@ -206,74 +166,20 @@ class LangevinRespa(Langevin):
         return type(self)(self.temperature, friction, steps, self.slow_kicks)
 
 
-class IsokineticCircles(LangevinRespa):
-    """A stochastic isokinetic bath for each coordinate of free atoms, with several time steps.
-
-    Each mass-weighted velocity u and an auxiliary variable w keep u^2 + w^2 = k_B T, so that no kick drives an atom
-    faster than that: `IsokineticSpheres(spheres="axes", auxiliary=1)` of `kcons.thermostats` for atoms without
-    constraints. Spheres of molecules need sums over each molecule, which programs of OpenMM do not have: run these by
-    `kcons.thermostats.IsokineticSpheres`, with forces from OpenMM. Configurations only: dynamics are lost.
-
-    Parameters
-    ----------
-    temperature, friction, steps, slow_kicks
-        As for `LangevinRespa`; temperature and friction above 0.
-
-    Raises
-    ------
-    InputError
-        Temperature or friction not above 0. At the first step: the System has constraints (`UnsupportedError`).
-    """
-
-    def __init__(
-        self,
-        temperature: unit.Quantity | float,
-        friction: unit.Quantity | float,
-        steps: Mapping[int, int],
-        slow_kicks: SlowKicks = "ends",
-    ) -> None:
-        super().__init__(temperature, friction, steps, slow_kicks)
-        for name, value in (("temperature", self.temperature), ("friction", self.friction)):
-            if not value > 0:
-                raise InputError(f"{name} is {value}; circles need one above 0", item=name)
-
-    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        super().begin(integrator, context)
-        rows = context.getSystem().getNumConstraints()
-        if rows:
-            raise UnsupportedError(
-                f"{self!r} is for free atoms, and the System holds {rows} constraints: their spheres need sums over "
-                "each molecule, which programs of OpenMM do not have. Use LangevinRespa, or "
-                "kcons.thermostats.IsokineticSpheres with forces from OpenMM"
-            )
-
-    def declare(self, program: Program) -> None:
-        super().declare(program)
-        program.memory.add(program.vector("w", "auxiliary variables"))
-        program.vector("keep", "what is left of u in a kick")
-
-    def push(self, program: Program, force: str, h: str, name: str) -> None:
-        """u' = (1 - u^2/R^2) F and w' = -(u w/R^2) F in closed form, as `kcons.thermostats.multistep` has it."""
-        p = program
-        along = f"c=max(-1, min(1, sqrt(m/kT)*v*s)); s=select(step({force}), 1, -1)"
-        strength = f"z=abs({force})*{h}/sqrt(m*kT)"
-        share = "d=0.5*((1+c)+(1-c)*exp(-2*z))"
-        p.each("keep", f"exp(-z)/d; {share}; {strength}; {along}", "of the kick")
-        lead = "0.5*s*sqrt(kT/m)*((1-exp(-2*z))+c*(1-exp(-z))^2)/d"
-        p.each("v", f"keep*v+{lead}; {share}; {strength}; {along}", f"forces of group {name} turn v and w (kick)")
-        p.each("w", "keep*w", "both")
-        self._onto_circles(p)
-
-    def exchange(self, program: Program, h: str) -> None:
-        super().exchange(program, h)
-        program.each("w", "kept_share*w+spread*gaussian", "the bath acts on both")
-        self._onto_circles(program)
-
-    def _onto_circles(self, p: Program) -> None:
-        p.each("keep", "select(m*v*v+w*w, sqrt(kT/(m*v*v+w*w)), 1)", "onto the circle")
-        p.each("v", "keep*v", "onto the circle")
-        p.each("w", "keep*w", "onto the circle")
-
-    def warmth(self, integrator: Integrator) -> float:
-        """u^2 is half of k_B T on average."""
-        return 2.0
+def _write_all(step: Step, operations: Sequence[Operation]) -> None:
+    p = step.program
+    for operation in operations:
+        if isinstance(operation, Kick):
+            force, h = f"f{operation.group}", f"{operation.fraction!r}*dt"
+            p.each("v", f"v+{h}*{force}/m", f"forces of group {operation.group} act (kick)")
+        elif isinstance(operation, Fly):
+            for length in operation.flights:
+                impulse = step.drift(f"({length!r}*dt)")
+                p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        elif isinstance(operation, Exchange):
+            # The drift that follows absorbs what noise has across constraints.
+            p.let("kept_share", f"exp(-friction*{operation.fraction!r}*dt)", "friction")
+            p.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{operation.fraction!r}*dt))", "noise")
+            p.each("v", "kept_share*v+spread*gaussian/sqrt(m)", "friction and noise act")
+        elif isinstance(operation, Project):
+            step.project()

@@ -1,4 +1,4 @@
-"""Checks of an integrator on its Context, before and during a run, and the return to the last good state."""
+"""What an integrator looks at in its Context: before steps, at checks, where a call ends; and the way back."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import gc
 import logging
 import weakref
 from collections.abc import Iterable
-from itertools import chain
 from time import perf_counter
 from typing import Any
 
@@ -16,12 +15,12 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError
+from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.certificate import MOST, SHARE
-from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import SINGLE, Precision
-from kcons.openmm.integrator.step_counts import refuse_old_positions
+from kcons.openmm.integrator.program import forces_at_old_positions
+from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
@@ -45,18 +44,15 @@ _REMEDY = "let kcons hold these constraints: take them out of the System and han
 
 
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
-    """The Context that was made with this integrator, alone or within a CompoundIntegrator."""
-    address = int(integrator.this)
-    # Young objects first: it was made just now in most cases, and a process has millions of old ones.
-    for thing in chain.from_iterable(gc.get_objects(generation) for generation in range(3)):
-        if issubclass(type(thing), openmm.Context):
-            owner = getattr(thing, "_integrator", None)
-            if owner is integrator:
-                return thing
-            if isinstance(owner, openmm.CompoundIntegrator):
-                parts = (owner.getIntegrator(k) for k in range(owner.getNumIntegrators()))
-                if any(int(part.this) == address for part in parts):
-                    return thing
+    """The Context that was made with this integrator: the one that refers to it. Asked once for each Context.
+
+    OpenMM tells an integrator nothing of its Context, which has the integrator as an attribute.
+    """
+    for holder in gc.get_referrers(integrator):
+        # Attributes are a dictionary of their own where somebody has asked for it.
+        for owner in gc.get_referrers(holder) if type(holder) is dict else [holder]:
+            if issubclass(type(owner), openmm.Context) and owner.getIntegrator() is integrator:
+                return owner
     return None
 
 
@@ -182,15 +178,19 @@ class Guard:
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
         self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
+        self._size = _size(self.system)
         check_system(self.system)
         self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.constraints = SystemConstraints(context, integrator)
-        self.rows = self.constraints.rows
-        self._tell_precision()
-        refuse_old_positions(integrator, self.system, self.constraints.precision)
+        self.rows, precision = self.constraints.rows, self.constraints.precision
+        integrator.take_precision(precision)
+        self._refuse_old_positions()
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
+        for name, value in (("coarse", precision.name == "single"), ("moving", self.moving)):
+            if name in integrator.program.settings:
+                integrator.program.set(name, float(value))
         #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them, and
         #: a CMMotionRemover, to which half a kick matters where forces add up to something, on what has mass.
         applied = [force for force in forces_of(self.system) if force.getForceGroup() not in integrator.row_groups]
@@ -201,35 +201,21 @@ class Guard:
                 and (any(map(knows_a_place, applied)) or held_without_mass(self.system))
             )
         )
-        self.started = False  # whether the set-up was checked
-        #: Whether others may have moved x or v since: the next step looks where they are.
-        self.disturbed = True
+        #: Whether the start was looked at.
+        self.started = False
         #: g of the thermostat, once it is known.
         self.thermal: int | None = None
         self.since_check = 0
         self._explosive = len(self.rows.masses) * _LIGHT**2
         #: Whether the program sums squares of velocities where a call ends. Reference and CPU would make other noise,
         #: since they draw random numbers with each sum.
-        self.sums = self.constraints.precision.rounds_lengths or not integrator.ensemble.noisy
-        self._surroundings: tuple[object, ...] | None = None
+        self.sums = precision.rounds_lengths or not integrator.ensemble.noisy
         self._good: openmm.State | None = None
         #: When the last check ended, what it took, and how many were put off since.
         self._checked, self._cost, self._put_off = perf_counter(), 0.0, 0
         self._freedom: int | None = None
-        self._left: tuple[int, Any] | None = None
+        self._left: tuple[Any, ...] | None = None
         self._parameters: dict[str, float] | None = None
-
-    def begin_anew(self) -> None:
-        """Others have written the variables of the program: the next step is the first of a run."""
-        self._tell_precision()
-        self.started, self.disturbed = False, True
-
-    def _tell_precision(self) -> None:
-        """Write into the program what it has to know of the platform."""
-        integrator = self.integrator
-        integrator.take_precision(self.constraints.precision)
-        if "coarse" in integrator.program.numbers:
-            integrator.program.write("coarse", float(self.constraints.precision.name == "single"))
 
     @property
     def alive(self) -> openmm.Context | None:
@@ -245,8 +231,49 @@ class Guard:
         assert integrator is not None
         return integrator
 
+    @property
+    def late(self) -> bool:
+        """Whether velocities are those of half a step before, and on no constraints at x."""
+        return self.integrator.scheme is None
+
+    def _refuse_old_positions(self) -> None:
+        """Raise where rows would be computed at old positions."""
+        integrator, precision = self.integrator, self.constraints.precision
+        concerned = integrator.parts and precision.rounds_lengths and self.system.getNumConstraints()
+        if concerned and forces_at_old_positions(integrator.program.lines):
+            raise UnsupportedError(
+                f"{precision} computes these rows at old positions where the System has constraints as well; give "
+                "CollectiveRows meets_system=True; with constraint objects take scheme 'rattle' at constant energy or "
+                "let kcons hold all constraints (hold(system, ..., take='all', keep_water=False)); or run on the CPU "
+                "platform"
+            )
+
+    # -- calls ----------------------------------------------------------------------------------
+
+    @property
+    def knows(self) -> bool:
+        """Whether the Context is where the last call left it, as far as clock, box and size of its System tell."""
+        context = self._context()
+        if context is None or self._size != _size(self.system):
+            return False
+        return self._left is None or self._left == (context.getStepCount(), _box(context))
+
+    def enter(self) -> None:
+        """A call of `step` begins."""
+        if not self.started:
+            self.begin()
+        elif self.integrator.parts and self._parameters != dict(self.context.getParameters()):
+            self.integrator.refresh()
+
+    def leave(self) -> None:
+        """A call of `step` ends."""
+        context = self.context
+        self._left = context.getStepCount(), _box(context)
+        if self.integrator.parts:
+            self._parameters = dict(context.getParameters())
+
     def begin(self) -> None:
-        """Before the first step, and where others may have moved x or v: both on the constraints.
+        """Before the first step, and where others have moved x: x and v on the constraints, or refused.
 
         Raises
         ------
@@ -258,8 +285,14 @@ class Guard:
             What a part finds wrong.
         """
         context, integrator = self.context, self.integrator
-        x, v = positions_of(context), velocities_of(context)
+        now = context.getState(positions=True, velocities=True)
+        x, v = (np.asarray(each._value) for each in (now.getPositions(asNumpy=True), now.getVelocities(asNumpy=True)))
         _check_finite(x, v, context.getStepCount(), False)
+        if self.started:
+            integrator.refresh()
+        else:
+            # OpenMM keeps the forces of a CustomIntegrator whatever has happened to the box.
+            context.setVelocities(v)
         try:
             for part in integrator.parts:
                 part.take_place(integrator.program, context)
@@ -268,21 +301,16 @@ class Guard:
             for part in integrator.parts:
                 if not self.started:
                     part.check(context, velocities=not self.late)
-                elif not self._steered_away(part):
+                elif not part.steered:  # a context parameter moves rows, and the next drift follows
                     self._refuse(part.worst_miss(context, velocities=not self.late))
-            ensemble = integrator.ensemble
-            (ensemble.go_on if self.started else ensemble.begin)(integrator, context)
+            if not self.started:
+                integrator.ensemble.begin(integrator, context)
         except Exception:
             context.setPositions(x)
             context.setVelocities(v)
             raise
-        self.started, self.disturbed = True, False
+        self.started = True
         self._remember(context.getState(positions=True, velocities=True))
-
-    @property
-    def late(self) -> bool:
-        """Whether velocities are those of half a step before, and on no constraints at x."""
-        return self.integrator.scheme is None
 
     def _put_right(self, x: FloatArray) -> None:
         """Bring positions that are near the constraints onto them."""
@@ -296,7 +324,7 @@ class Guard:
                 item="positions",
                 atoms=self.rows.pairs[row],
             )
-        asked = [part for part in integrator.parts if not self._steered_away(part)]
+        asked = [part for part in integrator.parts if not (self.started and part.steered)]
         misses = _misses(asked, context)
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
         if not near and not np.any(miss > self.constraints.limit(x)):
@@ -313,10 +341,6 @@ class Guard:
             worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
             worst = f"the {misses[0]}" if misses else worst
             logger.warning("the start was put right: %s; particles were moved by up to %.3g nm", worst, moved)
-
-    def _steered_away(self, part: Part) -> bool:
-        """Whether a context parameter has moved the rows of a part since the last step, which is where they go then."""
-        return self.started and part.steered and self._parameters != dict(self.context.getParameters())
 
     def _refuse(self, miss: Miss | None) -> None:
         if miss is not None:
@@ -336,40 +360,12 @@ class Guard:
             # impulse, which enters the kinetic energy, is that of a smooth motion.
             off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
         else:
-            off = not self.started and bool(integrator.parts and integrator.getGlobalVariableByName("stale"))
-            off = off or self.constraints.speed_miss(positions_of(context), v) is not None
+            off = self.constraints.speed_miss(positions_of(context), v) is not None
             off = off or any(part.worst_miss(context) is not None for part in integrator.parts)
         if off:
             integrator.applyVelocityConstraints(context)
 
-    # -- between and after steps ----------------------------------------------------------------
-
-    def surroundings_changed(self) -> bool:
-        """Whether parameters or the box were changed since the last call: forces that were kept are old then."""
-        context = self.context
-        now = (dict(context.getParameters()), _box(context))
-        before, self._surroundings = self._surroundings, now
-        return before is not None and before != now
-
-    def note_surroundings(self) -> None:
-        self.surroundings_changed()
-
-    def meet_others(self) -> None:
-        """Make OpenMM compute forces anew if since the last step the box was changed, or others have made steps.
-
-        It keeps the forces of a CustomIntegrator whatever happens to the box, and whatever the other integrators of a
-        CompoundIntegrator do to x.
-        """
-        context = self.context
-        if self._left is not None and self._left != (context.getStepCount(), _box(context)):
-            context.setVelocities(velocities_of(context))
-
-    def leave(self) -> None:
-        """A call of `step` ends."""
-        context = self.context
-        self._left = context.getStepCount(), _box(context)
-        if any(part.steered for part in self.integrator.parts):
-            self._parameters = dict(context.getParameters())
+    # -- after steps ----------------------------------------------------------------------------
 
     def look(self) -> None:
         """The end of a call: whether velocities are finite and slower than light, root mean square.
@@ -385,7 +381,6 @@ class Guard:
         squares = self.integrator.getGlobalVariableByName("motion") if v is None else float(np.vdot(v, v))
         if squares <= self._explosive:
             return
-        self.disturbed = False
         context, held = self.context, self.rows.n_rows > 0
         step, v = context.getStepCount(), velocities_of(context)
         try:
@@ -421,7 +416,6 @@ class Guard:
             The Context is put back to where it was checked last.
         """
         self.since_check += steps
-        self.disturbed = False
         due = 0 < self.integrator.check_every <= self.since_check
         if not (due or ends):
             return
@@ -431,15 +425,27 @@ class Guard:
                 self._put_off += 1
                 self.since_check = 0
             return
-        self.check()
+        begun = perf_counter()
+        try:
+            self.check()
+        except (CertificateError, ConvergenceError, NonFiniteError) as error:
+            if isinstance(error, CertificateError):
+                error.state = self._good
+            self._go_back(error)
+            raise
+        self._cost = self._checked - begun
 
     def check(self) -> None:
-        """Positions and velocities finite and on all that is held, or back to where they were.
+        """Whether positions and velocities are finite and on all that is held: the state to come back to.
 
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
+
+        Raises
+        ------
+        CertificateError, ConvergenceError, NonFiniteError
         """
-        context, integrator, begun = self.context, self.integrator, perf_counter()
+        context, integrator = self.context, self.integrator
         step = context.getStepCount()
         try:
             integrator.ensemble.verify(integrator)
@@ -454,16 +460,12 @@ class Guard:
                 self.certify(miss, f"at step {step} ")
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
             error.step = step
-            if isinstance(error, CertificateError):
-                error.state = self._good
-            self._go_back(error)
             raise
         self._remember(now)
-        self._cost = self._checked - begun
 
     def _go_back(self, error: KconsError) -> None:
         """The state that was checked last, and the error says so."""
-        if not self.disturbed and self._good is not None:
+        if self._good is not None:
             self.put_back()
             good = self.context.getStepCount()
             error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
@@ -494,8 +496,9 @@ class Guard:
             context.setTime(good.getTime())
             context.setStepCount(good.getStepCount())
             self.integrator.program.recall(self._memory)
-            self.since_check, self.disturbed = 0, False
             self.integrator.refresh()
+            self.since_check = 0
+            self.leave()
 
     def explosion(self, words: str, step: int) -> NonFiniteError:
         """The error for a NaN that OpenMM met after `step`, once the state is put back."""
@@ -521,6 +524,10 @@ class Guard:
     def degrees_of_freedom(self) -> int:
         """Also less three where a CMMotionRemover acts."""
         return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+
+
+def _size(system: openmm.System) -> tuple[int, int, int]:
+    return system.getNumParticles(), system.getNumConstraints(), system.getNumForces()
 
 
 def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Miss]:

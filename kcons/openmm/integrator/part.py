@@ -86,8 +86,8 @@ class Part(ABC):
     The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
     is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
 
-    Steps after which the state is not read may end without `project` (see `lean_step_writer`): the next drift absorbs
-    what v has across the rows. The integrator sets `lean` to True before `declare` where its program has such steps.
+    Steps after which the state is not read may end without `project` (see `kcons.openmm.integrator.steps`): the next
+    drift absorbs what v has across the rows. `lean` is set to True before `declare` where a program has such steps.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
     `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.integrator.system_checks`.
@@ -152,9 +152,6 @@ class Part(ABC):
         """Serve another integrator than before; `notes` are those of its program."""
         self.forget()
         vars(self).update(notes)
-
-    def continue_from(self, before: openmm.CustomIntegrator, notes: dict[str, Any], program: Program) -> None:
-        """`before`, another member of a CompoundIntegrator with these notes, has made steps in the same Context."""
 
     @property
     def driven(self) -> bool:

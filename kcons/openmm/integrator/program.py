@@ -1,11 +1,12 @@
-"""An integrator as a list of computations, each with the words that explain it."""
+"""The program of an integrator as plain data: variables, and computations with the words that explain them."""
 
 from __future__ import annotations
 
+import re
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import openmm
@@ -13,46 +14,77 @@ import openmm
 from kcons.constraints.target import FloatArray
 
 _GIVEN = "x, v, m, f, dt: positions, velocities, masses, applied forces, time step"
+_FORCES = re.compile(r"\b(f|energy)(\d*)\b")
+#: Name of the variable that tells whether vector settings are those of this integrator.
+_SUM_OF_VECTORS = "sum_of_vectors"
 
 
-class Program:
-    """Writes the computations of a CustomIntegrator and their listing, line by line.
-
-    Parameters
-    ----------
-    integrator : openmm.CustomIntegrator
-        The computations are added to it as they are written.
+class Line(NamedTuple):
+    """One computation.
 
     Attributes
     ----------
+    kind : str
+        'let' for a global variable, 'each' for one of each degree of freedom, 'sum'; 'hold' x or v; 'others';
+        'loop', 'when' and 'end' make blocks.
+    variable, expression, words : str
+    """
+
+    kind: str
+    variable: str
+    expression: str
+    words: str
+
+    @property
+    def code(self) -> str:
+        """As `listing` shows it."""
+        match self.kind:
+            case "hold":
+                return f"constrain {'positions' if self.variable == 'x' else 'velocities'}"
+            case "others":
+                return "update context state"
+            case "loop" | "when":
+                return f"{'while' if self.kind == 'loop' else 'if'} {self.expression}:"
+            case "sum":
+                return f"{self.variable} = sum({self.expression})"
+        return f"{self.variable} = {self.expression}"
+
+
+class Program:
+    """Variables and lines of a program; `hand_over` gives them to a CustomIntegrator.
+
+    Attributes
+    ----------
+    lines : list of Line
+    numbers : dict of float
+        Global variables, and their values in a new integrator.
     settings : dict of float
-        Global variables that the integrator was made with, or was told since. They are kept here; the variables of a
-        Context are copies of them, which a State or a checkpoint may overwrite, and `push` puts right.
+        Those that the integrator was made with, or was told since. They are kept here and written at each call of
+        `step`: whatever a State or a checkpoint brings is a copy.
     idle : dict of float
-        Global variables that control the program, as they are between two calls of `step`.
+        Those that control the program, as they are where nothing is asked of it; written at each call as well.
     memory : set of str
         Variables that belong to a state as x and v do.
+    vectors : dict
+        Variables with a value for each degree of freedom; those that are settings with their values, else None.
+    tables : dict
+        Constants, written name(k) in expressions.
+    kinetic_energy : str
+        Expression of the kinetic energy that a State tells.
     """
 
     def __init__(self, integrator: openmm.CustomIntegrator) -> None:
         # Weak, for the integrator owns its program.
         self._integrator = weakref.ref(integrator)
-        self.variables: list[str] = []
-        self._lines: list[tuple[int, str, str]] = []
-        self._depth = 0
-        #: Blocks in which nothing is written yet.
-        self._unopened: list[tuple[str, str, str, str]] = []
-        self._known: set[str] = {"x", "v", "m", "f", "dt", "energy"}
-        #: Kind, variable and expression of each computation, for `count_step`; 'loop', 'when' and 'end' make blocks.
-        self.operations: list[tuple[str, str, str]] = []
-        self.tables: dict[str, tuple[float, ...]] = {}
+        self.lines: list[Line] = []
         self.numbers: dict[str, float] = {}
         self.settings: dict[str, float] = {}
         self.idle: dict[str, float] = {}
         self.memory: set[str] = set()
-        #: Variables with a value for each degree of freedom.
-        self.vectors: set[str] = set()
-        self._vectors: dict[str, FloatArray] = {}
+        self.vectors: dict[str, FloatArray | None] = {}
+        self.tables: dict[str, tuple[float, ...]] = {}
+        self.kinetic_energy = "m*v*v/2"
+        self._words: dict[str, str] = {}
 
     @property
     def integrator(self) -> openmm.CustomIntegrator:
@@ -64,22 +96,20 @@ class Program:
 
     def number(self, name: str, words: str, value: float = 0.0) -> str:
         """Declare a global variable; returns its name."""
-        if name not in self._known:
-            self._known.add(name)
-            self.integrator.addGlobalVariable(name, value)
+        if name not in self._words:
+            self._words[name] = words
             self.numbers[name] = float(value)
-            self.variables.append(f"{name}: {words}")
         return name
 
     def setting(self, name: str, words: str, value: float) -> str:
         """Declare a global variable that the integrator was made with; returns its name."""
-        if name not in self._known:
+        if name not in self._words:
             self.settings[name] = float(value)
         return self.number(name, words, value)
 
     def control(self, name: str, words: str, value: float = 0.0) -> str:
         """Declare a global variable that has this value between two calls of `step`; returns its name."""
-        if name not in self._known:
+        if name not in self._words:
             self.idle[name] = float(value)
         return self.number(name, words, value)
 
@@ -87,6 +117,131 @@ class Program:
         """Declare a global variable that belongs to a state as x and v do, 0 at first; returns its name."""
         self.memory.add(name)
         return self.number(name, words)
+
+    def vector(self, name: str, words: str) -> str:
+        """Declare a variable with a value for each degree of freedom; returns its name."""
+        if name not in self._words:
+            self._words[name] = f"{words} (each degree of freedom)"
+            self.vectors[name] = None
+        return name
+
+    def vector_setting(self, name: str, words: str, values: FloatArray) -> str:
+        """Declare a variable that the integrator was made with, values of shape (n_particles, 3); returns its name."""
+        self.vector(name, words)
+        self.vectors[name] = np.array(values, dtype=np.float64)
+        return name
+
+    def table(self, name: str, values: Sequence[float], words: str) -> str:
+        """Declare a table of constants, written name(k) in expressions; returns its name."""
+        self._words[f"{name}(k)"] = words
+        self.tables[name] = tuple(float(value) for value in values)
+        return name
+
+    # -- computations ---------------------------------------------------------------------------
+
+    def let(self, variable: str, expression: str, words: str) -> None:
+        """variable = expression for one global variable."""
+        self.lines.append(Line("let", variable, expression, words))
+
+    def each(self, variable: str, expression: str, words: str) -> None:
+        """variable = expression for each degree of freedom."""
+        self.lines.append(Line("each", variable, expression, words))
+
+    def sum(self, variable: str, expression: str, words: str) -> None:
+        """variable = sum of expression over all degrees of freedom."""
+        self.lines.append(Line("sum", variable, expression, words))
+
+    def hold_positions(self, words: str) -> None:
+        self.lines.append(Line("hold", "x", "", words))
+
+    def hold_velocities(self, words: str) -> None:
+        self.lines.append(Line("hold", "v", "", words))
+
+    def let_others_act(self) -> None:
+        """Barostats, CMMotionRemover, Andersen thermostats change the state here."""
+        self.lines.append(Line("others", "", "", "barostats and other outside agents may act"))
+
+    @contextmanager
+    def loop(self, condition: str, words: str) -> Iterator[None]:
+        """Repeat what is written inside while `condition` holds."""
+        with self._block("loop", condition, words):
+            yield
+
+    @contextmanager
+    def when(self, condition: str, words: str) -> Iterator[None]:
+        """Do what is written inside if `condition` holds; without anything inside, there is no block."""
+        with self._block("when", condition, words):
+            yield
+
+    @contextmanager
+    def _block(self, kind: str, condition: str, words: str) -> Iterator[None]:
+        self.lines.append(Line(kind, "", condition, words))
+        begun = len(self.lines)
+        yield
+        if len(self.lines) == begun:
+            self.lines.pop()
+        else:
+            self.lines.append(Line("end", "", "", ""))
+
+    # -- the integrator -------------------------------------------------------------------------
+
+    def hand_over(self) -> None:
+        """Give variables and lines to the integrator: the only place where a program of OpenMM is made."""
+        integrator = self.integrator
+        held = [values for values in self.vectors.values() if values is not None]
+        if held:
+            # Any numbers but these make another sum, but for chance.
+            total = sum(float(np.vdot(values, np.sin(np.arange(1.0, values.size + 1)))) for values in held)
+            self.setting(_SUM_OF_VECTORS, "a checksum of settings with a value for each degree of freedom", total)
+        for name, value in self.numbers.items():
+            integrator.addGlobalVariable(name, value)
+        for name, values in self.vectors.items():
+            integrator.addPerDofVariable(name, 0)
+            if values is not None:
+                integrator.setPerDofVariableByName(name, values.tolist())
+        for name, table in self.tables.items():
+            integrator.addTabulatedFunction(name, openmm.Discrete1DFunction(list(table)))
+        integrator.setKineticEnergyExpression(self.kinetic_energy)
+        add = {
+            "let": integrator.addComputeGlobal,
+            "each": integrator.addComputePerDof,
+            "sum": integrator.addComputeSum,
+            "hold": lambda x, _: (
+                integrator.addConstrainPositions() if x == "x" else integrator.addConstrainVelocities()
+            ),
+            "others": lambda *_: integrator.addUpdateContextState(),
+            "loop": lambda _, condition: integrator.beginWhileBlock(condition),
+            "when": lambda _, condition: integrator.beginIfBlock(condition),
+            "end": lambda *_: integrator.endBlock(),
+        }
+        for line in self.lines:
+            add[line.kind](line.variable, line.expression)
+
+    def set(self, name: str, value: float) -> None:
+        """Change a setting, here and in the Context."""
+        self.settings[name] = float(value)
+        self.write(name, value)
+
+    def write(self, name: str, value: float) -> None:
+        """Change a global variable in the Context only."""
+        openmm.CustomIntegrator.setGlobalVariableByName(self.integrator, name, float(value))
+
+    def push(self) -> None:
+        """Write all settings into the Context, and end what was under way there."""
+        if _SUM_OF_VECTORS in self.settings:
+            found = self.integrator.getGlobalVariableByName(_SUM_OF_VECTORS)
+            if found != self.settings[_SUM_OF_VECTORS]:
+                self.push_vectors()
+        for name, value in self.settings.items():
+            self.write(name, value)
+        for name, value in self.idle.items():
+            self.write(name, value)
+
+    def push_vectors(self) -> None:
+        """Write the settings of each degree of freedom into the Context."""
+        for name, values in self.vectors.items():
+            if values is not None:
+                self.integrator.setPerDofVariableByName(name, values.tolist())
 
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
@@ -98,158 +253,34 @@ class Program:
         for name, value in values.items():
             (self.integrator.setPerDofVariableByName if name in self.vectors else self.write)(name, value)
 
-    def vector_setting(self, name: str, words: str, values: FloatArray) -> str:
-        """Declare a variable that the integrator was made with, values of shape (n_particles, 3); returns its name."""
-        self.vector(name, words)
-        self._vectors[name] = np.array(values, dtype=np.float64)
-        self._write_vector(name)
-        return name
-
-    def vector(self, name: str, words: str) -> str:
-        """Declare a variable with a value for each degree of freedom; returns its name."""
-        if name not in self._known:
-            self._known.add(name)
-            self.vectors.add(name)
-            self.integrator.addPerDofVariable(name, 0)
-            self.variables.append(f"{name}: {words} (each degree of freedom)")
-        return name
-
-    def table(self, name: str, values: Sequence[float], words: str) -> str:
-        """Declare a table of constants, written name(k) in expressions; returns its name."""
-        self._known.add(name)
-        self.integrator.addTabulatedFunction(name, openmm.Discrete1DFunction(list(values)))
-        self.tables[name] = tuple(values)
-        self.variables.append(f"{name}(k): {words}")
-        return name
-
-    # -- settings -------------------------------------------------------------------------------
-
-    def set(self, name: str, value: float) -> None:
-        """Change a setting, here and in the Context."""
-        self.settings[name] = float(value)
-        self.write(name, value)
-
-    def write(self, name: str, value: float) -> None:
-        """Change a global variable in the Context only."""
-        openmm.CustomIntegrator.setGlobalVariableByName(self.integrator, name, float(value))
-
-    def differing(self) -> list[str]:
-        """Settings whose variables have other values: something else has written them."""
-        read = self.integrator.getGlobalVariableByName
-        return [name for name, value in self.settings.items() if read(name) != value]
-
-    def push(self) -> None:
-        """Write all settings into the Context, and end what was under way there."""
-        for name, value in (self.settings | self.idle).items():
-            self.write(name, value)
-        for name in self._vectors:
-            self._write_vector(name)
-
-    def forget(self) -> None:
-        """Put all other global variables back to what they are in a new integrator."""
-        for name, value in self.numbers.items():
-            if name not in self.settings:
-                self.write(name, value)
-
-    def _write_vector(self, name: str) -> None:
-        self.integrator.setPerDofVariableByName(name, self._vectors[name].tolist())
-
-    # -- computations ---------------------------------------------------------------------------
-
-    def let(self, variable: str, expression: str, words: str) -> None:
-        """variable = expression for one global variable."""
-        self._write("let", variable, expression, f"{variable} = {expression}", words)
-        self.integrator.addComputeGlobal(variable, expression)
-
-    def each(self, variable: str, expression: str, words: str) -> None:
-        """variable = expression for each degree of freedom."""
-        self._write("each", variable, expression, f"{variable} = {expression}", words)
-        self.integrator.addComputePerDof(variable, expression)
-
-    def sum(self, variable: str, expression: str, words: str) -> None:
-        """variable = sum of expression over all degrees of freedom."""
-        self._write("sum", variable, expression, f"{variable} = sum({expression})", words)
-        self.integrator.addComputeSum(variable, expression)
-
-    def hold_positions(self, words: str) -> None:
-        self._write("hold", "x", "", "constrain positions", words)
-        self.integrator.addConstrainPositions()
-
-    def hold_velocities(self, words: str) -> None:
-        self._write("hold", "v", "", "constrain velocities", words)
-        self.integrator.addConstrainVelocities()
-
-    def let_others_act(self) -> None:
-        """Barostats, CMMotionRemover, Andersen thermostats change the state here."""
-        self._write("others", "", "", "update context state", "barostats and other outside agents may act")
-        self.integrator.addUpdateContextState()
-
-    @contextmanager
-    def loop(self, condition: str, words: str) -> Iterator[None]:
-        """Repeat what is written inside while `condition` holds."""
-        with self._block("loop", condition, f"while {condition}:", words):
-            yield
-
-    @contextmanager
-    def when(self, condition: str, words: str, *, usual: bool = False) -> Iterator[None]:
-        """Do what is written inside if `condition` holds; without anything inside, there is no block.
-
-        `usual` tells those who count steps that it mostly does where this depends on positions.
-        """
-        with self._block("usual" if usual else "when", condition, f"if {condition}:", words):
-            yield
-
-    @contextmanager
-    def _block(self, kind: str, condition: str, code: str, words: str) -> Iterator[None]:
-        outside = len(self._unopened)
-        self._unopened.append((kind, condition, code, words))
-        yield
-        if len(self._unopened) > outside:
-            self._unopened.pop()
-            return
-        self._depth -= 1
-        self.integrator.endBlock()
-        self.operations.append(("end", "", ""))
-
-    def _write(self, kind: str, variable: str, expression: str, code: str, words: str) -> None:
-        """Note a computation, after the blocks that begin with it have been opened."""
-        pending, self._unopened = self._unopened, []
-        for block, condition, opening, why in pending:
-            begin = self.integrator.beginWhileBlock if block == "loop" else self.integrator.beginIfBlock
-            begin(condition)
-            self.operations.append((block, "", condition))
-            self._lines.append((self._depth, opening, why))
-            self._depth += 1
-        self.operations.append((kind, variable, expression))
-        self._lines.append((self._depth, code, words))
-
-    # -- running --------------------------------------------------------------------------------
-
-    def run(self, context: openmm.Context, steps: int, parts: int = 1) -> None:
-        """Make steps, each of them in so many executions of the program, of which the global `phase` is the number.
-
-        OpenMM takes each execution for a step; clock and step count are put right.
-        """
-        integrator = self.integrator
-        if parts == 1:
-            openmm.CustomIntegrator.step(integrator, steps)
-            return
-        dt = integrator.getStepSize()._value
-        for _ in range(steps):
-            time, count = context.getTime()._value, context.getStepCount()
-            self.write("phase", 1.0)
-            try:
-                openmm.CustomIntegrator.step(integrator, parts)
-            finally:
-                self.write("phase", 0.0)
-            context.setTime(time + dt)
-            context.setStepCount(count + 1)
-
-    # -- listing --------------------------------------------------------------------------------
-
     def listing(self) -> str:
         """The variables, and the steps with their words in a column beside."""
-        codes = ["    " * depth + code for depth, code, _ in self._lines]
-        width = min(max((len(code) for code in codes), default=0), 60)
-        steps = [f"  {code:<{width}}  # {words}" for code, (_, _, words) in zip(codes, self._lines, strict=True)]
-        return "\n".join(["variables", *(f"  {line}" for line in (_GIVEN, *self.variables)), "each step", *steps])
+        rows, depth = [], 0
+        for line in self.lines:
+            if line.kind == "end":
+                depth -= 1
+                continue
+            rows.append(("    " * depth + line.code, line.words))
+            depth += line.kind in ("loop", "when")
+        width = min(max((len(code) for code, _ in rows), default=0), 60)
+        steps = [f"  {code:<{width}}  # {words}" for code, words in rows]
+        known = [f"{name}: {words}" for name, words in self._words.items()]
+        return "\n".join(["variables", *(f"  {line}" for line in (_GIVEN, *known)), "each step", *steps])
+
+
+def forces_at_old_positions(lines: Sequence[Line]) -> bool:
+    """Whether GPUs compute forces at old positions where the System has constraints.
+
+    They keep what a computation makes of x as a difference, which forces do not see, until the next constraints are
+    applied to positions; where no such line follows anywhere below, x is changed at once.
+    """
+    holds = [k for k, line in enumerate(lines) if line[:2] == ("hold", "x")]
+    kept = False
+    for k, line in enumerate(lines):
+        if kept and _FORCES.search(line.expression):
+            return True
+        if line.kind == "hold" and line.variable == "x":
+            kept = False
+        elif line.kind == "each" and line.variable == "x":
+            kept = bool(holds) and k < holds[-1]
+    return False

@@ -2,34 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import functools
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from types import MethodType
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.constraints.arguments import whole_number
-from kcons.errors import InputError, KconsError, UnsupportedError
-from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
-from kcons.openmm.integrator.guard import Guard, find_context
-from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
+from kcons.constraints.arguments import positive, whole_number
+from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
+from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.precision import DOUBLE
+from kcons.openmm.integrator.precision import DOUBLE, Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import to_scheme
-from kcons.openmm.integrator.states.calls import Calls
-from kcons.openmm.integrator.states.copies import Copies
-from kcons.openmm.integrator.states.hearing import listen, listeners
-from kcons.openmm.integrator.states.outside_of_steps import OutsideOfSteps
-from kcons.openmm.integrator.states.settings import Settings, picoseconds
-from kcons.openmm.integrator.step_counts import StepCounts, count_step
-from kcons.openmm.integrator.system_checks import require_context
-from kcons.openmm.quantities import relative_tolerance
+from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.steps import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step, write_step
+from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
+from kcons.openmm.quantities import kelvins, number, relative_tolerance
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
+#: A time step in ps without a unit that is longer may be one in fs.
+_LONG = 0.02
+#: What `failed` is where others have moved x between two calls.
+_MOVED = -1
 
-class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
+_Given = ParamSpec("_Given")
+_Found = TypeVar("_Found")
+
+
+class _OfEnsembles(Generic[_Given, _Found]):
+    """A method that an integrator has where its ensemble has what it is about, as integrators of OpenMM do.
+
+    So programs can ask by `hasattr` whether there is a thermostat.
+    """
+
+    def __init__(self, method: Callable[Concatenate[Any, _Given], _Found]) -> None:
+        self.method = method
+        functools.update_wrapper(cast(Any, self), method)
+
+    def __get__(self, integrator: ProjectedIntegrator | None, owner: type | None = None) -> Callable[_Given, _Found]:
+        if integrator is None:
+            return self.method  # type: ignore[return-value]
+        what = self.method.__name__[3:].lower()
+        if self.method.__name__ != "setTemperature" or not integrator.thermostatted:
+            integrator._given(what)
+        return MethodType(self.method, integrator)
+
+
+class ProjectedIntegrator(Integrator):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -61,6 +88,15 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
     ensemble : Ensemble, optional
         How velocities change between drifts; constant energy by default.
 
+    Attributes
+    ----------
+    scheme : Splitting or None
+        None for the leapfrog.
+    parts : tuple of Part
+    row_groups : frozenset of int
+        Force groups that carry rows, not forces.
+    program : Program
+
     Raises
     ------
     InputError, UnsupportedError
@@ -73,17 +109,17 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
 
     Notes
     -----
-    A member of a CompoundIntegrator makes its steps with all its checks, as long as kcons is imported.
+    What the integrator was made with and was told since is written into its program at each call of `step`. Without
+    Python, as a member of a CompoundIntegrator or read from XML, the program makes the same steps without checks.
     """
 
     #: Steps between two checks, if nothing else is asked for, ...
     _check_every = 100
     #: ... when checks come later where they would take more than a hundredth of the time.
     spare = True
-    #: How often forces were no longer those that were known.
-    refreshed = 0
-    #: What writes the program.
-    _writer: type[LeanStepWriter] = LeanStepWriter
+    #: Of the System's constraints; None where the platform decides.
+    asked_tolerance: float | None = None
+    _guard: Guard | None = None
 
     def __init__(
         self,
@@ -100,10 +136,9 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         openmm.CustomIntegrator.setConstraintTolerance(self, self.asked_tolerance or DOUBLE.tolerance)
         if check_every is not None:
             self.check_every = check_every
-        #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
-        self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
-        if isinstance(ensemble, type) or not hasattr(self._ensemble, "check"):
+        self._ensemble = ConstantEnergy() if ensemble is None else ensemble
+        if not isinstance(self._ensemble, Ensemble):
             raise InputError(
                 f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin(temperature, friction)",
                 item="ensemble",
@@ -116,22 +151,21 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
         for k, part in enumerate(self.parts, start=1):
             part.forget()
             part.code = k
-        #: Force groups that carry rows, not forces.
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
-        self._guard: Guard | None = None
         if self.row_groups:
-            self.setIntegrationForceGroups(-1)
+            openmm.Integrator.setIntegrationForceGroups(self, set(range(32)) - self.row_groups)
         self.program = Program(self)
-        writer: type[LeanStepWriter] = getattr(self._ensemble, "writer", None) or self._writer
-        self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
-        self._plan.write()
-        self._plan.write_look()
+        self._step = Step(self.program, self.scheme, self.parts, self._ensemble)
+        write_step(self._step, self._own_step)
+        self.program.hand_over()
         #: What parts know as this integrator, and what its program has set in each.
         self.identity = object()
         self._notes = [part.notes() for part in self.parts]
         for part in self.parts:
             part.serves = self.identity
-        listen(self)
+
+    #: A kind of step of its own, see `write_step`.
+    _own_step: Callable[[Step], bool] | None = None
 
     def __repr__(self) -> str:
         scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
@@ -144,9 +178,8 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
     def listing(self) -> str:
         """What is held and how closely, the variables, and the steps of the integrator, in words."""
         held = f"constraints of the System to {self.getConstraintTolerance():g} (relative)"
-        guard = self._guard
-        if guard is not None:
-            held += f", {guard.constraints.precision}"
+        if self._guard is not None:
+            held += f", {self._guard.constraints.precision}"
         elif self.asked_tolerance is None:
             held += ", or what the precision of the Context allows"
         step = "\n".join(f"  {operation}" for operation in self.operations())
@@ -154,23 +187,77 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
 
     def operations(self) -> tuple[Operation, ...]:
         """What a step consists of, as for steppers on arrays; `listing` adds how OpenMM computes it."""
-        return self._plan.operations
+        return self._step.operations
 
-    def counts(self, *, seen: bool = True, iterations: int = 2) -> StepCounts:
-        """What a step makes OpenMM do, where all goes well.
+    # -- the Context ----------------------------------------------------------------------------
 
-        Parameters
-        ----------
-        seen : bool
-            Steps at whose end somebody looks; False for those within a call of `step`.
-        iterations : int
-            How often loops run that solve for positions.
+    @property
+    def context(self) -> openmm.Context:
+        """The Context that this integrator belongs to.
+
+        Raises
+        ------
+        UnsupportedError
+            There is none.
         """
-        lean = {"between": float(not seen), "behind": float(not seen), "lean": 1.0}
-        known = {name: value for name, value in lean.items() if name in self.program.numbers}
-        for name in {"exact", "coarse"} & set(self.program.numbers):
-            known[name] = self.getGlobalVariableByName(name)
-        return count_step(self.program, iterations=iterations, **known)
+        context = None if self._guard is None else self._guard.alive
+        if context is None and (context := find_context(self._holder)) is None:
+            raise UnsupportedError(
+                "this integrator belongs to no Context: create one with it first. Where it has one that is not found, "
+                "as a member of a CompoundIntegrator, call integrator.attach(context)"
+            )
+        return context
+
+    @property
+    def _holder(self) -> openmm.Integrator:
+        """The integrator that the Context has."""
+        return self
+
+    def attach(self, context: openmm.Context) -> None:
+        """Look at this Context, and at its System anew; done by itself but for members of a CompoundIntegrator.
+
+        Raises
+        ------
+        InputError
+            It is no Context, or that of another integrator.
+        """
+        require_context(context)
+        owner = context.getIntegrator()
+        compound = isinstance(owner, openmm.CompoundIntegrator)
+        members = [owner.getIntegrator(k) for k in range(owner.getNumIntegrators())] if compound else []
+        if owner is not self._holder and all(int(member.this) != int(self.this) for member in members):
+            raise InputError(
+                f"the Context was made with another integrator than {self!r}; give the Context of this one",
+                item="context",
+            )
+        self._guard = Guard(context, self)
+
+    def _watch(self, context: openmm.Context | None = None) -> Guard:
+        """The guard of the Context, which is a new one where the Context or its System is another."""
+        self._take_parts()
+        guard = self._guard
+        if guard is None or not guard.knows or (context is not None and context is not guard.alive):
+            self.attach(self.context if context is None else context)
+        assert self._guard is not None
+        return self._guard
+
+    def _take_parts(self) -> None:
+        """Parts that have served another integrator since serve this one again."""
+        if all(part.serves is self.identity for part in self.parts):
+            return
+        for part, notes in zip(self.parts, self._notes, strict=True):
+            part.serve(self, notes)
+            part.serves = self.identity
+        if self._guard is not None:
+            self.take_precision(self._guard.constraints.precision)
+            self._guard.started = False
+
+    def take_precision(self, precision: Precision) -> None:
+        """The Context is known: tolerances that were left open become those of its platform."""
+        if self.asked_tolerance is None:
+            openmm.CustomIntegrator.setConstraintTolerance(self, precision.tolerance)
+        for part in self.parts:
+            part.take_precision(self.program, precision)
 
     # -- running --------------------------------------------------------------------------------
 
@@ -183,77 +270,118 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
     def check_every(self, steps: int) -> None:
         self._check_every, self.spare = whole_number(steps, "check_every", 0), False
 
-    @property
-    def context(self) -> openmm.Context:
-        """The Context that this integrator belongs to.
-
-        Found by itself; set it where this fails.
+    def step(self, steps: int) -> None:
+        """Make `steps` steps.
 
         Raises
         ------
-        InputError
-            What is set is no Context, or that of another integrator.
-        UnsupportedError
-            There is none.
+        KconsError
+            A solve of one of the parts failed: positions, velocities, time and step count are those before that
+            step, `error.step` is its number. (What barostats and CMMotionRemover did at its beginning stays.) Or a
+            check failed, or a NaN appeared: they are those of the last check.
+        InputError, UnsupportedError
+            `steps` is no whole number. At the first step: the System cannot be propagated, or the start is not on the
+            constraints.
         """
-        guard = self._guard
-        context = None if guard is None else guard.alive
-        if context is None:
-            context = find_context(self)
-            if context is None:
-                raise UnsupportedError("this integrator belongs to no Context; create one with it first")
-            self.context = context
-        return context
+        steps = whole_number(steps, "steps", 0)
+        guard = self._watch()
+        guard.enter()
+        self.program.push()
+        try:
+            if "call" in self.program.numbers:
+                self.program.write("call", 1.0)
+            while steps > 0:
+                # At least one: `check_every` may have become less than what was made since the last check.
+                block = min(steps, max(self.check_every - guard.since_check, 1)) if self.check_every else steps
+                self._run_block(guard, block, block == steps)
+                guard.count(block)
+                steps -= block
+        finally:
+            if "call" in self.program.numbers:
+                self.program.write("call", 0.0)
+        guard.leave()
 
-    @context.setter
-    def context(self, context: openmm.Context) -> None:
-        if self._guard is None or self._guard.alive is not context:
-            require_context(context)
-            if not any(one is self for one in listeners(context)):
-                raise InputError(
-                    f"the Context was made with another integrator than {self!r}; give the Context of this one",
-                    item="context",
-                )
-            self._guard = Guard(context, self)
+    def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
+        """Make steps, with the shorter program for those after which the state is not read."""
+        unseen = steps - self._step.observed if self._step.lazy and not guard.in_parts else 0
+        if unseen > 0 and guard.undisturbed and not (self._step.joined and guard.moving):
+            with self._control("between"):
+                self._run(guard, unseen, False)
+            steps -= unseen
+        self._run(guard, steps, ends)
 
-    def _watch(self, context: openmm.Context | None = None) -> Guard:
-        served = [part.serves for part in self.parts if part.serves is not self.identity]
-        if served:
-            for part, notes in zip(self.parts, self._notes, strict=True):
-                part.serve(self, notes)
-                part.serves = self.identity
-        if context is None:
-            context = self.context
-        self.context = context
-        assert self._guard is not None
-        if self._written:
-            self._take_written()
-        if served:
-            self.take_precision(self._guard.constraints.precision)
-            self._guard.disturbed = True
-            for before in listeners(self._guard.context):
-                if isinstance(before, ProjectedIntegrator) and any(before.identity is one for one in served):
-                    for part, notes in zip(before.parts, before._notes, strict=True):
-                        if any(part is own for own in self.parts):
-                            part.continue_from(before, notes, self.program)
-        return self._guard
+    @contextmanager
+    def _control(self, name: str, value: float = 1.0) -> Iterator[None]:
+        """A control of the program has another value for a while."""
+        self.program.write(name, value)
+        try:
+            yield
+        finally:
+            self.program.write(name, self.program.idle[name])
+
+    def _run(self, guard: Guard, steps: int, ends: bool) -> None:
+        """Make steps; with the last of them a call may end."""
+        context, dt = guard.context, self._dt
+        time, first = context.getTime()._value, context.getStepCount()
+        before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
+        for part in self.parts:
+            part.begin_run()
+        try:
+            summed = int(ends and guard.sums)
+            self._execute(guard, steps - summed)
+            if summed:
+                with self._control("ending"):
+                    self._execute(guard, 1)
+        except openmm.OpenMMException as error:
+            guard.put_back()
+            if "NaN" not in str(error):
+                raise
+            raise guard.explosion(str(error), first) from error
+        code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
+        done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
+        # OpenMM's clock goes on with the first step size after setStepSize.
+        if code or abs(context.getTime()._value - (time + done * dt)) > 1e-6 * dt:
+            context.setTime(time + done * dt)
+        if code:
+            context.setStepCount(first + done)
+            self.program.write("failed", 0.0)
+            if code == _MOVED:
+                guard.begin()
+                self._run(guard, steps, ends)
+                return
+            guard.since_check += done
+            failure = self._failure(code, first + done + 1)
+            if "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
+                self.program.write("between", 0.0)
+                self.applyVelocityConstraints(context)
+            guard.leave()
+            raise failure
+        if ends:
+            guard.look()
+
+    def _execute(self, guard: Guard, steps: int) -> None:
+        """Run the program; each step in several executions, of which `phase` is the number, where forces need them.
+
+        OpenMM takes each execution for a step; clock and step count are put right.
+        """
+        if not guard.in_parts:
+            openmm.CustomIntegrator.step(self, steps)
+            return
+        context, dt = guard.context, self._dt
+        for _ in range(steps):
+            time, count = context.getTime()._value, context.getStepCount()
+            with self._control("phase"):
+                openmm.CustomIntegrator.step(self, self._step.phases)
+            context.setTime(time + dt)
+            context.setStepCount(count + 1)
 
     def _failure(self, code: int, step: int) -> KconsError:
-        error = self.parts[code - 1].failure(self, step)
-        self.program.write("failed", 0.0)
-        return error
+        return self.parts[code - 1].failure(self, step)
 
     def refresh(self) -> None:
-        """Compute the forces anew at the next step.
-
-        Where parts are held, forces are kept from one step to the next. What changes them is seen: positions,
-        parameters, boxes, `updateParametersInContext`.
-        """
-        self.refreshed += 1
-        if self.parts:
+        """Compute what is kept of positions anew at the next step."""
+        if "stale" in self.program.numbers:
             self.program.write("stale", 1.0)
-        if "behind" in self.program.numbers:
-            self.program.write("behind", 0.0)
 
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
@@ -266,15 +394,435 @@ class ProjectedIntegrator(OutsideOfSteps, Calls, Settings, Copies):
             What is wrong. Also a failure in a step that ran within a CompoundIntegrator.
         """
         guard = self._watch(context)
-        if self.parts:
-            code = int(self.getGlobalVariableByName("failed"))
-            if code:
-                raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
-        for part in self.parts if guard.disturbed else ():
-            part.check(guard.context, velocities=not guard.late)
-        guard.check()
+        code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
+        if code > 0:
+            self.program.write("failed", 0.0)
+            raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
         for part in self.parts:
             part.check(guard.context, velocities=not guard.late)
+        guard.check()
+
+    # -- states on constraints ------------------------------------------------------------------
+
+    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Bring positions onto all constraints, those of the parts as well.
+
+        Raises
+        ------
+        KconsError
+            They cannot be reached from here; positions are unchanged.
+        """
+        guard = self._watch(context)
+        context = guard.context
+        start, velocities = positions_of(context), velocities_of(context)
+        tolerance = self._tolerance(tolerance)
+        try:
+            guard.constraints.hold_positions(tolerance)
+            if not all(part.solves_alone for part in self.parts):
+                for part in self.parts:
+                    part.apply_positions(context)
+            elif self.parts:
+                context.setVelocities(np.zeros_like(velocities))
+                self._run_alone(guard, self._step.alone, self._step.alone + 1)
+            guard.constraints.check(positions_of(context), None)
+            for part in self.parts:
+                guard.certify(part.worst_miss(context, velocities=False))
+        except KconsError:
+            context.setPositions(start)
+            raise
+        finally:
+            context.setVelocities(velocities)
+
+    def applyVelocityConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Make velocities tangent to all constraints, those of the parts as well.
+
+        Raises
+        ------
+        KconsError
+            A part cannot do it; velocities are unchanged.
+        """
+        guard = self._watch(context)
+        context = guard.context
+        velocities, tolerance = velocities_of(context), self._tolerance(tolerance)
+        try:
+            if self.parts and all(part.solves_alone for part in self.parts):
+                self._run_alone(guard, self._step.alone, self._step.alone)
+                return
+            context.applyVelocityConstraints(tolerance)
+            for part in self.parts:
+                part.apply_velocities(context)
+        except KconsError:
+            context.setVelocities(velocities)
+            raise
+
+    def _tolerance(self, given: float | None) -> float:
+        return relative_tolerance(self.getConstraintTolerance() if given is None else given)
+
+    def _run_alone(self, guard: Guard, first: int, end: int) -> None:
+        """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
+        context = guard.context
+        if not guard.started:  # what Forces tell here is not known yet
+            for part in self.parts:
+                part.take_place(self.program, context)
+        time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
+        # Within a call, too: only its own steps begin it.
+        call = self.getGlobalVariableByName("call") if "call" in self.program.numbers else 0.0
+        self.program.push()
+        self.refresh()
+        try:
+            with self._control("first_stage", first), self._control("end_stage", end):
+                openmm.CustomIntegrator.step(self, 1)
+        finally:
+            self.program.write("good_steps", good)
+            self.refresh()
+            if call:
+                self.program.write("call", 1.0)
+            context.setTime(time)
+            context.setStepCount(count)
+        code = int(self.getGlobalVariableByName("failed"))
+        if code:
+            self.program.write("failed", 0.0)
+            raise self._failure(code, count)
+
+    def setVelocitiesToTemperature(
+        self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None
+    ) -> None:
+        """Draw velocities for a temperature (K if a float) and make them tangent to all constraints.
+
+        Context.setVelocitiesToTemperature does it for the System's own constraints, to 1e-5 only.
+
+        Raises
+        ------
+        InputError
+            A temperature below zero, a seed that is none.
+        """
+        temperature = kelvins(temperature)
+        self._watch(context)  # refuses before velocities are changed
+        arguments = (temperature,) if seed is None else (temperature, whole_number(seed, "seed", -(2**31), 2**31 - 1))
+        context.setVelocitiesToTemperature(*arguments)
+        self.applyVelocityConstraints(context)
+
+    def minimizeEnergy(
+        self,
+        context: openmm.Context | None = None,
+        tolerance: unit.Quantity | float = 10.0,
+        maxIterations: int = 0,
+    ) -> None:
+        """Minimise the energy with all constraints kept.
+
+        Without parts this is OpenMM's LocalEnergyMinimizer, followed by `applyConstraints`; OpenMM's minimiser knows
+        nothing of parts.
+
+        Parameters
+        ----------
+        tolerance : Quantity or float
+            Root mean square of the force components along the constraints, in kJ/mol/nm if a float.
+        maxIterations : int
+            0 for no limit.
+
+        Raises
+        ------
+        InputError
+            A tolerance that is not above zero, a number of iterations that is none.
+        """
+        context = self._watch(context).context
+        tolerance = positive(number(tolerance, unit.kilojoule_per_mole / unit.nanometer, "tolerance"), "tolerance")
+        maxIterations = whole_number(maxIterations, "maxIterations", 0)
+        if self.parts:
+            descend(self, context, tolerance, maxIterations)
+        else:
+            openmm.LocalEnergyMinimizer.minimize(context, tolerance, maxIterations)
+            self.applyConstraints(context)
+
+    # -- temperature that is found --------------------------------------------------------------
+
+    def degrees_of_freedom(self, context: openmm.Context | None = None) -> int:
+        """Three for each particle with a mass, less the rank of all constraints.
+
+        Also less three where a CMMotionRemover keeps the centre of mass at rest. Found at the first call.
+        """
+        return self._watch(context).degrees_of_freedom()
+
+    def independent_momenta(self, context: openmm.Context | None = None) -> int:
+        """Three for each particle with a mass, less the rank of all constraints, whatever happens to total momentum."""
+        return self._watch(context).independent_momenta()
+
+    def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
+        """As a State has it: of the velocities at x; with a bath that has noise, of those in the middle of the step.
+
+        With such a bath, and with the leapfrog, the next step computes forces anew, as after any State with energies.
+        """
+        guard = self._watch(context)
+        if self.scheme is None or self.ensemble.noisy:
+            groups = self.getIntegrationForceGroups() if self.scheme is None else 0
+            return guard.context.getState(energy=True, groups=groups).getKineticEnergy()
+        v = velocities_of(guard.context)
+        return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
+
+    def computeSystemTemperature(self) -> unit.Quantity:
+        """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it.
+
+        With `Isokinetic`, whose K does not fluctuate, the temperature of the configurations.
+
+        Raises
+        ------
+        InputError
+            No degree of freedom is left.
+        """
+        freedom = self.degrees_of_freedom()
+        if freedom <= 0:
+            raise InputError("the constraints leave no degree of freedom: there is no temperature", item="constraints")
+        warmth = self.ensemble.warmth(self)
+        return (2 * warmth * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
+
+    # -- settings -------------------------------------------------------------------------------
+
+    @property
+    def ensemble(self) -> Ensemble:
+        """How velocities change between drifts, as it is now; see `setTemperature`, `setFriction`."""
+        return self._ensemble
+
+    @property
+    def thermostatted(self) -> bool:
+        """Whether velocities change by more than forces and constraints."""
+        return type(self.ensemble) is not ConstantEnergy
+
+    @_OfEnsembles
+    def setTemperature(self, temperature: unit.Quantity | float) -> None:
+        """Change the temperature (K if a float) of the ensemble.
+
+        Raises
+        ------
+        InputError
+            It is below zero; with `Isokinetic`, zero.
+        MissingSettingError
+            At constant energy.
+        """
+        self._take(self.ensemble.at(kelvins(temperature)))
+        guard = self._guard
+        if guard is not None and guard.alive is not None and guard.started:
+            warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
+
+    @_OfEnsembles
+    def getTemperature(self) -> unit.Quantity:
+        """The temperature of the ensemble.
+
+        Raises
+        ------
+        MissingSettingError
+            It has none; so `hasattr` is False.
+        """
+        return self._given("temperature") * unit.kelvin
+
+    @_OfEnsembles
+    def setFriction(self, friction: unit.Quantity | float) -> None:
+        """Change the friction (1/ps if a float) of the ensemble.
+
+        Raises
+        ------
+        InputError
+            It is below zero.
+        MissingSettingError
+            The ensemble has none.
+        """
+        self._take(self.ensemble.with_friction(friction))
+
+    @_OfEnsembles
+    def getFriction(self) -> unit.Quantity:
+        """The friction of the ensemble.
+
+        Raises
+        ------
+        MissingSettingError
+            It has none; so `hasattr` is False.
+        """
+        return self._given("friction") / unit.picosecond
+
+    def _given(self, what: str) -> float:
+        value = getattr(self.ensemble, what, None)
+        if not isinstance(value, float):
+            name = "constant energy" if not self.thermostatted else repr(self.ensemble)
+            raise MissingSettingError(f"there is no {what} at {name}; give ensemble=Langevin(temperature, friction)")
+        return value
+
+    def _take(self, ensemble: Ensemble) -> None:
+        ensemble.follow(self)  # first, as it may refuse
+        self._ensemble = ensemble
+        for name, value in ensemble.settings().items():
+            self.program.set(name, value)
+
+    @property
+    def _dt(self) -> float:
+        return float(self.getStepSize()._value)
+
+    def setStepSize(self, size: unit.Quantity | float) -> None:
+        """Change the time step.
+
+        Raises
+        ------
+        InputError
+            It is no positive number, or more than the ensemble can follow.
+
+        Warns
+        -----
+        UserWarning
+            It is above 20 fs and has no unit.
+        """
+        dt = picoseconds(size)
+        self.ensemble.check_timestep(dt)
+        super().setStepSize(dt)
+
+    def setConstraintTolerance(self, tol: float) -> None:
+        """Change the relative tolerance of the System's constraints.
+
+        One that was left open stays so where it is set to what an integrator without a Context, or this one, has.
+
+        Raises
+        ------
+        InputError
+            It is not between 0 and 1.
+        """
+        wanted = relative_tolerance(tol)
+        if self.asked_tolerance is None and wanted in (DOUBLE.tolerance, self.getConstraintTolerance()):
+            return
+        self.asked_tolerance = wanted
+        super().setConstraintTolerance(wanted)
+
+    def setGlobalVariableByName(self, name: str, value: float) -> None:
+        """Set a variable of the program.
+
+        Raises
+        ------
+        UnsupportedError
+            It is a setting, which has a method of its own.
+        """
+        if name in self.program.settings:
+            raise UnsupportedError(
+                f"{name} is a setting of the integrator: use setTemperature, setFriction, or set_target of a part"
+            )
+        super().setGlobalVariableByName(name, value)
+
+    def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
+        """Choose the force groups that act; groups that carry rows never do.
+
+        Parameters
+        ----------
+        groups : int or iterable of int
+            A bit mask or group numbers. -1 and all 32 groups mean: all but the groups of rows.
+
+        Raises
+        ------
+        InputError
+            Groups that carry rows are among those given; what is no number of a group.
+        UnsupportedError
+            The Context exists; it has read the groups and would ignore the change.
+        """
+        if self._guard is not None or find_context(self._holder) is not None:
+            raise UnsupportedError("the Context has read the force groups already; set them before it is created")
+        if isinstance(groups, int | np.integer):
+            wanted = {g for g in range(32) if (int(groups) >> g) & 1}
+        elif isinstance(groups, Iterable) and not isinstance(groups, str):
+            wanted = {whole_number(group, "force group", 0, 31) for group in groups}
+        else:
+            raise InputError(f"groups is {groups!r}; give numbers of force groups, such as {{0, 1}}", item="groups")
+        rows = self.row_groups
+        if len(wanted) == 32:
+            wanted -= rows
+        if wanted & rows:
+            raise InputError(
+                f"force groups {sorted(wanted & rows)} carry constraint rows, their forces are gradients and must not "
+                "act; leave them out",
+                item="groups",
+            )
+        super().setIntegrationForceGroups(wanted)
+
+    # -- copies ---------------------------------------------------------------------------------
+
+    @classmethod
+    def from_xml(cls, xml: str, scheme: str | Splitting = "rattle", **arguments: Any) -> Self:
+        """The integrator whose program XmlSerializer has written, with the time step, tolerance and seed of the file.
+
+        Parameters
+        ----------
+        xml : str
+            The text of the file.
+        scheme, **arguments
+            With which it was made: no file contains parts and ensembles.
+
+        Raises
+        ------
+        InputError
+            The file has another program.
+        """
+        plain = openmm.XmlSerializer.deserialize(xml)
+        made = cls(plain.getStepSize(), scheme, **{"tolerance": plain.getConstraintTolerance(), **arguments})
+        if not isinstance(plain, openmm.CustomIntegrator) or _computations(plain) != _computations(made):
+            raise InputError(
+                f"the file has another program than {made!r}; give the scheme, ensemble and parts it was made with",
+                item="integrator",
+            )
+        made.setRandomNumberSeed(plain.getRandomNumberSeed())
+        openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
+        return made
+
+    def _making(self) -> tuple[Any, ...]:
+        scheme = LEAPFROG if self.scheme is None else self.scheme
+        every = None if self.spare else self.check_every
+        made_with = (self.getStepSize(), scheme, self.parts, self.asked_tolerance, every, self.ensemble)
+        program = self.program
+        # What belongs to a state or a step a copy starts without; clocks of targets that move go by the good steps.
+        left = {*program.settings, *program.idle, *program.memory, *VARIABLES} - {"good_steps"}
+        run = {name: self.getGlobalVariableByName(name) for name in program.numbers if name not in left}
+        return made_with, program.settings, run, self.getIntegrationForceGroups(), self.getRandomNumberSeed()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (type(self), *self._making())
+
+    def __copy__(self) -> Self:
+        """Without the Context, and with copies of the parts; rows of `hold`, which the System has, are shared."""
+        return cast(Self, _remade(type(self), *deepcopy(self._making())))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.__copy__()
+
+
+def _remade(
+    kind: type[ProjectedIntegrator],
+    made_with: tuple[Any, ...],
+    settings: dict[str, float],
+    run: dict[str, float],
+    groups: int,
+    seed: int,
+) -> ProjectedIntegrator:
+    dt, scheme, parts, tolerance, check_every, ensemble = made_with
+    made = kind(dt, scheme, parts=parts, tolerance=tolerance, check_every=check_every, ensemble=ensemble)
+    made.setRandomNumberSeed(seed)
+    openmm.Integrator.setIntegrationForceGroups(made, groups)
+    for name, value in settings.items():
+        made.program.set(name, value)
+    made.program.recall(run)
+    return made
+
+
+def _computations(integrator: openmm.CustomIntegrator) -> list[tuple[Any, ...]]:
+    return [tuple(integrator.getComputationStep(k)) for k in range(integrator.getNumComputations())]
+
+
+def picoseconds(timestep: Any) -> float:
+    """A time step; a long one without a unit, which may be meant in fs, draws a warning where the caller was called."""
+    dt = number(timestep, unit.picosecond, "timestep")
+    if not (np.isfinite(dt) and dt > 0):
+        raise InputError(
+            f"the time step is {timestep}; give a positive one; to go back in time, reverse the velocities",
+            item="timestep",
+        )
+    if dt > _LONG and not unit.is_quantity(timestep):
+        warnings.warn(
+            f"the time step is {dt:g} ps, that is {dt * 1e3:g} fs: is it meant in fs? Give it with its unit, "
+            f"{dt:g} * unit.femtoseconds or {dt:g} * unit.picoseconds",
+            stacklevel=3,
+        )
+    return dt
 
 
 def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:

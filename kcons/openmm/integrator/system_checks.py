@@ -6,6 +6,7 @@ velocities, independently of it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -18,8 +19,8 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 
@@ -386,8 +387,7 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
             f"{where}: {platform} places virtual sites at the end of a program only, and beside parts= steps of "
             f"several drifts ({integrator.scheme!r}) are not made in parts; use scheme='rattle'"
         )
-    owner = getattr(context, "_integrator", integrator)
-    if late and isinstance(owner, openmm.CompoundIntegrator) and not getattr(owner, "closed", False):
+    if late and type(context.getIntegrator()) is openmm.CompoundIntegrator:
         raise UnsupportedError(
             f"{where}: {platform} places virtual sites at the end of a program only, and within a CompoundIntegrator "
             "OpenMM runs it as a whole, with forces of sites that are one step old. Use scheme='leapfrog', or the "
@@ -429,4 +429,23 @@ def refuse_barostat(context: openmm.Context, rows: Iterable[Sequence[int]], kind
                 f"{kind} on particles {', '.join(map(str, atoms[:6]))}{', ...' if len(atoms) > 6 else ''} {what}; "
                 f"{names.pop()} moves whole molecules and would break it. Run at constant volume, or join the "
                 "molecules by bonds of no strength"
+            )
+
+
+#: Relative difference of two temperatures that is taken for rounding.
+_ROUNDING = 1e-6
+
+
+def warn_of_barostat(context: openmm.Context, temperature: float | None, stacklevel: int) -> None:
+    """Warn where a barostat judges its trials by another temperature (K) than the thermostat keeps, if there is one."""
+    for force in forces_of(context.getSystem()) if temperature is not None else ():
+        if type(force).__name__ not in BAROSTATS:
+            continue
+        name = type(force).Temperature()
+        found = float(context.getParameter(name))
+        if abs(found - temperature) > _ROUNDING * temperature:
+            warnings.warn(
+                f"the {type(force).__name__} has a temperature of {found:g} K, and the integrator one of "
+                f"{temperature:g} K: volumes belong to neither. Call context.setParameter({name!r}, {temperature:g})",
+                stacklevel=stacklevel,
             )

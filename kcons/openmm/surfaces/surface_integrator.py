@@ -16,13 +16,12 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.states.settings import picoseconds
+from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
 from kcons.openmm.quantities import accepted, nanometers
 from kcons.openmm.surfaces.closed_forms import QUADRICS, CompiledQuadricRows, QuadricRows, TorusRows
 from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
 from kcons.openmm.surfaces.surface_rows import CARRIER, SurfaceRows, engine, positions_and_velocities, refuse_system
-from kcons.openmm.surfaces.surface_step_writer import SurfaceStepWriter
+from kcons.openmm.surfaces.surface_steps import surface_step
 from kcons.steppers import Splitting
 
 AnySurface: TypeAlias = Constraint | ExpressionSurface
@@ -126,8 +125,7 @@ class SurfaceIntegrator(ProjectedIntegrator):
         See `surface_parts` and `ProjectedIntegrator`.
     """
 
-    _writer = SurfaceStepWriter
-    _plan: SurfaceStepWriter
+    _own_step = staticmethod(surface_step)
 
     def __init__(
         self,

@@ -31,7 +31,7 @@ MUTANTS = [
         "openmm/integrator/states/settings.py",
         "differing = self.program.differing()",
         "differing = []",
-        "tests/openmm/integrator/states/test_settings.py::test_a_setting_that_was_written_by_its_number_is_refused_once",
+        "openmm_runs.py::test_a_setting_that_was_written_by_its_number_is_refused_once",
     ),
     (
         "openmm/integrator/system_checks.py",
@@ -288,7 +288,7 @@ MUTANTS = [
         "openmm/callback_rows/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",
-        "tests/openmm/integrator/states/test_settings.py::test_a_run_goes_on_bit_for_bit",
+        "openmm_runs.py::test_a_run_goes_on_bit_for_bit",
     ),
     (
         "openmm/callback_rows/carried_constraints.py",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
 from dataclasses import replace
@@ -10,16 +11,18 @@ from functools import cache
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import twice_kinetic
+from ensemble_runs import twice_kinetic, warm
 from openmm import app, unit
-from openmm_systems import GPUS, context_of, loose_alanine, potential_energy, state_of, water_box
+from openmm_systems import GPUS, alanine, context_of, loose_alanine, potential_energy, started, state_of, water_box
 
 from kcons.constraints import Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, WaysBackIntegrator, hold
+from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import exchange
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import ACCEPTED, POTENTIAL, PROPOSAL, SIZE, stream
+
+reversing = HamiltonianMonteCarlo.reversing_integrator
 
 
 @cache
@@ -32,7 +35,7 @@ def relaxed(n):
     return state_of(context)[0]
 
 
-def waters(dt=0.004, scheme="rattle", kind=WaysBackIntegrator, platform="Reference", n=8, steps=(2, 5), **options):
+def waters(dt=0.004, scheme="rattle", kind=reversing, platform="Reference", n=8, steps=(2, 5), **options):
     system, _ = water_box(n)
     integrator = kind(dt * unit.picosecond, scheme)
     context = context_of(system, integrator, platform)
@@ -77,8 +80,8 @@ def test_every_decision_follows_from_the_energies():
     ("platform", "kind", "near"),
     [
         ("Reference", ProjectedIntegrator, 1e-6),
-        ("CPU", WaysBackIntegrator, 0.05),
-        *(pytest.param(*p.values, WaysBackIntegrator, 1e-3, id=p.id, marks=p.marks) for p in GPUS[-1:]),
+        ("CPU", reversing, 0.05),
+        *(pytest.param(*p.values, reversing, 1e-3, id=p.id, marks=p.marks) for p in GPUS[-1:]),
     ],
 )
 def test_platforms_and_ways_back_make_one_chain(platform, kind, near):
@@ -92,7 +95,7 @@ def test_platforms_and_ways_back_make_one_chain(platform, kind, near):
     np.testing.assert_allclose(state_of(b.context)[0], state_of(a.context)[0], atol=0.01 * near)
 
 
-@pytest.mark.parametrize("kind", [WaysBackIntegrator, ProjectedIntegrator])
+@pytest.mark.parametrize("kind", [reversing, ProjectedIntegrator])
 def test_what_cannot_be_taken_back_is_rejected(kind):
     _, sampler = waters(0.03, kind=kind, steps=1)
     start = state_of(sampler.context)[0]
@@ -140,7 +143,10 @@ def test_reporters_of_a_simulation_see_every_proposal():
         for name in ("O", "H", "H"):
             topology.addAtom(name, app.Element.getBySymbol(name), residue)
     simulation = app.Simulation(
-        topology, system, WaysBackIntegrator(0.005), openmm.Platform.getPlatformByName("Reference")
+        topology,
+        system,
+        HamiltonianMonteCarlo.reversing_integrator(0.005),
+        openmm.Platform.getPlatformByName("Reference"),
     )
     simulation.context.setPositions(x)
     sampler = HamiltonianMonteCarlo(simulation, 300 * unit.kelvin, 3, 5)
@@ -168,7 +174,7 @@ def trimer(steps=(3, 8), dt=0.15, spring=0.0, **options):
         for k in range(3):
             force.addParticle(k)
         system.addForce(force)
-    integrator = WaysBackIntegrator(dt * unit.picosecond)
+    integrator = HamiltonianMonteCarlo.reversing_integrator(dt * unit.picosecond)
     context = context_of(system, integrator)
     context.setPositions(np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
     return HamiltonianMonteCarlo(context, 1 / GAS_CONSTANT, steps, 21, **options)
@@ -301,17 +307,17 @@ def test_bad_input_changes_nothing():
         ({"tolerance": 0.0}, "tolerance is 0.0"),
     ):
         with pytest.raises(InputError, match=words):
-            sampler(WaysBackIntegrator(1e-3), **options)
+            sampler(HamiltonianMonteCarlo.reversing_integrator(1e-3), **options)
     for integrator, others, words in (
         (openmm.VerletIntegrator(1e-3), (), "is no ProjectedIntegrator"),
         (ProjectedIntegrator(1e-3, "leapfrog"), (), "makes no reversible steps"),
         (ProjectedIntegrator(1e-3, ensemble=Langevin(300.0, 1.0)), (), "leave out ensemble"),
-        (WaysBackIntegrator(1e-3), (openmm.CMMotionRemover(),), "removeCMMotion=False"),
-        (WaysBackIntegrator(1e-3), (openmm.AndersenThermostat(300, 1),), "AndersenThermostat"),
+        (HamiltonianMonteCarlo.reversing_integrator(1e-3), (openmm.CMMotionRemover(),), "removeCMMotion=False"),
+        (HamiltonianMonteCarlo.reversing_integrator(1e-3), (openmm.AndersenThermostat(300, 1),), "AndersenThermostat"),
     ):
         with pytest.raises(UnsupportedError, match=words):
             sampler(integrator, others)
-    good = sampler(WaysBackIntegrator(1e-3))
+    good = sampler(HamiltonianMonteCarlo.reversing_integrator(1e-3))
     for wanted, proposals, words in ((1.5, 20, "wanted is 1.5"), (0.8, 3, "proposals is 3")):
         with pytest.raises(InputError, match=words):
             good.tune(wanted, proposals)
@@ -326,7 +332,7 @@ def test_an_energy_that_is_not_finite_is_an_error():
     force.addParticle(0)
     system = openmm.XmlSerializer.clone(sampler.context.getSystem())
     system.addForce(force)
-    context = context_of(system, WaysBackIntegrator(0.01))
+    context = context_of(system, HamiltonianMonteCarlo.reversing_integrator(0.01))
     context.setPositions(state_of(sampler.context)[0])
     with pytest.raises(NonFiniteError, match="potential energy is nan"):
         HamiltonianMonteCarlo(context, 300, 2, 1).step(1)
@@ -350,3 +356,90 @@ def test_numbers_of_proposals(proposals):
     _, sampler = waters()
     with pytest.raises(InputError, match="proposals"):
         sampler.step(proposals)
+
+
+# -- drifts that are taken back -----------------------------------------------------------------------
+
+
+def missed(integrator):
+    """How far the worst way back has missed its start: root of the sum over particles, in nm."""
+    return integrator.getGlobalVariableByName("missed") ** 0.5
+
+
+@pytest.mark.parametrize(("scheme", "dt"), [("rattle", 2e-3), ("geodesic", 2e-3), ("blanes-moan4", 4e-3)])
+def test_steps_are_those_of_the_plain_integrator(scheme, dt):
+    system, x, v = alanine()
+    ends = []
+    for kind in (ProjectedIntegrator, reversing):
+        integrator = kind(dt, scheme, tolerance=1e-13)
+        ends.append(_after(system, integrator, x, v, 10))
+    np.testing.assert_allclose(ends[1][0], ends[0][0], atol=1e-11)
+    np.testing.assert_allclose(ends[1][1], ends[0][1], atol=1e-8)
+    assert 0 < missed(integrator) < 1e-11
+
+
+def _after(system, integrator, x, v, steps):
+    context = started(system, integrator, x, v)
+    integrator.step(steps)
+    return state_of(context)
+
+
+def test_the_way_back_of_a_large_step_is_not_finite():
+    """Waters that turn by more than SETTLE can take back."""
+    system, x = water_box(8)
+    for dt in (0.002, 0.03):
+        integrator = reversing(dt * unit.picosecond, check_every=0)
+        context = context_of(system, integrator)
+        context.setPositions(x)
+        integrator.setVelocitiesToTemperature(context, 600, 3)
+        if dt < 0.01:
+            integrator.step(1)
+            assert missed(integrator) < 1e-12
+            continue
+        with pytest.raises(NonFiniteError):
+            integrator.step(1)
+        assert not missed(integrator) < 1e-3
+
+
+def test_what_is_taken_back_is_so_by_the_step_from_its_end():
+    """Also where a kick pushes so far across a constraint that the solver, from there, finds the other end of it."""
+    system, length, h = openmm.System(), 0.1, 0.1
+    for mass in (1e9, 1.0):
+        system.addParticle(mass)
+    system.addConstraint(0, 1, length)
+    push = openmm.CustomExternalForce("f*x")
+    push.addGlobalParameter("f", 2.6 * length / h**2)  # 1.3 lengths in a step
+    push.addParticle(1)
+    system.addForce(push)
+    integrator = reversing(h * unit.picosecond)
+    context = context_of(system, integrator)
+    begun = np.array([[0.0, 0, 0], [0, length, 0]])
+    context.setPositions(begun)
+    context.setVelocities([[0.0, 0, 0], [2.166 * length / h, 0, 0]])
+    integrator.step(1)
+    x, v = state_of(context)
+    assert missed(integrator) < 1e-9
+    assert x[1, 0] > 0.8 * length
+    integrator.setGlobalVariableByName("missed", 0.0)
+    context.setPositions(x)
+    context.setVelocities(-v)
+    integrator.step(1)
+    assert missed(integrator) < 1e-9
+    np.testing.assert_allclose(state_of(context)[0], begun, atol=1e-6)
+
+
+def test_parts_and_the_leapfrog_are_refused():
+    system, x, _ = alanine()
+    with pytest.raises(UnsupportedError, match="takes back whole trajectories"):
+        reversing(1e-3, parts=[hold(system, [], positions=x, take="all")])
+    with pytest.raises(UnsupportedError, match="no reversible steps"):
+        reversing(1e-3, "leapfrog")
+
+
+def test_copies_take_their_drifts_back():
+    copied = copy.deepcopy(reversing(2e-3, "blanes-moan4"))
+    system, x = water_box(8)
+    context = warm(system, copied, x, 1)
+    copied.step(1)
+    assert context.getStepCount() == 1
+    assert 0 < missed(copied) < 1e-12

@@ -21,7 +21,7 @@ from openmm_systems import (
     state_of,
 )
 
-from kcons.constraints import Dihedral, Distance, Plane, Sphere
+from kcons.constraints import Dihedral, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.openmm import (
     CollectiveRows,
@@ -44,26 +44,43 @@ PS = unit.picosecond
 # -- its Context ------------------------------------------------------------------------------------
 
 
-def test_finds_its_context():
+@kinds
+def test_finds_its_context(kind):
     system, x, v = dumbbell()
-    first, second = ProjectedIntegrator(1e-3), ProjectedIntegrator(1e-3)
+    first, second, third = (kind(1e-3) for _ in range(3))
     with pytest.raises(UnsupportedError, match="belongs to no Context"):
         first.step(1)
-    contexts = [started(system, integrator, x, v) for integrator in (first, second)]
-    assert first.context is contexts[0]
-    assert second.context is contexts[1]
-    third = ProjectedIntegrator(1e-3)
-    context = started(system, third, x, v)
-    third.context = context
+    contexts = [started(system, integrator, x, v) for integrator in (first, second, third)]
+    vars(contexts[1])  # attributes are a dictionary of their own then
+    for k, integrator in enumerate((first, second, third)):
+        assert integrator.context is contexts[k]
+    with pytest.raises(InputError, match="another integrator"):
+        first.attach(contexts[1])
+    third.attach(contexts[2])
     third.step(1)
-    assert context.getStepCount() == 1
-    del context
+    assert contexts[2].getStepCount() == 1
+    contexts.pop()
     with pytest.raises(UnsupportedError, match="belongs to no Context"):
         third.step(1)
 
 
+def test_the_context_is_looked_for_once(monkeypatch):
+    system, x, v = dumbbell()
+    asked, find = [], guard.gc.get_referrers
+    monkeypatch.setattr(guard.gc, "get_referrers", lambda *given: asked.append(1) or find(*given))
+    context = started(system, integrator := ProjectedIntegrator(1e-3), x, v)
+    for _ in range(3):
+        integrator.step(2)
+        integrator.degrees_of_freedom()
+        integrator.check()
+    assert len(asked) <= 3 and context.getStepCount() == 6
+    asked.clear()
+    integrator.step(2)
+    assert not asked
+
+
 def test_compound_integrator():
-    """OpenMM runs the program; checks are to be called for. A step called directly has them."""
+    """OpenMM runs the bare program; checks and steps of its own are to be had once it knows the Context."""
     system, x, v = alanine()
     alone = ProjectedIntegrator(1e-3)
     lonely = started(system, alone, x, v)
@@ -72,10 +89,12 @@ def test_compound_integrator():
     compound.addIntegrator(ours)
     compound.addIntegrator(other)
     context = started(system, compound, x, v)
-    assert ours.context is context
+    with pytest.raises(UnsupportedError, match=r"call integrator\.attach"):
+        ours.step(1)
     compound.step(10)
+    ours.attach(context)
     ours.check()
-    np.testing.assert_array_equal(state_of(context), state_of(lonely))
+    np.testing.assert_allclose(state_of(context), state_of(lonely), rtol=0, atol=1e-9)
     assert ours.degrees_of_freedom() == alone.degrees_of_freedom()
     compound.setCurrentIntegrator(1)
     compound.step(2)
@@ -84,16 +103,18 @@ def test_compound_integrator():
     assert context.getStepCount() == 14
 
 
-def test_compound_integrator_tells_of_failures():
+def test_a_member_of_a_compound_integrator_stops_where_a_part_fails():
+    """Nothing moves from there on, and `check` tells."""
     system, x, v = loose_alanine()
-    v[0, 2] = 0.0  # tangent: nothing is put right at the start
     compound, ours = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3, parts=[holding(steepest=-1.0)])
     compound.addIntegrator(ours)
     context = started(system, compound, x, v)
     before = state_of(context)
-    with pytest.raises(ConvergenceError, match="too steep"):
-        compound.step(5)
+    compound.step(5)
     np.testing.assert_array_equal(state_of(context), before)
+    ours.attach(context)
+    with pytest.raises(ConvergenceError, match="too steep"):
+        ours.check()
 
 
 # -- the start --------------------------------------------------------------------------------------
@@ -465,27 +486,3 @@ def test_the_leapfrog_comes_back_with_its_kinetic_energy():
     integrator.setStepSize(1e-3)
     assert context.getStepCount() == 10
     assert context.getState(energy=True).getKineticEnergy() == kinetic
-
-
-def test_rows_that_another_member_has_left_are_looked_at():
-    """They were pulled back by the first drift, and velocities took up the way."""
-    x = np.array([[0.0, 0, 0], [0.15, 0, 0], [0.15, 0.15, 0]])
-    system, springs = openmm.System(), openmm.HarmonicBondForce()
-    for _ in x:
-        system.addParticle(12.0)
-    springs.addBond(0, 1, 0.15, 1e4)
-    springs.addBond(1, 2, 0.15, 1e4)
-    system.addForce(springs)
-    rows = hold(system, Distance([[0, 2]]), x)
-    compound = openmm.CompoundIntegrator()
-    compound.addIntegrator(ProjectedIntegrator(1e-3, parts=[rows]))
-    compound.addIntegrator(openmm.VerletIntegrator(1e-3))
-    context = started(system, compound, x, 0.5 * np.random.default_rng(3).normal(size=(3, 3)))
-    compound.step(5)
-    compound.setCurrentIntegrator(1)
-    compound.step(400)
-    compound.setCurrentIntegrator(0)
-    off = abs(np.linalg.norm(np.subtract(*state_of(context)[0][[0, 2]])) / np.linalg.norm(x[0] - x[2]) - 1)
-    assert off > 0.1
-    with pytest.raises(InputError, match="What moved them does not know the rows"):
-        compound.step(1)

@@ -29,9 +29,7 @@ from openmm_systems import (
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Isokinetic, ProjectedIntegrator
-from kcons.openmm.integrator.states.copies import program_of
 from kcons.openmm.integrator.system_checks import refuse_barostat
-from kcons.steppers import Geodesic
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 PS = unit.picosecond
@@ -70,17 +68,6 @@ def test_units_and_arguments():
         part.meets_system = True
     with pytest.raises(UnsupportedError, match="only one part"):
         ProjectedIntegrator(0.001, parts=meeting)
-
-
-def test_any_splitting_is_a_scheme():
-    system, x, v = alanine()
-    by_name, by_object = ProjectedIntegrator(1e-3, "geodesic"), ProjectedIntegrator(1e-3, Geodesic(8))
-    assert program_of(by_name) == program_of(by_object)
-    a, b = (started(system, integrator, x, v) for integrator in (by_name, by_object))
-    by_name.step(5)
-    by_object.step(5)
-    np.testing.assert_array_equal(state_of(a), state_of(b))
-    assert "Geodesic(substeps=3)" in repr(ProjectedIntegrator(1e-3, Geodesic(3)))
 
 
 # -- barostats, thermostats, centre of mass ----------------------------------------------------------

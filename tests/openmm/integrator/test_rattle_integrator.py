@@ -171,7 +171,6 @@ def _updated(context, integrator):
     force = next(f for f in context.getSystem().getForces() if isinstance(f, openmm.CustomBondForce))
     force.setBondParameters(0, 0, 1, [4.0])
     force.updateParametersInContext(context)
-    integrator.refresh()
 
 
 @pytest.mark.parametrize("change", [_warmer, _elsewhere, _stronger, _finer, _updated])

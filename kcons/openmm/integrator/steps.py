@@ -1,0 +1,793 @@
+"""One step of an integrator: a function for each kind of step, and what an ensemble puts into it.
+
+What begins and ends a step, and what may be left out of it, goes by a few variables:
+
+- `between` is 1 for all steps of a call but the last ones. A step after which nobody looks at the velocities may end
+  without the second half of its kick and without a projection; it says so in `behind`, and the next makes up for it.
+- `call` is 1 where a call of `step` begins and 2 afterwards. Forces are kept in a variable within a call only. Where it
+  is 0, which is so without Python, they are computed in each step.
+- `failed` is the number of the part whose solve failed; -1 asks Python to look at positions that others have moved.
+  Nothing moves then until Python has read it. Of a step that failed x and v go back to `x_last` and `v_last`; what is
+  kept of x is computed anew (`stale`), and `loose` says that v is not tangent.
+- `ending` is 1 in the last step of a call, which sums `motion` for `Guard.look`.
+- `phase` is other than 0 where virtual sites are placed at the end of an execution of the program only: each execution
+  is then the part of a step from one force evaluation to the next, and counts on by itself.
+- `first_stage` and `end_stage` are other than 0 and the number of drifts only while constraints are applied outside of
+  steps: then the program starts at a drift without kicks, or behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import openmm
+
+from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import operations_of, stages_of
+from kcons.steppers.operations import Exchange, Operation
+from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Splitting
+
+#: Schemes whose shortest drifts are less than this part of a step: what rounding does to x, divided by the length of
+#: the drift, must be kept out of v there.
+SHORT_DRIFT = 1 / 30
+
+
+class Variable(NamedTuple):
+    """What a name in a program stands for."""
+
+    kind: str
+    words: str
+    value: float = 0.0
+
+
+VARIABLES = {
+    "phase": Variable("control", "0 for a whole step; else the number of the part of it that is made"),
+    "stage": Variable("number", "number of the drift"),
+    "stop": Variable("number", "the drift that is left to the next part"),
+    "h": Variable("number", "length of the drift"),
+    "per_h": Variable("number", "1/h after the drift"),
+    "kick": Variable("number", "length of a kick as a fraction of the step, with what the last step left out"),
+    "ending": Variable("control", "1 in the last step of a call"),
+    "motion": Variable("number", "sum of squares of velocities where a call ended"),
+    "first_stage": Variable("control", "0; more to apply the constraints alone, outside of steps"),
+    "end_stage": Variable("control", "where the stages end"),
+    "good_steps": Variable("number", "steps done since the integrator was made"),
+    "call": Variable("control", "1 where a call of step begins, 2 within it, 0 without Python"),
+    "failed": Variable("control", "number of the part whose solve failed, 0 for none"),
+    "loose": Variable("number", "1 where v was taken back to a step at whose end nobody looked: it is not tangent"),
+    "between": Variable("control", "1 if nobody looks at the velocities after this step"),
+    "behind": Variable("control", "1 where v lacks what ends a step"),
+    "led": Variable("number", "the same when the last drift began"),
+    "looked": Variable("control", "1 if somebody may have looked since the last step", 1.0),
+    "coarse": Variable("setting", "1 in single precision: rounding of x over a time step is much beside a kick"),
+    "moving": Variable("setting", "1 where barostats may move x between steps"),
+    "moved": Variable("number", "how far others have moved x since the last step"),
+    "stale": Variable("number", "1 at a fresh start, and where what is kept of x must be computed anew", 1.0),
+    "xu": Variable("vector", "positions before constraints act on them"),
+    "u": Variable("vector", "velocities of the drift"),
+    "x_last": Variable("vector", "positions to come back to"),
+    "v_last": Variable("vector", "velocities to come back to"),
+    "x_start": Variable("vector", "positions where the drift began"),
+    "v_middle": Variable("vector", "velocities after friction and noise, with which x moved last"),
+    "v_end": Variable("vector", "v at the end of the step that has this v_middle"),
+    "v_next": Variable("vector", "velocities with all of (x-xu)/h"),
+    "force": Variable("vector", "applied forces at x, kept within a call where OpenMM would compute them again"),
+    "impulse": Variable("vector", "change of v by the constraints in the last drift"),
+}
+
+
+def use(program: Program, *names: str, value: float | None = None) -> str:
+    """Declare variables of the list, with another value at the beginning where one is given; returns the last name."""
+    for name in names:
+        kind, words, first = VARIABLES[name]
+        given = () if kind == "vector" else (first if value is None else value,)
+        getattr(program, kind)(name, words, *given)
+    return names[-1]
+
+
+class Integrator(openmm.CustomIntegrator):
+    """What ensembles and checks may ask of an integrator; `ProjectedIntegrator` answers, and says what each is."""
+
+    scheme: Splitting | None
+    parts: tuple[Part, ...]
+    program: Program
+    row_groups: frozenset[int]
+    spare: bool
+    check_every: int
+    ensemble: Ensemble
+    context: openmm.Context
+    _guard: Any
+    _watch: Callable[..., Any]
+    take_precision: Callable[..., None]
+    refresh: Callable[[], None]
+    applyConstraints: Callable[..., None]
+    applyVelocityConstraints: Callable[..., None]
+    independent_momenta: Callable[..., int]
+    degrees_of_freedom: Callable[..., int]
+    kinetic_energy: Callable[..., Any]
+
+
+class Ensemble:
+    """The kicks of an integrator, and what happens in the middle of its step; this one is Newton's: v += h f/m.
+
+    A value: its attributes never change, two are equal if theirs are, and it may be given to any number of
+    integrators. What changes belongs to the integrator.
+
+    Attributes
+    ----------
+    stays_tangent : bool
+        Whether kicks leave v tangent to all constraints at x: a step that ends with a kick ends without a projection
+        of its own then.
+    adds_up : bool
+        Whether two kicks at the same place, which are one of the sum of their times, are made as one.
+    owes : bool
+        Whether what `close` does may be left to the next step if the state is not read between.
+    noisy : bool
+        Whether it has noise, of size `spread` in the program: the kinetic energy that is reported is then that of
+        `v_middle`, since velocities have the temperature of the bath in the middle of a step only.
+    """
+
+    stays_tangent = adds_up = owes = noisy = False
+
+    # -- what it goes with ----------------------------------------------------------------------
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
+
+    def check_timestep(self, dt: float) -> None:
+        """Raise `InputError` for a time step (ps) that the ensemble cannot follow."""
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        """What a step consists of. Where there is an `Exchange`, `middle` writes it."""
+        return operations_of(scheme)
+
+    # -- the program ----------------------------------------------------------------------------
+
+    def declare(self, program: Program) -> None:
+        """Variables and tables."""
+
+    def write(self, step: Step) -> bool:
+        """Write a step of its own kind; False to leave it to `write_step`."""
+        return False
+
+    def open(self, program: Program) -> None:
+        """What comes before the first kick of a step, v tangent to all constraints; also what the last step owes.
+
+        Where constraints are applied alone (`first_stage` is not 0) it must do nothing.
+        """
+
+    def close(self, program: Program) -> None:
+        """What comes at the end of a step, v tangent to all constraints; `behind` says that the next step is to do it.
+
+        Only with `owes`, and where the program has `between`.
+        """
+
+    def take_back(self, program: Program) -> None:
+        """A step failed: variables of the ensemble are again what they were before `open`."""
+
+    def kick(self, step: Step, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
+        """Let the applied forces act for a time.
+
+        For h = 0 nothing but the impulse may be added: so the constraints are applied alone.
+
+        Parameters
+        ----------
+        step : Step
+        h : str
+            Expression of the time.
+        impulse : str
+            Expression that is to be added to v before (that of the drift that came before), or ''.
+        tangent : bool
+            Whether v is tangent before, without the impulse.
+        unseen : bool
+            Whether another kick follows before v is read.
+
+        Returns
+        -------
+        str
+            Expression of the velocities afterwards, which are not yet in v.
+        """
+        return "+".join(filter(None, ["v", impulse, f"{h}*{step.force}/m"]))
+
+    def middle(self, step: Step, u: str) -> None:
+        """Between two halves of the drift: from velocities u, an expression, to v."""
+        raise NotImplementedError
+
+    def drift(self, step: Step, h: str, u: str) -> str:
+        """A drift of length h with velocities u; returns what `Step.drift` does."""
+        return step.flight(h, u)
+
+    # -- a run ----------------------------------------------------------------------------------
+
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
+        """At the first step of a run, x and v on the constraints.
+
+        Raises
+        ------
+        KconsError
+            The ensemble does not exist for this System or this start.
+        """
+
+    def verify(self, integrator: Integrator) -> None:
+        """Raise `ConvergenceError` if something went wrong since the last check."""
+
+    def warmth(self, integrator: Integrator) -> float:
+        """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
+        return 1.0
+
+    def settings(self) -> dict[str, float]:
+        """The global variables of the program that are settings of the ensemble, by name."""
+        return {}
+
+    def at(self, temperature: float) -> Ensemble:
+        """The same at another temperature (K)."""
+        raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
+
+    def follow(self, integrator: Integrator) -> None:
+        """The integrator takes this ensemble, perhaps in the middle of a run; raise `KconsError` if it cannot."""
+
+    # -- a value --------------------------------------------------------------------------------
+
+    def _keep(self, **attributes: Any) -> None:
+        self.__dict__.update(attributes)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise UnsupportedError(
+            f"{self!r} is a value and does not change: call setTemperature or setFriction of the integrator, or make "
+            f"another {type(self).__name__}"
+        )
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and other.__dict__ == self.__dict__
+
+    def __hash__(self) -> int:
+        return hash((type(self), *self.__dict__.items()))
+
+
+class ConstantEnergy(Ensemble):
+    """Newton's equations."""
+
+
+class Step:
+    """What the functions that write a step share.
+
+    Attributes
+    ----------
+    operations : tuple of Operation
+        What a step consists of.
+    drifts, kicks : list of float
+        Its stages as fractions of the step; see `stages_of`.
+    halves : bool
+        Whether a bath acts between two halves of the only drift.
+    alone : int
+        With parts: number of the stage that is a drift without kicks, for applying constraints outside of steps.
+    phases : int
+        Executions of the program that a step takes where virtual sites are placed at the end of each only.
+    kept : bool
+        Whether the applied forces are kept in a variable within a call: where parts evaluate row groups, OpenMM
+        remembers the forces of the last groups only.
+    sited : bool
+        Whether parts stand beside virtual sites.
+    single : bool
+        Whether there is one part, whose rows are all there is.
+    lean : bool
+        Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
+    lazy : bool
+        Whether `between` is of use.
+    observed : int
+        How many steps at the end of a call must be complete: two where a part tells the mean over a step.
+    force : str
+        Name of the applied forces.
+    """
+
+    def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
+        self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
+        self.operations = ensemble.operations(scheme)
+        self.drifts, self.kicks = stages_of(self.operations)
+        self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
+        self.alone = len(self.drifts) + 1
+        self.one_drift = len(self.drifts) == 1 or self.halves
+        self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
+        self.sited = scheme is not None and any(part.sited for part in self.parts)
+        self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
+        verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
+        self.lean = plain and bool(self.parts) and verlet and not self.sited
+        #: Without parts: the kick that ends a step is made with that which begins the next.
+        self.joined = ensemble.adds_up and not self.parts and verlet
+        self.lazy = self.lean or self.joined or (not self.parts and (ensemble.owes or scheme is None))
+        self.observed = 2 if self.lean and any(hasattr(part, "mean_multipliers") for part in self.parts) else 1
+        self.kept = scheme is not None and any(part.evaluates for part in self.parts) and not self.lean
+        self.force = "f"
+        #: Whether drifts change v by impulses without the rounding errors of positions.
+        self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
+
+    # -- kicks, drifts, projections -------------------------------------------------------------
+
+    def kick(self, h: str, impulse: str = "", tangent: bool = False) -> None:
+        """The applied forces act for h, after the impulse of a drift."""
+        words = "constraint forces act, then the applied ones" if impulse else "applied forces act"
+        self.program.each("v", self.kicked(h, impulse, tangent), f"the {words} (kick)")
+
+    def kicked(self, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
+        """The velocities after a kick, which a drift may begin with."""
+        tangent = tangent and self.scheme is not None  # the leapfrog's velocities belong to half a step before
+        return self.ensemble.kick(self, h, impulse, tangent, unseen)
+
+    def drift(self, h: str, u: str = "v") -> str:
+        """Fly h along all constraints with velocities u; returns the impulse that keeps x on them, to be added to u."""
+        return self.ensemble.drift(self, h, u)
+
+    def flight(self, h: str, u: str) -> str:
+        """The drift itself."""
+        p = self.program
+        if self.filtered:
+            return self._filtered_flight(h)
+        for part in self.parts:
+            part.remember(p)
+        self.land(u, h)
+        if self.scheme is None:
+            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
+            return "impulse"
+        return f"(x-xu)/{h}"
+
+    def _filtered_flight(self, h: str) -> str:
+        """What a drift does to v lies along the gradients where it began: the rest of (x-xu)/h is rounding.
+
+        (x-xu)/h has the rounding errors of x, divided by h. The projector where the drift began tells what of it is
+        along the constraints.
+        """
+        p = self.program
+        use(p, "x_start", "v_next")
+        p.each("x_start", "x", "where the drift begins")
+        p.each("x", f"x+{h}*v", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        p.hold_positions("back onto the constraints of the System")
+        p.each("v_next", f"v+(x-xu)/{h}", "the constraint forces act on v as well, and rounding errors of x")
+        p.each("v", f"(x-xu)/{h}", "to be split")
+        p.each("xu", "x", "where the drift ends")
+        p.each("x", "x_start", "back, for a moment")
+        p.hold_positions("the solver of the System takes its directions from here")
+        p.hold_velocities("what is along the constraints: rounding")
+        p.each("x", "xu", "where the drift ends")
+        p.hold_positions("the solver of the System takes its directions from here")
+        return "v_next-2*v"
+
+    def land(self, u: str, h: str) -> None:
+        """Fly freely for h with velocities u, and go from there back onto all constraints."""
+        p = self.program
+        u = u if u.isidentifier() else f"({u})"
+        p.each("x", f"x+{h}*{u}", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        for part in self.parts:
+            if not (part.meets_system or part.lands_last):
+                part.land(p, h)
+        together = [part for part in self.parts if part.meets_system]
+        if together:
+            together[0].land(p, h)
+        else:
+            p.hold_positions("back onto the constraints of the System")
+        # Until then GPUs keep x as a difference, and forces do not see it.
+        for part in self.parts:
+            if part.lands_last:
+                part.land(p, h)
+        if self.sited and any(part.lands_last for part in self.parts):
+            p.hold_positions("GPUs place virtual sites")
+
+    def project(self) -> None:
+        """Make v tangent to all constraints at x."""
+        self.program.hold_velocities("tangent to the constraints of the System")
+        for part in self.parts:
+            part.project(self.program)
+
+    @property
+    def ends_tangent(self) -> bool:
+        """Whether the last kick leaves v tangent, so that no projection is needed."""
+        # In a loop, the last kick may be left out, where constraints are applied alone.
+        return self.ensemble.stays_tangent and self.kicks[-1] != 0 and (not self.parts or self.one_drift)
+
+    # -- the kinetic energy that is reported ----------------------------------------------------
+
+    def note_middle(self, velocities: str) -> None:
+        """The velocities between the last drift of a step and the kick that ends it."""
+        if self.ensemble.noisy:
+            self.program.each("v_middle", self._of_step(velocities, "v_middle"), "its kinetic energy is reported")
+
+    def note_end(self) -> None:
+        """The step that has this `v_middle` ends."""
+        if self.ensemble.noisy:
+            self.program.each("v_end", self._of_step("v", "v_end"), "to see whether others change v")
+
+    def _of_step(self, value: str, kept: str) -> str:
+        """Constraints that are applied alone, outside of steps, leave a variable as it is."""
+        return f"select(first_stage, {kept}, {value})" if self.parts else value
+
+
+# -- kinds of step --------------------------------------------------------------------------------
+
+
+def write_step(step: Step, own: Callable[[Step], bool] | None = None) -> None:
+    """Write the program of a step.
+
+    Parameters
+    ----------
+    step : Step
+    own : callable, optional
+        A kind of step of the integrator's own, which returns False where it leaves the step to the others.
+    """
+    p, ensemble = step.program, step.ensemble
+    if step.scheme is None:
+        # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
+        # impulse of the forces at x is added, and half that of the constraints in the drift to x.
+        p.kinetic_energy = "m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse"
+        p.memory.add(use(p, "impulse"))
+    if step.lazy:
+        use(p, "between")
+    ensemble.declare(p)
+    if ensemble.noisy:
+        use(p, "v_middle", "v_end")
+        # Where others have set v since, it is theirs that counts.
+        p.kinetic_energy = "m*u*u/2; u=select(spread*delta(v-v_end), v_middle, v)"
+    if not (own is not None and own(step)):
+        use(p, "xu")
+        if not ensemble.write(step):
+            _kind(step)(step)
+    use(p, "ending", "motion")
+    with p.when("ending != 0", "a call ends"):
+        p.sum("motion", "v*v", "are velocities finite?")
+
+
+def _kind(step: Step) -> Callable[[Step], None]:
+    if step.parts:
+        return _lean_step if step.lean else _guarded_step
+    if step.joined:
+        return _joined_step
+    if step.scheme is None:
+        return _leapfrog_step
+    return single_step if step.one_drift else _loop_step
+
+
+def _leapfrog_step(step: Step) -> None:
+    """Velocities half a step behind positions, without parts."""
+    p = step.program
+    p.let_others_act()
+    step.kick("dt")
+    p.each("x", "x+dt*v", "move freely (drift)")
+    p.each("xu", "x", "where that leads")
+    p.hold_positions("back onto the constraints of the System")
+    with p.when("between = 0", "somebody asks for the kinetic energy"):
+        p.each("impulse", "(x-xu)/dt", "what the constraint forces do to v")
+    p.each("v", "v+(x-xu)/dt", "the constraint forces act on v as well")
+
+
+def single_step(step: Step) -> None:
+    """One drift, or two halves with a bath between them, without parts."""
+    p, kicks, ensemble = step.program, step.kicks, step.ensemble
+    use(p, "phase")
+    h = "(0.5*dt)" if step.halves else "dt"
+    with p.when("phase != 2", "up to the new positions"):
+        p.let_others_act()
+        ensemble.open(p)
+        if kicks[0]:
+            step.kick(_of_dt(kicks[0]), tangent=True)
+        if step.halves:
+            # The second half absorbs what is across the constraints.
+            ensemble.middle(step, f"v+{step.drift(h)}")
+        impulse = step.drift(h)
+    with p.when("phase != 1", "with the forces there"):
+        step.note_middle(f"v+{impulse}")
+        if kicks[-1]:
+            step.kick(_of_dt(kicks[-1]), impulse)
+        else:
+            p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        if not step.ends_tangent:
+            step.project()
+        step.note_end()
+        ensemble.close(p)
+    p.let("phase", f"select(phase, select({step.phases}-phase, phase+1, 1), 0)", "what follows")
+
+
+def _loop_step(step: Step) -> None:
+    """Several drifts, without parts."""
+    p, n = step.program, len(step.drifts)
+    p.table("drift_share", step.drifts, "length of drift k as a fraction of the step")
+    p.table("kick_share", step.kicks, "length of the kick before drift k as a fraction of the step")
+    use(p, "phase", "stage", "stop", "h")
+    p.let("stage", "select(phase, phase-1, 0)", "first drift")
+    p.let("stop", f"select(phase, min(phase, {n}), {n})", "where to stop")
+    with p.when("stage = 0", "a step begins"):
+        p.let_others_act()
+        step.ensemble.open(p)
+    # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
+    with p.loop("stage < stop", "all drifts and kicks of the scheme"):
+        with p.when("kick_share(stage) != 0", "a kick comes first"):
+            step.kick("dt*kick_share(stage)")
+        p.let("h", "dt*drift_share(stage)", "length of this drift")
+        p.each("v", f"v+{step.drift('h')}", "the constraint forces act on v as well")
+        p.let("stage", "stage+1", "what follows")
+    with p.when(f"phase*({step.phases}-phase) = 0", "the step ends"):
+        if step.kicks[-1]:
+            step.kick(_of_dt(step.kicks[-1]))
+        if not step.ends_tangent:
+            step.project()
+        step.ensemble.close(p)
+    p.let("phase", f"select(phase, select({step.phases}-phase, phase+1, 1), 0)", "what follows")
+
+
+def _joined_step(step: Step) -> None:
+    """Velocity Verlet without parts, of which two kicks between drifts are made as one where v is not read."""
+    p, ensemble = step.program, step.ensemble
+    use(p, "behind", "kick", "phase", "x_start", "coarse")
+    h = "(0.5*dt)" if step.halves else "dt"
+    with p.when("phase != 2", "up to the new positions"):
+        p.let_others_act()
+        p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
+        u = step.kicked("kick*dt", tangent=True, unseen=True)
+        with p.when("coarse != 0", "where a drift leads does not tell v: the impulse alone is read from it"):
+            p.each("v", u, "the applied forces act (kick)")
+            if step.halves:
+                ensemble.middle(step, f"v+{step.drift(h)}")
+            else:
+                p.each("v", f"v+{step.drift(h)}", "the constraint forces act on v as well")
+        with p.when("coarse = 0", "v need not be written: it follows from where the drift leads"):
+            p.each("x_start", "x", "where the drift begins")
+            p.each("x", f"x+{h}*({u})", "the applied forces act, then move freely (drift)")
+            p.hold_positions("back onto the constraints of the System")
+            if step.halves:
+                ensemble.middle(step, f"(x-x_start)/{h}")
+            else:
+                p.each("v", f"(x-x_start)/{h}", "as the drift went")
+        if step.halves:  # this half absorbs what noise has across the constraints
+            p.each("v", f"v+{step.drift(h)}", "the constraint forces act on v as well")
+        if ensemble.stays_tangent:
+            with p.when("exact+1-between != 0", "kicks need it"):
+                step.project()
+    with p.when("between+delta(phase-1) = 0", "somebody looks at the velocities"):
+        step.note_middle("v")
+        step.kick("0.5*dt", tangent=True)
+        if not ensemble.stays_tangent:  # otherwise the next drift absorbs what v has across
+            step.project()
+        step.note_end()
+    p.let("behind", "between", "the next step makes up for it")
+    p.let("phase", "select(phase, 3-phase, 0)", "what follows")
+
+
+# -- steps that are taken back when a part fails --------------------------------------------------
+
+
+def declare_guards(step: Step, *, shares: bool = True) -> None:
+    """Variables of steps with parts, and their stages; `shares` where drifts have lengths of their own."""
+    p, n = step.program, len(step.drifts)
+    use(p, "failed", "good_steps", "first_stage")
+    use(p, "end_stage", value=n)
+    use(p, "stage", "stale")
+    if shares:
+        p.table("drift_share", [*step.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
+    p.table("kick_share", [*step.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
+    if step.kept or step.lean:
+        use(p, "call", "moved")
+
+
+def see_who_moved(step: Step) -> None:
+    """How far x is from where the last step ended; where a call begins, Python has to look at what others moved."""
+    p = step.program
+    p.sum("moved", "(x-x_last)^2", "barostats, setPositions and minimisers move x between steps")
+    asks = "select(call-1, failed, select(moved, -1, 0))"
+    p.let("failed", f"select(failed+stale, failed, {asks})", "a call begins: ask Python to look at x")
+
+
+def _guarded_step(step: Step) -> None:
+    """Any scheme with parts. The same program brings positions, or velocities alone, onto the constraints.
+
+    It starts at the last stage of the tables then, a drift without kicks, or behind it.
+    """
+    p = step.program
+    divided = step.sited and step.one_drift
+    declare_guards(step)
+    use(p, "h", *["per_h"] * step.one_drift, *["phase"] * divided, "x_last", "v_last")
+    if step.kept:
+        step.force = use(p, "force")
+    for part in step.parts:
+        part.lean = False
+        part.declare(p)
+    if not divided:
+        _up_to_forces(step, _with_forces)
+        return
+    with p.when("phase != 2", "up to the new positions"):
+        _up_to_forces(step, lambda _: None)
+    with p.when("phase != 1", "with the forces there"):
+        _with_forces(step)
+    p.let("phase", "select(phase, 3-phase, 0)", "what follows")
+
+
+def _up_to_forces(step: Step, then: Callable[[Step], None]) -> None:
+    p, ensemble = step.program, step.ensemble
+    with p.when("first_stage+abs(failed) = 0", "a step, and nothing failed before"):
+        p.let_others_act()
+    if step.kept:
+        see_who_moved(step)
+    with p.when("failed = 0", "after a failure nothing moves"):
+        if step.kept:
+            with p.when("moved+stale != 0", "others did"):
+                p.each("x_last", "x", "start here")
+            with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
+                p.each("force", "f", "applied forces")
+            if ensemble.noisy:
+                # Reference and CPU draw random numbers with each computation: how steps are divided into calls must
+                # not change the noise.
+                with p.when("moved+stale+abs(call-2) = 0", "forces are known"):
+                    p.each("force", "force", "as many random numbers are drawn")
+            p.let("call", "select(call, 2, 0)", "forces are known in this call")
+            with p.when("moved+stale != 0", "others did"):
+                for part in step.parts:
+                    part.begin(p)
+        else:
+            p.each("x_last", "x", "to come back to")
+        p.let("stale", "0", "what is kept belongs to x")
+        p.each("v_last", "v", "to come back to")
+        ensemble.open(p)
+        if step.kicks[0]:
+            step.kick("dt*kick_share(first_stage)", tangent=True)
+        p.let("stage", "first_stage", "first drift")
+        if step.halves:
+            with p.when("first_stage = 0", "a step"):
+                p.let("h", "dt*drift_share(0)", "length of the first drift")
+                ensemble.middle(step, f"v+{step.drift('h')}")
+                p.let("stage", "1", "what follows")
+        if step.one_drift:
+            _only_drift(step)
+        else:
+            _all_drifts(step)
+        then(step)
+
+
+def _only_drift(step: Step) -> None:
+    """One drift needs no loop; set-up takes 15 times as long for each block within a loop."""
+    p = step.program
+    p.let("per_h", "0", "no drift yet")
+    with p.when("stage < end_stage*step(0.5-failed)", "unless velocities are projected alone"):
+        p.let("h", "dt*drift_share(stage)", "length of the drift")
+        impulse = step.drift("h")
+        if step.scheme is None:
+            p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        p.let("per_h", "1/h", "the constraint forces act on v as well, with the kick that follows")
+        p.let("stage", "stage+1", "what follows")
+
+
+def _all_drifts(step: Step) -> None:
+    p = step.program
+    with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
+        p.let("h", "dt*drift_share(stage)", "length of this drift")
+        if step.single:
+            # From (x-xu)/h, the shortest of many drifts would have most of the digits of v.
+            step.parts[0].remember(p)
+            step.parts[0].land_alone(p, "v", "h")
+        else:
+            p.each("v", f"v+{step.drift('h')}", "the constraint forces act on v as well")
+        p.let("stage", "stage+1", "what follows")
+        # Without the block set-up is faster, but forces are then computed after a failure as well.
+        if all(step.kicks[1:]) and all(part.stays_finite for part in step.parts):
+            _kick_after(step)
+        else:
+            with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
+                _kick_after(step)
+
+
+def _kick_after(step: Step, impulse: str = "") -> None:
+    """The kick that follows drift `stage`, with the forces at x."""
+    if step.kept:
+        step.program.each("force", "f", "applied forces")
+    step.kick("dt*kick_share(stage)", impulse)
+
+
+def _with_forces(step: Step) -> None:
+    p = step.program
+    if step.scheme is None:
+        # The leapfrog has velocities of half a step ago, which belong to no x.
+        with p.when("first_stage*step(0.5-failed) != 0", "constraints alone"):
+            step.project()
+        with p.when("failed = 0", "the step is good"):
+            p.let("good_steps", "good_steps+1", "count it")
+    else:
+        with p.when("failed = 0", "all solves converged"):
+            if step.one_drift:
+                step.note_middle("v+per_h*(x-xu)")
+                _kick_after(step, "per_h*(x-xu)")
+            if not step.ends_tangent:
+                step.project()
+            step.note_end()
+            step.ensemble.close(p)
+            p.let("good_steps", "good_steps+delta(failed)", "count it")
+            if step.kept:
+                p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
+    with p.when("failed > 0", "a solve failed"):
+        p.each("x", "x_last", "back to where the step began")
+        p.each("v", "v_last", "back to where the step began")
+        step.ensemble.take_back(p)
+        p.let("stale", "1", "what is kept belongs to elsewhere")
+
+
+def _lean_step(step: Step) -> None:
+    """Velocity Verlet with parts.
+
+    Between two steps of one call velocities are not read. The second half kick of a step and the first of the next are
+    then one, and the velocities are not made tangent: the next drift starts where they would be, pushes along the same
+    gradients, and absorbs what they have across. The motion is the same; see notes on RATTLE and leapfrog.
+    """
+    p = step.program
+    declare_guards(step)
+    use(p, "h", "per_h", "x_last", "v_last", "u", "force", "moving", "looked", "behind", "led", "loose")
+    for part in step.parts:
+        part.lean = True
+        part.declare(p)
+    with p.when("select(failed, 0, looked) != 0", "x and v may have been changed"):
+        p.each("v_last", "v", "to come back to")
+        with p.when("first_stage = 0", "a step"):
+            p.let_others_act()
+        see_who_moved(step)
+    with p.when("failed = 0", "after a failure nothing moves"):
+        with p.when("looked != 0", "x and v may have been changed"):
+            with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
+                p.each("force", "f", "applied forces")
+            p.let("call", "select(call, 2, 0)", "forces are known in this call")
+            with p.when("moved+stale != 0", "others did"):
+                p.each("x_last", "x", "start here")
+                across = any(part.meets_system for part in step.parts)
+                if across:
+                    p.each("u", "v", "v is needed to project the rows")
+                for part in step.parts:
+                    part.begin(p)
+                if across:
+                    p.each("v", "u", "v again")
+            p.each("u", "v+kick_share(first_stage)*dt*force/m", "the applied forces act (kick)")
+        with p.when("looked = 0", "in the middle of many steps"):
+            p.let_others_act()
+            p.each("x_last", "x", "to come back to")
+            p.each("u", "v+dt*f/m", "the applied forces act (both half kicks)")
+            for part in step.parts:
+                part.renew(p)
+        p.let("stale", "0", "what is kept belongs to x")
+        p.let("led", "behind", "for multipliers")
+        p.let("stage", "first_stage", "the drift")
+        p.let("per_h", "0", "no drift yet")
+        with p.when("stage < end_stage*step(0.5-failed)", "unless velocities are projected alone"):
+            p.let("h", "dt*drift_share(stage)", "length of the drift")
+            for part in step.parts:
+                part.remember(p)
+            if step.single:
+                step.parts[0].land_alone(p, "u", "h")
+            else:
+                step.land("u", "h")
+            p.let("per_h", "1/h", "the constraint forces act on v as well")
+            p.let("stage", "stage+1", "what follows")
+        with p.when("select(failed, 0, 1-between) != 0", "somebody looks at the velocities"):
+            landed = "v" if step.single else "u+per_h*(x-xu)"
+            p.each("force", "f", "applied forces")
+            p.each("v", f"{landed}+dt*kick_share(stage)*force/m", "constraint forces act, then the applied ones (kick)")
+            step.project()
+            p.each("x_last", "select(failed, x_last, x)", "where the step ended")
+        with p.when("select(failed, 0, between) != 0", "nobody looks"):
+            if not step.single:
+                p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
+            for part in step.parts:
+                part.passed(p)
+        # Without blocks: the set-up of OpenMM goes along each way through them.
+        p.let("good_steps", "good_steps+delta(failed)", "count it if all solves converged")
+        with p.when("failed != 0", "a solve failed"):
+            p.each("x", "x_last", "back to where the step began")
+            p.each("v", "select(looked, v_last, u-0.5*dt*f/m)", "back to where the step began")
+            p.let("loose", "1-looked", "was it complete?")
+            p.let("stale", "1", "what is kept belongs to elsewhere")
+        p.let("looked", "select(failed, 1, 1-between)", "does somebody look?")
+        p.let("behind", "1-looked", "v lacks half a kick")
+
+
+def _of_dt(share: float) -> str:
+    return "dt" if share == 1 else f"{share!r}*dt"

@@ -1,0 +1,481 @@
+"""What an integrator was made with wins over what States, checkpoints and copies carry; runs go on from them."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import holding, loose_alanine, potential_energy, started, state_of
+from tied_cluster import (
+    CENTRE,
+    EVERYTHING,
+    KINDS,
+    MASSES,
+    X,
+    begun,
+    bond,
+    carried_at,
+    cluster,
+    on_a_sphere,
+    row_at,
+    thermostatted,
+)
+
+from kcons.constraints import Plane
+from kcons.errors import InputError, KconsError, OverdeterminedError, UnsupportedError
+from kcons.openmm import (
+    CollectiveRows,
+    HamiltonianMonteCarlo,
+    Isokinetic,
+    Langevin,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    hold,
+)
+from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm.quantities import GAS_CONSTANT
+from kcons.steppers import Geodesic
+from kcons.steppers.splitting import Splitting
+
+#: The trap of `cluster` is round.
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
+#: Parts beside more ensembles and schemes: what each keeps between steps has to follow the state.
+PAIRS = {
+    f"{held}, {name}": functools.partial(make, **chosen)
+    for held, make in (("sphere", on_a_sphere), ("collective", row_at), ("carried", carried_at))
+    for name, chosen in {
+        "Isokinetic": {"ensemble": Isokinetic(300)},
+        "isokinetic4": {"ensemble": Isokinetic(300), "scheme": "isokinetic4"},
+        "NoseHooverMiddle": {"ensemble": NoseHooverMiddle(300, 5.0)},
+        "blanes-moan4": {"scheme": "blanes-moan4"},
+    }.items()
+}
+
+
+@pytest.mark.parametrize("kind", KINDS | PAIRS)
+@pytest.mark.parametrize("way", ["State", "checkpoint"])
+def test_a_run_goes_on_bit_for_bit(kind, way):
+    """In another Context with an integrator of the same settings, and again in its own; noise aside."""
+    if "Langevin" in kind and way != "checkpoint":
+        pytest.skip("a State does not carry random numbers")
+    made, other = ((KINDS | PAIRS)[kind]() for _ in range(2))
+    made.run(7)
+    state, checkpoint = made.context.getState(**EVERYTHING), made.context.createCheckpoint()
+    if way == "checkpoint":
+        other.run(2)
+        other.context.loadCheckpoint(checkpoint)
+        if "Langevin" in kind:  # random numbers of the Reference platform belong to the process
+            other.run(5)
+            made.run(1)
+            made.context.loadCheckpoint(checkpoint)
+            made.run(5)
+            np.testing.assert_array_equal(state_of(other.context), state_of(made.context))
+            return
+    else:
+        other.context.setState(openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(state)))
+    assert other.context.getStepCount() == 7
+    made.run(5)
+    other.run(5)
+    end = state_of(made.context)
+    np.testing.assert_array_equal(state_of(other.context), end)
+    if way == "checkpoint":
+        made.context.loadCheckpoint(checkpoint)
+    else:
+        made.context.setState(state)
+    made.run(5)
+    np.testing.assert_array_equal(state_of(made.context), end)
+
+
+# -- settings stay ------------------------------------------------------------------------------------
+
+
+def give(made, other, way):
+    """Load what `made` has into the Context of `other`."""
+    if way == "checkpoint":
+        other.context.loadCheckpoint(made.context.createCheckpoint())
+    else:
+        other.context.setState(made.context.getState(**EVERYTHING))
+
+
+ways = pytest.mark.parametrize("way", ["State", "checkpoint"])
+
+
+@ways
+@pytest.mark.parametrize("part", [False, True])
+def test_friction_and_temperature_stay(way, part):
+    def make(temperature, friction):
+        ensemble = Langevin(temperature, friction)
+        return row_at(ensemble=ensemble) if part else thermostatted(ensemble)()
+
+    made, other = make(300, 1.0), make(400, 50.0)
+    read = other.integrator.getGlobalVariableByName
+    made.run(3)
+    for _ in range(2):
+        give(made, other, way)
+        other.run()
+        assert (read("friction"), read("kT")) == (50.0, GAS_CONSTANT * 400)
+    other.integrator.setFriction(2 / unit.picosecond)
+    other.integrator.setTemperature(350 * unit.kelvin)
+    give(made, other, way)
+    other.run()
+    assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
+    assert other.integrator.ensemble == Langevin(350, 2.0)
+    for preserved in (True, False):
+        other.context.reinitialize(preserveState=preserved)
+        other.context.setPositions(X)
+        other.run()
+        assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
+
+
+@ways
+def test_the_kinetic_energy_of_isokinetic_stays(way):
+    made, other = thermostatted(Isokinetic(300))(), thermostatted(Isokinetic(400))()
+    made.run(3)
+    other.run(1)
+    give(made, other, way)
+    other.run(2)
+    count = other.integrator.ensemble.count(other.integrator)
+    found = MASSES @ np.sum(state_of(other.context)[1] ** 2, axis=1)
+    assert abs(found / ((count - 1) * GAS_CONSTANT * 400) - 1) < 1e-12
+
+
+def test_a_temperature_that_is_refused_changes_nothing():
+    """Of one degree of freedom there is none, and its run goes on."""
+    system, field = openmm.System(), openmm.CustomExternalForce("5*x")
+    field.addParticle(system.addParticle(20.0), [])
+    system.addForce(field)
+    part = hold(system, [Plane([0], [0, 1, 0], 0.0), Plane([0], [0, 0, 1], 0.0)], np.zeros((1, 3)))
+    bath = Isokinetic(kinetic_energy=2.0)
+    integrator = ProjectedIntegrator(0.002, parts=[part], ensemble=bath)
+    context = started(system, integrator, np.zeros((1, 3)), np.array([[0.1, 0, 0]]))
+    integrator.step(1)
+    with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
+        integrator.setTemperature(300)
+    assert integrator.ensemble is bath
+    integrator.step(1)
+    assert 10 * np.sum(state_of(context)[1] ** 2) == pytest.approx(2.0)
+
+
+@ways
+@pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere], ids=["collective", "carried", "surface"])
+def test_targets_stay(make, way):
+    """A State of another target is put right in the next step, for it is nearer than a tenth of the length."""
+    made, other = make(0.20), make(0.22)
+    made.run(3)
+    other.run(2)
+    give(made, other, way)
+    other.run(1)
+    x = state_of(other.context)[0]
+    length = np.linalg.norm(x[0] - CENTRE) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
+    assert abs(length - 0.22) < 1e-12
+
+
+def test_set_target_outlives_a_state():
+    made = row_at(0.30)
+    before = made.run(2)
+    made.part.set_target(made.integrator, 0, 3.5 * unit.angstrom)
+    made.part.restore(made.context)
+    made.run(2)
+    made.context.setState(before)
+    with pytest.raises(KconsError, match="restore"):
+        made.run()
+    made.part.restore(made.context)
+    made.run()
+    assert abs(made.part.values(made.context)[0] - 0.35) < 1e-12
+    assert copy.copy(made.integrator).program.settings == made.integrator.program.settings
+
+
+def test_a_setting_has_a_method_of_its_own():
+    """Written by its number, as programs do that copy all variables, it has its value again in the next step."""
+    made = thermostatted(Langevin(300, 1.0))()
+    made.run(2)
+    integrator = made.integrator
+    with pytest.raises(UnsupportedError, match="setting of the integrator"):
+        integrator.setGlobalVariableByName("kT", 3.0)
+    for k in range(integrator.getNumGlobalVariables()):
+        integrator.setGlobalVariable(k, 0.0)
+    made.run()
+    assert integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "RattleIntegrator"])
+def test_variables_of_a_copy_leave_a_run_as_it_is(kind):
+    ran, fresh = KINDS[kind](), KINDS[kind]()
+    for one in (ran, fresh) if "Langevin" in kind else ():
+        one.integrator.setFriction(0)
+    ran.run(5)
+    given = copy.deepcopy(ran.integrator)
+    for k in range(given.getNumGlobalVariables()):
+        ran.integrator.setGlobalVariable(k, given.getGlobalVariable(k))
+    fresh.run(5)
+    ran.run(5)
+    fresh.run(5)
+    np.testing.assert_allclose(state_of(ran.context), state_of(fresh.context), rtol=0, atol=1e-9)
+
+
+def test_nvt_to_nve_and_back_through_a_simulation(tmp_path):
+    """A State without the variables of the integrator that has saved it."""
+    topology = app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for _ in range(8):
+        topology.addAtom("C", app.element.carbon, residue)
+    place = openmm.Platform.getPlatformByName("Reference")
+    warm = app.Simulation(topology, cluster(bonded=True), ProjectedIntegrator(0.002, ensemble=Langevin(300, 1)), place)
+    warm.context.setPositions(X)
+    warm.integrator.setVelocitiesToTemperature(warm.context, 300, 1)
+    warm.step(5)
+    for given in ({}, {"ensemble": Isokinetic(300)}, {"ensemble": Langevin(310, 2.0)}, {}):
+        state = warm.context.getState(positions=True, velocities=True, parameters=True)
+        again = app.Simulation(topology, cluster(bonded=True), ProjectedIntegrator(0.002, **given), place)
+        again.context.setState(state)
+        np.testing.assert_array_equal(state_of(again.context), state_of(warm.context))
+        again.step(5)
+        warm = again
+    assert warm.currentStep == 25
+
+
+@pytest.mark.parametrize(
+    ("make", "more"),
+    # A particle on a sphere is damped least.
+    [(row_at, 5000), (carried_at, 5000), (on_a_sphere, 16000), (lambda **given: thermostatted(**given)(), 5000)],
+)
+def test_zero_kelvin_brings_to_rest(make, more):
+    """Friction without noise: all energy goes, the certificate holds with velocities of rounding alone."""
+    made = make(ensemble=Langevin(0, 6.0))  # as the field damps fastest
+    first = potential_energy(made.context)
+    made.run(4000)
+    assert np.abs(state_of(made.context)[1]).max() < 5e-3
+    assert potential_energy(made.context) < first
+    assert made.integrator.getTemperature() == 0 * unit.kelvin
+    made.integrator.check(made.context)
+    made.run(more)
+    assert np.abs(state_of(made.context)[1]).max() < 1e-4
+
+
+# -- ensembles are values -----------------------------------------------------------------------------
+
+
+def test_ensembles_are_values():
+    shared = Langevin(300, 1.0)
+    one, two = thermostatted(shared)(), thermostatted(shared)()
+    one.integrator.setTemperature(500)
+    one.integrator.setFriction(7)
+    two.run()
+    assert two.integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
+    assert (shared.temperature, shared.friction) == (300, 1.0)
+    assert one.integrator.getTemperature() == 500 * unit.kelvin
+    assert one.integrator.getFriction() == 7 / unit.picosecond
+    for value, name in ((shared, "temperature"), (shared, "friction"), (Isokinetic(300), "temperature")):
+        with pytest.raises(UnsupportedError, match="setTemperature or setFriction"):
+            setattr(value, name, 400.0)
+    with pytest.raises(AttributeError):
+        one.integrator.ensemble = shared
+    assert Langevin(300, 1.0) == shared != Langevin(300, 2.0)
+    assert len({Langevin(300, 1.0), shared, Isokinetic(300, atoms=[1, 2]), Isokinetic(300, atoms=[1, 2])}) == 2
+
+
+def test_what_an_ensemble_lacks():
+    plain, smooth = ProjectedIntegrator(0.002), ProjectedIntegrator(0.002, ensemble=Isokinetic(300))
+    lacking = [(plain, name) for name in ("getTemperature", "setTemperature", "getFriction", "setFriction")]
+    for one, name in (*lacking, (smooth, "getFriction"), (smooth, "setFriction")):
+        assert not hasattr(one, name)
+        with pytest.raises(UnsupportedError, match="ensemble=Langevin"):
+            getattr(one, name)
+    assert smooth.getTemperature() == 300 * unit.kelvin
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        (lambda: Langevin(-1, 1), "temperature"),
+        (lambda: Langevin(300 * unit.nanometer, 1), "give it in K"),
+        (lambda: Langevin(300, 1 * unit.picosecond), "give it in 1/ps"),
+        (lambda: Langevin(300, -1), "friction"),
+        (lambda: Langevin(float("nan"), 1), "temperature"),
+        (lambda: Isokinetic(0), "temperature"),
+        (lambda: ProjectedIntegrator(0.002, ensemble=Isokinetic(300)).setTemperature(0), "temperature"),
+        (lambda: ProjectedIntegrator(0.002, ensemble=Langevin), "give one of kcons.openmm"),
+        *((lambda g=g: ProjectedIntegrator(1e-3).setIntegrationForceGroups(g), "group") for g in ({40}, [0.5], "0")),
+        *((lambda g=g: ProjectedIntegrator(1e-3).setIntegrationForceGroups(g), "group") for g in (1.5, None)),
+        *((lambda t=t: ProjectedIntegrator(1e-3).setConstraintTolerance(t), "tolerance") for t in ("small", None)),
+        (lambda: ProjectedIntegrator(1e-3).setConstraintTolerance(float("nan")), "tolerance"),
+        (lambda: ProjectedIntegrator(1e-3).setConstraintTolerance(1 * unit.nanometer), "tolerance"),
+    ],
+)
+def test_settings_that_are_none_are_refused(wrong, match):
+    with pytest.raises(InputError, match=match):
+        wrong()
+
+
+def test_a_tolerance_that_was_left_open_stays_so_where_it_is_copied():
+    integrator, other = ProjectedIntegrator(0.002), ProjectedIntegrator(0.002)
+    integrator.setConstraintTolerance(other.getConstraintTolerance())
+    assert integrator.asked_tolerance is None
+    integrator.setConstraintTolerance(1e-7)
+    assert integrator.asked_tolerance == integrator.getConstraintTolerance() == 1e-7
+    integrator.setConstraintTolerance(1e-10)
+    assert integrator.asked_tolerance == 1e-10
+    assert ProjectedIntegrator(0.002, tolerance=1e-10).asked_tolerance == 1e-10
+
+
+@pytest.mark.parametrize("make", [ProjectedIntegrator, RattleIntegrator, HamiltonianMonteCarlo.reversing_integrator])
+@pytest.mark.parametrize("step", [4, 0.0201, 2.0])
+def test_a_long_time_step_without_a_unit_is_asked_about(make, step):
+    with pytest.warns(UserWarning, match=f"the time step is {step:g} ps, that is .* fs: is it meant in fs") as seen:
+        integrator = make(step)
+    with pytest.warns(UserWarning, match="is it meant in fs") as seen:
+        integrator.setStepSize(step)
+    assert len(seen) == 1 and seen[0].filename == __file__
+    integrator.setStepSize(0.02)
+    integrator.setStepSize(step * unit.picosecond)
+    for again in (copy.copy(integrator), pickle.loads(pickle.dumps(integrator)), make(integrator.getStepSize())):
+        assert again.getStepSize() == integrator.getStepSize()
+
+
+# -- copies and files ---------------------------------------------------------------------------------
+
+copies = pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda i: pickle.loads(pickle.dumps(i))])
+
+
+@copies
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_have_the_settings_of_now(kind, how):
+    made = KINDS[kind]()
+    if kind.startswith("carried") and how not in (copy.copy, copy.deepcopy):
+        with pytest.raises(UnsupportedError, match="pickle the System"):
+            how(made.integrator)
+        return
+    if "Langevin" in kind:
+        made.integrator.setTemperature(310)
+        made.integrator.setFriction(3)
+    if kind.startswith("collective"):
+        made.part.set_target(made.integrator, 0, 0.31)
+    again = how(made.integrator)
+    assert type(again) is type(made.integrator)
+    if kind != "RattleIntegrator":
+        assert again.program.settings == made.integrator.program.settings
+        assert again.ensemble == made.integrator.ensemble
+        for name, value in again.program.settings.items():
+            assert again.getGlobalVariableByName(name) == value
+    assert again.getStepSize() == made.integrator.getStepSize()
+
+
+@copies
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", "leapfrog"])
+def test_copies_make_the_same_steps(scheme, how):
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(1e-3, scheme, parts=[holding()], tolerance=1e-11, check_every=17)
+    integrator.setRandomNumberSeed(3)
+    integrator.setIntegrationForceGroups({0, 1, 2})
+    context = started(system, integrator, x, v)
+    integrator.step(3)
+    again = how(integrator)
+    assert again.program.lines == integrator.program.lines
+    assert (again.getConstraintTolerance(), again.check_every, again.getRandomNumberSeed()) == (1e-11, 17, 3)
+    assert again.getIntegrationForceGroups() == 7
+    assert again.parts[0] is not integrator.parts[0]
+    other = started(system, again, *state_of(context))
+    integrator.step(3)
+    again.step(3)
+    np.testing.assert_allclose(state_of(context), state_of(other), rtol=1e-9, atol=1e-12)
+    assert other.getStepCount() == 3
+
+
+@copies
+def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(how):
+    """Although the original has run: the new one acts at the first step, and an unchanged copy goes on as it was."""
+    made = thermostatted(Isokinetic(300, momentum="free"))()
+    made.run(5)
+    warmer, same = (how(made.integrator) for _ in range(2))
+    warmer.setTemperature(310)
+    contexts = [started(cluster(bonded=True), one, *state_of(made.context)) for one in (warmer, same)]
+    for one in (made.integrator, warmer, same):
+        one.step(3)
+    found, before = (MASSES @ np.sum(state_of(each)[1] ** 2, axis=1) for each in contexts)
+    assert found / before == pytest.approx(310 / 300, rel=1e-12)
+    np.testing.assert_allclose(state_of(contexts[1]), state_of(made.context), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("scheme", [*SCHEMES, "leapfrog", Geodesic(3), Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
+@pytest.mark.parametrize("parts", [False, True])
+def test_xml_has_the_bare_program(scheme, parts):
+    """What reads it makes the same steps; `from_xml` takes what no file contains."""
+    system, x, v = loose_alanine()
+
+    def held():
+        return [holding()] if parts else []
+
+    integrator = ProjectedIntegrator(2e-3, scheme, parts=held(), tolerance=1e-12)
+    integrator.setRandomNumberSeed(5)
+    integrator.setIntegrationForceGroups({0, 1, 2})
+    text = openmm.XmlSerializer.serialize(integrator)
+    assert "kcons" not in text
+    bare = openmm.XmlSerializer.deserialize(text)
+    assert type(bare) is openmm.CustomIntegrator
+    again = ProjectedIntegrator.from_xml(text, scheme, parts=held())
+    assert again.getStepSize() == integrator.getStepSize()
+    assert (again.getConstraintTolerance(), again.getRandomNumberSeed()) == (1e-12, 5)
+    assert again.getIntegrationForceGroups() == bare.getIntegrationForceGroups() == 7
+    with pytest.raises(InputError, match="another program"):
+        ProjectedIntegrator.from_xml(text, "rattle" if scheme != "rattle" else "suzuki4", parts=held())
+    contexts = [started(system, one, x, v) for one in (integrator, again, bare)]
+    integrator.applyConstraints(contexts[0])
+    integrator.applyVelocityConstraints(contexts[0])
+    for context in contexts:
+        context.setPositions(state_of(contexts[0])[0])
+        context.setVelocities(state_of(contexts[0])[1])
+    for one in (integrator, again, bare):
+        for _ in range(2):
+            one.step(3)
+    np.testing.assert_array_equal(state_of(contexts[0]), state_of(contexts[1]))
+    np.testing.assert_allclose(state_of(contexts[0]), state_of(contexts[2]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [name for name in KINDS if "carried" not in name])
+def test_the_bare_program_makes_the_same_steps(kind):
+    """Of an integrator that has run, with all that it was made with, and without Python."""
+    made, again = KINDS[kind](), KINDS[kind]()
+    for one in (made, again) if "Langevin" in kind else ():
+        one.integrator.setFriction(0)
+    made.run(2)
+    again.run(2)
+    bare = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(again.integrator))
+    context = openmm.Context(again.context.getSystem(), bare, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(state_of(made.context)[0])
+    context.setVelocities(state_of(made.context)[1])
+    bare.step(6)
+    made.run(6)
+    within = 1e-9 if "leapfrog" not in kind else 1e-6
+    np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=within)
+
+
+def test_files_of_something_else_are_refused():
+    for other in (openmm.VerletIntegrator(1e-3), openmm.CustomIntegrator(1e-3)):
+        with pytest.raises(InputError, match="another program"):
+            ProjectedIntegrator.from_xml(openmm.XmlSerializer.serialize(other))
+    rows = CollectiveRows(cluster(), [Row(bond(), 0.3)])
+    text = openmm.XmlSerializer.serialize(ProjectedIntegrator(0.002, parts=[rows]))
+    with pytest.raises(InputError, match="parts it was made with"):
+        ProjectedIntegrator.from_xml(text)
+    others = CollectiveRows(cluster(), [Row(bond(), 0.35)])
+    again = ProjectedIntegrator.from_xml(text, parts=[others], ensemble=None)
+    assert again.getGlobalVariableByName("target1_0") == 0.35
+
+
+def test_a_checkpoint_of_the_same_program_begins_with_its_settings():
+    made, other = (
+        begun(cluster(bonded=True), RattleIntegrator(0.002)),
+        begun(cluster(bonded=True), RattleIntegrator(1e-3)),
+    )
+    made.run(5)
+    other.context.loadCheckpoint(made.context.createCheckpoint())
+    other.run(5)
+    assert other.context.getTime()._value == pytest.approx(0.015)

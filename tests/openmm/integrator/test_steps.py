@@ -1,0 +1,555 @@
+"""Steps and calls of them: parts are held, failures taken back, and what is left out where nobody looks is no loss."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_parts import HeldCoordinates
+from openmm_systems import (
+    PLATFORMS,
+    alanine,
+    dumbbell,
+    holding,
+    loose_alanine,
+    masses_of,
+    on_gpus,
+    residuals,
+    started,
+    state_of,
+    total_energy,
+)
+from tied_cluster import KINDS, bond
+
+from kcons.constraints import KnifeEdge, Plane
+from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
+    LangevinRespa,
+    ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    hold,
+)
+from kcons.openmm.integrator.steps import Ensemble
+
+platforms = pytest.mark.parametrize("platform", PLATFORMS)
+#: The trap of `tied_cluster` is round.
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+PS = unit.picosecond
+
+
+# -- parts ------------------------------------------------------------------------------------------
+
+
+@platforms
+@pytest.mark.parametrize("evaluates", [False, True])
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4", "leapfrog"])
+def test_part_is_held(scheme, evaluates, platform):
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(5e-4, scheme, parts=[holding(evaluates=evaluates)])
+    context = started(system, integrator, x, v, platform)
+    energy = None
+    for _ in range(20):
+        integrator.step(5)
+        now, speed = state_of(context)
+        assert abs(now[0, 2] - x[0, 2]) < 1e-14
+        if scheme != "leapfrog":
+            assert speed[0, 2] == 0
+        energy = total_energy(context) if energy is None else energy
+        assert total_energy(context) == pytest.approx(energy, abs=0.5)
+    assert integrator.degrees_of_freedom() == 3 * 22 - system.getNumConstraints() - 1
+    assert context.getStepCount() == 100
+
+
+@pytest.mark.parametrize("evaluates", [False, True])
+def test_a_part_that_holds_nothing_changes_nothing(evaluates):
+    """With forces kept within a call or not."""
+    system, x, v = loose_alanine()
+    contexts = []
+    for parts in ((), (HeldCoordinates([], 2, 0.0, 22, evaluates=evaluates),)):
+        integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=parts)
+        contexts.append(started(system, integrator, x, v))
+        integrator.step(10)
+    np.testing.assert_allclose(state_of(contexts[0]), state_of(contexts[1]), atol=1e-10)
+
+
+class Reluctant(HeldCoordinates):
+    """Fails to project velocities where the global variable `reluctant` is 1."""
+
+    def declare(self, program):
+        super().declare(program)
+        program.number("reluctant", "1 where velocities cannot be projected")
+
+    def project(self, program):
+        super().project(program)
+        program.let("failed", f"select(reluctant,{self.code},failed)", "told to")
+
+
+@pytest.mark.parametrize("evaluates", [False, True])
+@pytest.mark.parametrize(
+    ("scheme", "how"), [("rattle", "steepest"), ("geodesic", "reluctant"), ("suzuki4", "reluctant")]
+)
+def test_a_failed_step_is_taken_back_and_not_counted(scheme, how, evaluates):
+    system, x, v = loose_alanine()
+
+    def begun():
+        part = Reluctant([0], 2, x[0, 2], 22, evaluates=evaluates)
+        integrator = ProjectedIntegrator(1e-3, scheme, parts=[part], tolerance=1e-13)
+        return integrator, started(system, integrator, x, v)
+
+    integrator, context = begun()
+    integrator.step(7)
+    before = state_of(context)
+    usual = integrator.getGlobalVariableByName(how)
+    integrator.setGlobalVariableByName(how, 1.0 if how == "reluctant" else -1.0)
+    with pytest.raises(ConvergenceError, match="too steep") as caught:
+        integrator.step(5)
+    assert caught.value.step == 8
+    np.testing.assert_array_equal(state_of(context), before)
+    assert context.getStepCount() == 7
+    assert context.getTime() / PS == pytest.approx(0.007, rel=1e-12)
+    integrator.setGlobalVariableByName(how, usual)
+    integrator.step(5)
+    undisturbed, other = begun()
+    undisturbed.step(12)
+    np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("change", ["parameter", "box", "positions", "force"])
+def test_changes_from_outside_reach_the_next_step(change):
+    """Also where a part makes the integrator keep forces from one step to the next within a call."""
+    system, x, v = dumbbell()
+    system.removeConstraint(0)
+    system.setDefaultPeriodicBoxVectors(*(3 * np.eye(3)))
+    pair = openmm.CustomNonbondedForce("q/r")
+    pair.addGlobalParameter("q", 20.0)
+    pair.setNonbondedMethod(openmm.CustomNonbondedForce.CutoffPeriodic)
+    for _ in range(2):
+        pair.addParticle([])
+    system.addForce(pair)
+    spring = openmm.HarmonicBondForce()
+    spring.addBond(0, 1, 0.2, 100.0)
+    system.addForce(spring)
+    contexts = []
+    for parts in ((), (HeldCoordinates([], 0, 0.0, 2, evaluates=True),)):
+        integrator = ProjectedIntegrator(1e-3, parts=parts)
+        context = started(system, integrator, x, v)
+        integrator.step(5)
+        if change == "parameter":
+            context.setParameter("q", -80.0)
+        elif change == "box":
+            context.setPeriodicBoxVectors(*(2.1 * np.eye(3)))
+        elif change == "positions":
+            context.setPositions(x)
+        else:
+            context.getSystem().getForce(2).setBondParameters(0, 0, 1, 0.5, 3000.0)
+            context.getSystem().getForce(2).updateParametersInContext(context)
+        integrator.step(1)
+        contexts.append(state_of(context))
+        spring.setBondParameters(0, 0, 1, 0.2, 100.0)
+    np.testing.assert_allclose(contexts[0], contexts[1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parameters_of_forces_are_used_in_the_next_step(kind):
+    made, fresh, old = KINDS[kind](), KINDS[kind](), KINDS[kind]()
+    for one in (made, fresh, old) if "Langevin" in kind else ():
+        one.integrator.setFriction(0)
+    made.run(5)
+    state = made.context.getState(positions=True, velocities=True)
+    for one in (made, fresh):
+        force = one.context.getSystem().getForce(0)
+        force.setBondParameters(0, 1, 0, 0.3, 5000.0)
+        force.updateParametersInContext(one.context)
+    fresh.context.setState(state)
+    made.run(1)
+    fresh.run(1)
+    within = 1e-4 if "leapfrog" in kind else 1e-9
+    np.testing.assert_allclose(state_of(made.context), state_of(fresh.context), rtol=0, atol=within)
+    old.context.setState(state)
+    old.run(1)
+    assert np.abs(state_of(old.context)[1] - state_of(made.context)[1]).max() > 1e-2
+
+
+class Friction(Ensemble):
+    """An ensemble that is seen to be right: v falls exponentially during kicks."""
+
+    def declare(self, program):
+        program.number("rate", "of the friction", 1e3 * np.log(4.0))
+
+    def kick(self, step, h, impulse="", tangent=False, unseen=False):
+        step.project()
+        return f"(v+{impulse or 0})*exp(-rate*{h})"
+
+
+@pytest.mark.parametrize("parts", [False, True])
+def test_an_ensemble_writes_the_kicks(parts):
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(1e-3, parts=[holding()] if parts else [], ensemble=Friction(), tolerance=1e-12)
+    context = started(system, integrator, x, v)
+    integrator.applyVelocityConstraints(context)
+    before = state_of(context)[1]
+    integrator.step(1)
+    mass = masses_of(system)
+    kinetic = [mass @ np.sum(u**2, axis=1) for u in (before, state_of(context)[1])]
+    # Of the bonds' curvature and the projection this knows nothing: they cost little.
+    assert kinetic[1] / kinetic[0] == pytest.approx(1 / 16, rel=0.02)
+    assert copy.copy(integrator).program.listing() == integrator.program.listing()
+    assert integrator.program.listing().count("constrain velocities") == 3
+
+
+# -- calls ------------------------------------------------------------------------------------------
+
+LEAN = [
+    "part",
+    "part that evaluates",
+    "row",
+    "moving row",
+    "carried",
+    "carried beside bonds",
+    "carried, with a velocity",
+]
+
+
+def held(kind, **arguments):
+    """An integrator of this kind in its Context, and its part."""
+    system, x, v = loose_alanine()
+    if kind == "carried":
+        system, x, v = alanine()
+        system = copy.deepcopy(system)
+        part = hold(system, [], x, take="all")
+    elif kind == "carried beside bonds":
+        system = copy.deepcopy(system)
+        part = hold(system, Plane([0], [0, 0, 1]), x)
+        assert system.getNumConstraints()
+    elif kind == "carried, with a velocity":
+        part = hold(system, KnifeEdge(8, 20, [0, 0, 1]), x)
+    elif kind.endswith("row"):
+        rate = 0.05 if kind == "moving row" else 0.0
+        system = copy.deepcopy(system)
+        part = CollectiveRows(system, [Row(bond(4, 20), rate=rate), Row(bond(0, 9))], positions=x)
+    else:
+        part = holding(evaluates=kind.endswith("evaluates"), **arguments)
+    integrator = ProjectedIntegrator(1e-3, parts=[part], tolerance=1e-13)
+    context = started(system, integrator, x, v)
+    integrator.applyVelocityConstraints(context)
+    return integrator, context, part
+
+
+@pytest.mark.parametrize("kind", LEAN)
+def test_calls_of_any_length_make_the_same_motion(kind):
+    """Within a call steps leave out what only a reader of velocities needs."""
+    ends, parts = [], []
+    for blocks in ([12], [5, 7], [1] * 12, [3, 1, 8]):
+        integrator, context, part = held(kind)
+        for steps in blocks:
+            integrator.step(steps)
+        ends.append(state_of(context))
+        parts.append((integrator, context, part))
+    for x, v in ends[1:]:
+        np.testing.assert_allclose(x, ends[0][0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(v, ends[0][1], rtol=0, atol=3e-11)
+    (one, there, ours), (other, _, theirs) = parts[0], parts[2]
+    if kind.endswith("row"):
+        for name in ("multipliers", "mean_multipliers", "work"):
+            found, singly = getattr(ours, name)(one), getattr(theirs, name)(other)
+            np.testing.assert_allclose(found, singly, rtol=1e-7, atol=1e-6, err_msg=name)
+        assert np.abs(ours.rates(there)).max() <= 1e-12
+    if kind == "carried":
+        np.testing.assert_allclose(ours.step_multipliers, theirs.step_multipliers, rtol=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if "Langevin" not in kind])
+def test_steps_in_tens_are_those_of_one_call(kind):
+    """As an app.Simulation asks for them; noise aside, which Reference and CPU draw with each computation."""
+    ends = []
+    for calls in ([60], [10] * 6):
+        made = KINDS[kind]()
+        for steps in calls:
+            made.integrator.step(steps)
+        ends.append(state_of(made.context))
+        assert made.context.getStepCount() == 60
+        assert made.context.getTime()._value == pytest.approx(0.12, rel=1e-12)
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "more"),
+    [
+        (lambda system, x: RattleIntegrator(1e-3), 0),
+        (lambda system, x: ProjectedIntegrator(1e-3), 0),
+        (lambda system, x: ProjectedIntegrator(1e-3, "leapfrog"), 0),
+        (lambda system, x: ProjectedIntegrator(1e-3, "blanes-moan4"), 0),
+        (lambda system, x: ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1.0)), 0),
+        (lambda system, x: ProjectedIntegrator(1e-3, ensemble=Isokinetic(300, momentum="free")), 0),
+        # Beside parts, one more a call: OpenMM keeps the forces of the last groups only.
+        (
+            lambda system, x: ProjectedIntegrator(1e-3, parts=[CollectiveRows(system, [Row(bond(2, 5))], positions=x)]),
+            1,
+        ),
+        (lambda system, x: ProjectedIntegrator(1e-3, parts=[hold(system, Plane([5], [0, 0, 1]), x)]), 1),
+    ],
+    ids=["RattleIntegrator", "rattle", "leapfrog", "blanes-moan4", "Langevin", "Isokinetic", "collective", "carried"],
+)
+def test_evaluations_of_forces_in_tens(make, more):
+    """OpenMM evaluates the forces once a step (five times in that of order 4), in however many calls."""
+    system, x, v = alanine()
+    system = copy.deepcopy(system)
+    while system.getNumForces():
+        system.removeForce(0)
+    if more:
+        while system.getNumConstraints():
+            system.removeConstraint(0)
+    evaluations = []
+
+    def nothing(state):
+        evaluations.append(1)
+        return 0.0, np.zeros(x.shape)
+
+    system.addForce(openmm.PythonForce(nothing))
+    integrator = make(system, x)
+    context = started(system, integrator, x, v)
+    integrator.step(10)
+    each = integrator.scheme.force_evaluations if hasattr(integrator, "scheme") and integrator.scheme else 1
+    evaluations.clear()
+    for _ in range(5):
+        integrator.step(10)
+    assert len(evaluations) == 50 * each + 5 * more
+    assert context.getStepCount() == 60
+
+
+def test_failure_where_nobody_looked():
+    """The state is complete, that of the step before, and the run can go on."""
+    integrator, context, _ = held("part", steepest=2e-4)
+    with pytest.raises(ConvergenceError) as caught:
+        integrator.step(1000)
+    done = context.getStepCount()
+    assert caught.value.step == done + 1
+    assert 3 < done < 97
+    assert context.getTime() / PS == pytest.approx(1e-3 * done, rel=1e-9)
+    x, v = state_of(context)
+    assert v[0, 2] == 0
+    assert residuals(context.getSystem(), context)[1] <= 1e-12
+    other, twin, _ = held("part")
+    other.step(done)
+    np.testing.assert_allclose(state_of(twin)[0], x, rtol=0, atol=1e-14)
+    assert np.abs(state_of(twin)[1] - v).max() <= 1e-12
+    integrator.setGlobalVariableByName("steepest", np.inf)
+    integrator.step(20)
+    other.step(20)
+    assert np.abs(state_of(twin)[0] - state_of(context)[0]).max() <= 1e-12
+
+
+@pytest.mark.parametrize("agent", ["barostat", "thermostat", "momentum"])
+def test_agents_of_the_system(agent):
+    """A carried row stays exact where a barostat moves x between steps; a thermostat meets complete velocities."""
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(0.9)
+    grid = np.array(list(np.ndindex(4, 4, 4))) * 0.5
+    x = np.concatenate([grid, grid + np.array([0.15, 0, 0])])
+    for _ in x:
+        force.addParticle(0, 0.2, 0.5)
+        system.addParticle(20.0)
+    for k in range(64):
+        force.addException(k, 64 + k, 0, 1, 0)
+        system.addConstraint(k, 64 + k, 0.15)
+    system.addForce(force)
+    system.setDefaultPeriodicBoxVectors(*(2.0 * np.eye(3)))
+    part = hold(system, [], x, take="all")
+    if agent == "barostat":
+        system.addForce(openmm.MonteCarloBarostat(50, 300, 3))
+    elif agent == "thermostat":
+        system.addForce(openmm.AndersenThermostat(300, 5))
+    else:
+        system.addForce(openmm.CMMotionRemover(1))
+    integrator = ProjectedIntegrator(2e-3, parts=[part])
+    context = started(system, integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    for _ in range(5):
+        integrator.step(20)
+        report = part.report(context)
+        assert report.residual <= 1e-13
+        assert report.velocity_residual <= 1e-13
+    if agent == "barostat":
+        edge = context.getState().getPeriodicBoxVectors(asNumpy=True)._value[0, 0]
+        assert edge != 2.0
+    if agent == "momentum":
+        momentum = masses_of(system) @ state_of(context)[1]
+        assert np.abs(momentum).max() <= 1e-3
+
+
+@platforms
+def test_leapfrog_knows_its_kinetic_energy(platform):
+    system, x, v = alanine()
+    energies, ends = [], []
+    for blocks in ([10], [1] * 10):
+        integrator = ProjectedIntegrator(1e-3, "leapfrog")
+        context = started(system, integrator, x, v, platform)
+        for steps in blocks:
+            integrator.step(steps)
+        energies.append(context.getState(energy=True).getKineticEnergy()._value)
+        ends.append(state_of(context))
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert energies[0] == energies[1]
+
+
+@platforms
+def test_leapfrog_at_rest_has_no_kinetic_energy(platform):
+    """Two particles pressed against each other at a held distance: half a kick and half of what holds it cancel."""
+    system = openmm.System()
+    press = openmm.CustomExternalForce("-100*sign*x")
+    press.addPerParticleParameter("sign")
+    for k, sign in enumerate((1.0, -1.0)):
+        system.addParticle(4.0)
+        press.addParticle(k, [sign])
+    system.addForce(press)
+    system.addConstraint(0, 1, 0.3)
+    x = np.array([[-0.15, 0, 0], [0.15, 0, 0]])
+    integrator = ProjectedIntegrator(0.01, "leapfrog")
+    context = started(system, integrator, x, np.zeros((2, 3)), platform)
+    integrator.step(7)
+    there, v = state_of(context)
+    assert np.abs(there - x).max() <= 1e-12
+    assert np.abs(v).max() <= 1e-10
+    # A kick of half a step alone is (0.01 100/4/2)^2 4 = 0.06 kJ/mol.
+    assert context.getState(energy=True).getKineticEnergy()._value <= 1e-10
+
+
+@pytest.mark.parametrize("kind", ["constant energy", "RattleIntegrator", "sphere"])
+def test_a_number_of_steps_that_is_none_is_refused(kind):
+    """Nothing moves; whole numbers of any kind are taken."""
+    made = KINDS[kind]()
+    for wrong in (2.5, "3", None, -1, True):
+        with pytest.raises(InputError, match=r"steps is .*; give a whole number, 0 or more") as caught:
+            made.integrator.step(wrong)
+        assert caught.value.item == "steps"
+    assert made.context.getStepCount() == 0
+    for steps in (0, 2, 3.0, np.int64(4)):
+        made.integrator.step(steps)
+    assert made.context.getStepCount() == 9
+
+
+@pytest.mark.parametrize("before", [100, 0])
+def test_checks_that_come_more_often_make_no_step_more(before):
+    """Steps since the last check may be more than the new interval."""
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3, check_every=before)
+    context = started(system, integrator, x, v)
+    integrator.step(50)
+    integrator.check_every = 10
+    integrator.step(100)
+    assert context.getStepCount() == 150
+    at_once = ProjectedIntegrator(1e-3)
+    other = started(system, at_once, x, v)
+    at_once.step(150)
+    np.testing.assert_array_equal(state_of(context)[0], state_of(other)[0])
+
+
+# -- a look where a call ends ------------------------------------------------------------------------
+
+LOOKING = {
+    "rattle": lambda step: ProjectedIntegrator(step, check_every=0),
+    "leapfrog": lambda step: ProjectedIntegrator(step, "leapfrog", check_every=0),
+    "suzuki4": lambda step: ProjectedIntegrator(step, "suzuki4", check_every=0),
+    "Langevin": lambda step: ProjectedIntegrator(step, check_every=0, ensemble=Langevin(300, 1.0)),
+    "LangevinRespa": lambda step: ProjectedIntegrator(
+        step, check_every=0, ensemble=LangevinRespa(300, 1.0, {0: 1, 1: 2})
+    ),
+    "Isokinetic": lambda step: ProjectedIntegrator(step, check_every=0, ensemble=Isokinetic(300)),
+    "RattleIntegrator": lambda step: RattleIntegrator(step, check_every=0),
+}
+
+
+def springs(n=8):
+    """A chain of stiff springs that no step of 20 fs can follow, and none of the solvers of constraints notice."""
+    system, force = openmm.System(), openmm.HarmonicBondForce()
+    for k in range(n):
+        system.addParticle(12.0)
+        if k:
+            force.addBond(k - 1, k, 0.1, 3e5)
+    force.setForceGroup(1)
+    system.addForce(force)
+    x = np.c_[0.1 * np.arange(n), 0.05 * (np.arange(n) % 2), np.zeros(n)]
+    v = np.random.default_rng(2).normal(0, 0.4, x.shape)
+    return system, x, v - v.mean(axis=0)
+
+
+@pytest.mark.parametrize("platform", ["Reference", *on_gpus("mixed")])
+@pytest.mark.parametrize("call", [1, 10, 25])
+@pytest.mark.parametrize("name", [name for name in LOOKING if name != "Isokinetic"])
+def test_an_explosion_is_told_where_its_call_ends(name, call, platform):
+    """Without any check but the first: lengths do not become 1e62 nm without a word."""
+    if call != 10 and platform != "Reference":
+        pytest.skip("each Context compiles its program")
+    system, x, v = springs()
+    integrator = LOOKING[name](20 * unit.femtosecond)
+    context = started(system, integrator, x, v, platform)
+    x, v = state_of(context)
+    with pytest.raises(NonFiniteError, match="take a smaller time step") as caught:
+        for _ in range(200):
+            integrator.step(call)
+            assert np.abs(state_of(context)[1]).max() < 1e6
+    assert caught.value.step % call == 0 and 0 <= caught.value.atom < 8
+    np.testing.assert_array_equal(state_of(context), [x, v])
+    assert context.getStepCount() == 0
+    integrator.setStepSize(0.5 * unit.femtosecond)
+    integrator.step(call)
+
+
+@pytest.mark.parametrize("name", ["rattle", "Langevin", "RattleIntegrator"])
+def test_a_simulation_tells_of_an_explosion(name):
+    system, x, v = springs()
+    topology = app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for k in range(system.getNumParticles()):
+        topology.addAtom(f"C{k}", app.element.carbon, residue)
+    integrator = LOOKING[name](20 * unit.femtosecond)
+    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation.context.setPositions(x)
+    simulation.context.setVelocities(v)
+    with pytest.raises(NonFiniteError, match="velocity of"):
+        simulation.step(60)
+    np.testing.assert_array_equal(state_of(simulation.context), [x, v])
+
+
+@pytest.mark.parametrize("platform", [*PLATFORMS, *on_gpus("mixed")])
+@pytest.mark.parametrize("name", LOOKING)
+def test_a_look_changes_nothing(name, platform, monkeypatch):
+    system, x, v = springs()
+    ends = []
+    for looked in (True, False):
+        integrator = LOOKING[name](0.5 * unit.femtosecond)
+        if name.startswith("Langevin"):
+            integrator.setFriction(0)  # no noise, which numbers drawn for the look would change
+        context = started(system, integrator, x, v, platform)
+        if not looked:
+            inner = getattr(integrator, "_ends", integrator)
+            control = inner._control
+            inner._control = lambda name, value=1.0, of=control: (
+                contextlib.nullcontext() if name == "ending" else of(name, value)
+            )
+            inner._watch().look = lambda: None
+        for _ in range(3):
+            integrator.step(7)
+        ends.append(state_of(context))
+    np.testing.assert_array_equal(*ends)
+
+
+def test_light_is_the_limit_and_no_smaller_speed():
+    """Particles may be fast: 1 dalton at a tenth of the speed of light is no explosion of a System of many."""
+    system, x, _ = springs()
+    integrator = LOOKING["rattle"](1e-6 * unit.femtosecond)
+    context = started(system, integrator, x, np.eye(8)[:, :3] * 3e4)
+    integrator.step(1)
+    context.setVelocities(np.full((8, 3), 3e5))
+    with pytest.raises(NonFiniteError, match=r"particle \d has a velocity of 5.2e\+05 nm/ps at step 2"):
+        integrator.step(1)
