@@ -38,11 +38,7 @@ def table():
 def test_a_row_a_method_and_setting():
     found = table()
     assert list(found.columns) == list(measure.COLUMNS)
-    assert (
-        list(found.method)
-        == [name for name in ("rattle", "ase-kcons", "dop853", "verlet") for _ in range(len(found) // 4)]
-        or True
-    )
+    assert list(dict.fromkeys(found.method)) == ["rattle", "ase-kcons", "dop853", "verlet"]
     rattle = found[found.method == "rattle"]
     assert list(rattle.setting) == pytest.approx([dt / chain().units.time_unit for dt in chain().time_steps])
     assert list(rattle.steps) == [round(chain().horizon / dt) for dt in chain().time_steps]
