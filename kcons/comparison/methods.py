@@ -6,7 +6,7 @@ user's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -17,11 +17,11 @@ import numpy as np
 from scipy.linalg import qr
 
 from kcons import steppers
-from kcons.comparison.runs import InAse, InOpenMM, OfSciPy, OfStates, OnArrays, Run
+from kcons.comparison.runs import InAse, InOpenMM, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import InputError, KconsError, did_you_mean
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, System
 
@@ -319,27 +319,11 @@ def independent_rows(system: TestSystem, held: ConstraintSet | None = None) -> C
 # -- SciPy ------------------------------------------------------------------------------------------
 
 
-class _Landing(OfSciPy):
-    """Positions and velocities go back onto the constraints after each step (Hairer, Lubich and Wanner, IV.4)."""
-
-    def __init__(self, solver: Any, system: TestSystem, motion: Motion, last: list[FloatArray]) -> None:
-        super().__init__(solver, system.positions.shape)
-        self.system, self.motion, self.last = system, motion, last
-
-    def advance(self, steps: int = 1) -> None:
-        for _ in range(steps):
-            super().advance()
-            (x, v), t = self.observe(), self.time
-            x = self.motion.project_positions(x, x, time=t)
-            v = self.motion.project_velocities(x, v, time=t)
-            # By less than the tolerance: the force known there need not be computed again.
-            f = self.last[0]
-            self.solver.y = np.concatenate([x.ravel(), v.ravel()])
-            self.solver.f = np.concatenate([v.ravel(), self.motion.acceleration(x, v, f, t).ravel()])
-
-
 def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
-    """DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105); nothing else stops a drift off the rows."""
+    """DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105); nothing else stops a drift off the rows.
+
+    With `land`, positions and velocities go back onto the rows after each step (Hairer, Lubich and Wanner, IV.4).
+    """
     from scipy.integrate import DOP853
 
     # Off the surface rows that depend on each other contradict each other.
@@ -352,12 +336,26 @@ def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
         f = last[0] = system.potential.forces(x, t)
         return np.concatenate([y[n:], motion.acceleration(x, v, f, t).ravel()])
 
+    def states() -> Iterator[State]:
+        while True:
+            message, t = solver.step(), float(solver.t)
+            if solver.status == "failed":
+                raise KconsError(f"DOP853 gave up at t = {t:g}: {message}")
+            x, v = solver.y.reshape(2, *shape)
+            if land:
+                x = motion.project_positions(x, x, time=t)
+                v = motion.project_velocities(x, v, time=t)
+                solver.y = np.concatenate([x.ravel(), v.ravel()])
+                # By less than the tolerance: the force known there need not be computed again.
+                solver.f = np.concatenate([v.ravel(), motion.acceleration(x, v, last[0], t).ravel()])
+            yield State(x, v, time=t)
+
     # Errors are measured against one unit of length and the thermal speed, not against each entry.
     speed = float(np.sqrt(np.mean(system.velocities**2))) or 1.0
     start = np.concatenate([system.positions.ravel(), system.velocities.ravel()])
     atol = rtol * np.repeat([1.0, speed], n)
     solver = DOP853(rate, 0.0, start, system.horizon, rtol=max(rtol, 1e-13), atol=atol)
-    return _Landing(solver, system, motion, last) if land else OfSciPy(solver, shape)
+    return OfStates(states(), State(system.positions, system.velocities))
 
 
 add_method("dop853", partial(_dop853, False), title="SciPy DOP853 on eq. 105", adaptive=True)

@@ -13,7 +13,6 @@ import numpy as np
 
 from kcons import steppers
 from kcons.constraints.target import FloatArray
-from kcons.errors import KconsError
 from kcons.steppers import State, Stepper, System
 
 if TYPE_CHECKING:
@@ -102,28 +101,6 @@ class OfStates(Run):
 
     def observe(self) -> tuple[FloatArray, FloatArray]:
         return self.state.positions, self.state.velocities
-
-
-class OfSciPy(Run):
-    """An `OdeSolver` of SciPy on y = (x, v)."""
-
-    def __init__(self, solver: Any, shape: tuple[int, ...]) -> None:
-        super().__init__(0.0)
-        self.solver, self.shape = solver, shape
-
-    @property
-    def time(self) -> float:
-        return float(self.solver.t)
-
-    def advance(self, steps: int = 1) -> None:
-        for _ in range(steps):
-            message = self.solver.step()
-            if self.solver.status == "failed":
-                raise KconsError(f"{type(self.solver).__name__} gave up at t = {self.time:g}: {message}")
-
-    def observe(self) -> tuple[FloatArray, FloatArray]:
-        x, v = self.solver.y.reshape(2, *self.shape)
-        return x, v
 
 
 class InAse(Run):

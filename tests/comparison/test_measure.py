@@ -38,11 +38,7 @@ def table():
 def test_a_row_a_method_and_setting():
     found = table()
     assert list(found.columns) == list(measure.COLUMNS)
-    assert (
-        list(found.method)
-        == [name for name in ("rattle", "ase-kcons", "dop853", "verlet") for _ in range(len(found) // 4)]
-        or True
-    )
+    assert list(dict.fromkeys(found.method)) == ["rattle", "ase-kcons", "dop853", "verlet"]
     rattle = found[found.method == "rattle"]
     assert list(rattle.setting) == pytest.approx([dt / chain().units.time_unit for dt in chain().time_steps])
     assert list(rattle.steps) == [round(chain().horizon / dt) for dt in chain().time_steps]
@@ -118,13 +114,16 @@ class Slow(Run):
 
 
 def test_what_exceeds_the_budget_is_stopped_after_a_step(registry):
-    add_method("slow", Slow)
-    found = compare(chain(), ["slow", "rattle"], budget=0.2, rounds=0)
+    class Slower(Slow):
+        seconds = 0.5
+
+    add_method("slow", Slower)
+    found = compare(chain(), ["slow", "rattle"], budget=2.0, rounds=0)
     slow = found[found.method == "slow"]
     assert "partial" in set(slow.status) and set(slow.status) <= {"ok", "partial", "not run"}
     first = slow[slow.status == "partial"].iloc[0]
-    assert first.steps >= 1 and np.isnan(first.error) and first.step_seconds == pytest.approx(0.05, rel=0.5)
-    assert "exceed the budget of 0.2 s" in first.note
+    assert first.steps >= 1 and np.isnan(first.error) and first.step_seconds == pytest.approx(0.5, rel=0.5)
+    assert "exceed the budget of 2 s" in first.note
     assert (found[found.method == "rattle"].status == "ok").all()
 
 

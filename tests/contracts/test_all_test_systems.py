@@ -16,17 +16,10 @@ from kcons.errors import InputError
 from tests.contracts.test_reference_orders import EPS, sensitivities
 from tests.reference import cases
 
-#: Molecules with forces of OpenMM, see test_structure.
-MOLECULES = {"alanine", "dhfr", "dhfr-water", "villin"}
-
 
 @functools.cache
 def solution(name, time):
     return small(name).solution(time)
-
-
-def test_every_system_is_covered_here():
-    assert set(SMALL) | MOLECULES == set(test_systems.SYSTEMS)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -129,12 +122,6 @@ def test_solution_stays_on_the_constraints(name):
         np.testing.assert_allclose(system.constraint_set.value(x, time), 0.0, rtol=0, atol=2e-14)
         if time == 0.0:
             np.testing.assert_allclose(x, system.positions, rtol=0, atol=1e-14)
-
-
-# -- geometry ---------------------------------------------------------------------------------------
-
-
-# -- potentials and MD engines ---------------------------------------------------------------------------
 
 
 # -- bad input --------------------------------------------------------------------------------------

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hard_cases.problem import Array, Problem
-from kcons.comparison.runs import Run
+from kcons.comparison.runs import InAse, InOpenMM, OnArrays, Run
 from kcons.steppers import Stepper
 
 
@@ -115,7 +115,7 @@ class Program:
             run.advance(block)
             done += block
             if wrap:
-                run.put(wrapped(run.observe()[0], problem.cell))
+                put(run, wrapped(run.observe()[0], problem.cell))
             if watch and done % every == 0:
                 watch(seen := frame())
                 if not np.all(np.isfinite(seen.x)):
@@ -139,3 +139,15 @@ def wrapped(x: Array, cell: Any) -> Array:
     """Atoms put into the cell one by one; those inside are not touched."""
     lattice = np.asarray(cell, dtype=float)
     return np.asarray(x - np.floor(x @ np.linalg.inv(lattice)) @ lattice)
+
+
+def put(run: Run, x: Array) -> None:
+    """Other positions, such as those wrapped into a cell, and the velocities as they are."""
+    if isinstance(run, OnArrays):
+        run.state = replace(run.state, positions=x)
+    elif isinstance(run, InAse):  # as atoms.wrap() does it: not through the constraints
+        run.atoms.arrays["positions"][:] = x
+    elif isinstance(run, InOpenMM):
+        run.context.setPositions(x * run.length)
+    else:
+        raise TypeError(type(run).__name__)

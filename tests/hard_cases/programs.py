@@ -20,7 +20,7 @@ from hard_cases.contract import (
     Program,
 )
 from hard_cases.problem import Array, Problem
-from kcons.comparison.runs import InAse, InOpenMM, OnArrays, Run, ase_constraints
+from kcons.comparison.runs import InAse, InOpenMM, OnArrays, Run
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
@@ -113,10 +113,18 @@ class PlainAse(Program):
     def hold(self, atoms: Any, problem: Problem) -> None:
         if problem.others:
             raise CannotExpressError(f"ASE has no {', '.join(sorted({c.family for c in problem.others}))}")
-        degrees = np.degrees(problem.held_angles)
-        options: Any = {"epsilon": 1e-10} if len(degrees) else {}
-        rows = (problem.pairs, problem.held_lengths, problem.triples, degrees)
-        atoms.set_constraint(ase_constraints(problem.fixed, *rows, internals=bool(len(degrees)), **options))
+        from ase.constraints import FixAtoms, FixBondLengths, FixInternals
+
+        held: list[Any] = [FixAtoms(list(problem.fixed))] if len(problem.fixed) else []
+        pairs, lengths = np.asarray(problem.pairs).tolist(), np.asarray(problem.held_lengths).tolist()
+        degrees, triples = np.degrees(problem.held_angles).tolist(), np.asarray(problem.triples).tolist()
+        if degrees:
+            bonds, angles = zip(lengths, pairs, strict=True), zip(degrees, triples, strict=True)
+            rows = [list(map(list, bonds)) or None, list(map(list, angles))]
+            held.append(FixInternals(bonds=rows[0], angles_deg=rows[1], epsilon=1e-10))
+        elif pairs:
+            held.append(FixBondLengths(pairs, bondlengths=lengths))
+        atoms.set_constraint(held)
 
     def dynamics(self, atoms: Any, dt: float) -> Any:
         """What makes steps."""

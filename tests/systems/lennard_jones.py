@@ -88,15 +88,6 @@ class LennardJones:
         f = np.zeros_like(x)
         return float(_evaluate(x, self.molecule, self.sites, self.box, self.cutoff, f)), f
 
-    def rigid_sample(self, x: FloatArray, arm: float = 1.0) -> tuple[float, float]:
-        """|grad U|^2 and laplacian of U in the shifts and turns of whole molecules.
-
-        For `kcons.thermostats.configurational_temperature`. Any scale `arm` of angles against lengths will do.
-        Molecules must be whole, not wrapped.
-        """
-        shift, bend, turn, twist = self.split_sample(x)
-        return shift + turn / arm**2, bend + twist / arm**2
-
     def split_sample(self, x: FloatArray) -> tuple[float, float, float, float]:
         """|grad U|^2 and laplacian of U in the shifts of whole molecules, and both in their turns (per radian)."""
         found = _rigid(x, self.molecule, self.first, self.sites, self.box, self.cutoff)

@@ -21,11 +21,14 @@ STORED = {
     "bead-torus": "A08_torus_geodesic",
 }
 
-SMALL = {"water": 8, "chain": 5, "chain-straight": 5, "chain-175": 5, "chain-free": 5, "sphere": 2, "ethanol": 1}
-SMALL.update({"sphere-pendulum": 2, "sphere-pendulum-top": 2})
-SMALL.update(dict.fromkeys(STORED, 1), dumbbells=2, slab=1)
-if find_spec("openmm") is not None:
-    SMALL["alanine"] = 1
+#: Molecules with forces of OpenMM that are too large, see tests/comparison/test_files.py.
+LARGE = {"dhfr", "dhfr-water", "villin", *(() if find_spec("openmm") else ("alanine",))}
+#: All others, those that a user or a test has added included.
+SMALL = {
+    name: 5 if name.startswith("chain") else entry.quick_size
+    for name, entry in test_systems.SYSTEMS.items()
+    if name not in LARGE
+}
 
 
 def small(name, **options):

@@ -88,15 +88,14 @@ def test_curvatures_of_a_fluid():
     split = TemperatureSplit(chosen.system(), seed=3)
     for _ in range(1000):
         split.add(x)
-    # Sums over shifts alone, and with the turns: arms that do not count, and of length 1.
-    far, near = (np.array(forces.rigid_sample(x, arm)) for arm in (1e9, 1.0))
+    forward, bend, torque, twist = forces.split_sample(x)
     mass, inertia = 2.0, 2 * (0.5 * fluid.BOND) ** 2
     above = np.array(split._series)[0, 0, :, 0]
-    assert above[0] == pytest.approx(far[0] / mass, rel=1e-9)
-    assert above[1] == pytest.approx((near - far)[0] / inertia, rel=1e-9)
+    assert above[0] == pytest.approx(forward / mass, rel=1e-9)
+    assert above[1] == pytest.approx(torque / inertia, rel=1e-9)
     shift, turn, rest = curvatures(split)
-    assert abs(shift.off(far[1] / mass)) <= 3.5 and shift.error < 0.04 * shift.value
-    assert abs(turn.off((near - far)[1] / inertia)) <= 3.5 and turn.error < 0.04 * turn.value
+    assert abs(shift.off(bend / mass)) <= 3.5 and shift.error < 0.04 * shift.value
+    assert abs(turn.off(twist / inertia)) <= 3.5 and turn.error < 0.04 * turn.value
     assert rest.value == 0
 
 

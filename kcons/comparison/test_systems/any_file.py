@@ -264,27 +264,18 @@ def _of_ase(snapshot: Any, name: str) -> Potential:
 
 
 def _calculator(name: str, atoms: Any) -> Any:
-    from ase.calculators import calculator as known
+    from kcons.ase.named_calculators import named_calculator
 
-    word = name.lower()
-    if word in ("gfn1", "gfn2"):
-        if find_spec("tblite") is None:
-            raise UnsupportedError(f"{name} needs tblite; python -m pip install tblite")
-        from tblite.ase import TBLite
-
-        return TBLite(method=f"GFN{word[-1]}-xTB", verbosity=0)
+    word, settings = name if ":" in name else name.lower(), {}
     if word == "tip3p":
-        from ase.calculators.tip3p import TIP3P
-
         widths = atoms.cell.lengths()[atoms.pbc]
         cutoff = min(9.0, 0.49 * float(widths.min())) if len(widths) else 9.0
-        return TIP3P(rc=cutoff, width=min(1.0, cutoff / 3))
+        settings = {"rc": cutoff, "width": min(1.0, cutoff / 3)}
     try:
-        return known.get_calculator_class(word)()
-    except Exception as error:
+        return named_calculator(word, settings)
+    except InputError as error:
         raise InputError(
             f"no forces {name!r}; there are openmm, {', '.join(CALCULATORS)}, force fields of OpenMM by name (such as "
-            "amber14-all,amber14/tip3p), and the calculators of ASE that need no settings "
-            f"({type(error).__name__}: {error})",
+            f"amber14-all,amber14/tip3p), and the calculators of ASE that need no settings ({error})",
             item="forces",
         ) from error

@@ -88,7 +88,7 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
     if name not in SYSTEMS:
         raise InputError(
             f"there is no test system {name!r}{did_you_mean(name, SYSTEMS)}; there are {', '.join(SYSTEMS)}",
-            item="scene",
+            item="system",
         )
     entry = SYSTEMS[name]
     if size is None:
