@@ -338,7 +338,7 @@ class GroupRows(Part):
         if self.lean:
             sure = f"between*step(tolerance{c}-{_LEFT!r}*residual{c})"
             again = f"select({sure}, 3, 1)"
-            if first:  # of what is foreseen, sigma within the tolerance is taken away, too
+            if first:  # of what is extrapolated, sigma within the tolerance is taken away, too
                 going = f"max({going}, follows{c}*{sure})"
         p.let(
             f"state{c}",
@@ -460,12 +460,16 @@ def clock_of(variables: dict[str, float], code: int) -> float:
     return variables[f"clock{code}"] + (variables[f"flown{code}"] if kept else 0.0)
 
 
-def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
-    """All global variables of the integrator that holds the rows, by name; `InputError` for what is none."""
+def require_holder(integrator: openmm.CustomIntegrator) -> None:
+    """Refuse a Context, a Simulation or whatever else is given for the integrator that holds the rows."""
     if not isinstance(integrator, openmm.CustomIntegrator):
         raise InputError(
             f"integrator is a {type(integrator).__name__}; give the integrator that holds the rows", item="integrator"
         )
+
+
+def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
+    """All global variables of an integrator by name."""
     numbers = range(integrator.getNumGlobalVariables())
     return {integrator.getGlobalVariableName(k): integrator.getGlobalVariable(k) for k in numbers}
 
