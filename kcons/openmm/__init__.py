@@ -7,8 +7,8 @@ collective variables, surfaces and the constraint objects of kcons.
 - `topology`: constraints by name
 - `integrator`: the integrators and the programs they run
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover
-- `callback_rows`: constraint objects of kcons
 - `collective`: collective variables
+- `callback_rows`: constraint objects of kcons
 - `surfaces`: particles on surfaces
 """
 

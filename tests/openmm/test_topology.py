@@ -105,3 +105,14 @@ def test_bonds_are_springs_at_their_lengths_and_constraints():
     system.addConstraint(2, 3, 0.1)
     assert sorted(map(tuple, bonds_of(system, x).tolist())) == [(0, 1), (1, 2), (2, 3)]
     assert bonds_of(system, 2.0 * x).tolist() == [[2, 3]]  # springs far off their lengths make no structure
+
+
+def test_a_network_of_springs_is_no_molecule():
+    x = np.random.default_rng(4).uniform(size=(7, 3))
+    system, force = openmm.System(), openmm.HarmonicBondForce()
+    for i in range(7):
+        system.addParticle(12.0)
+        for j in range(i):
+            force.addBond(i, j, float(np.linalg.norm(x[i] - x[j])), 1000.0)
+    system.addForce(force)
+    assert len(bonds_of(system, x)) == 0

@@ -38,7 +38,7 @@ from kcons.openmm.collective.coordinates import (
     put_in_groups,
     unit_of,
 )
-from kcons.openmm.collective.row_program import GroupRows, variables_of
+from kcons.openmm.collective.row_program import GroupRows, require_holder
 from kcons.openmm.collective.rows_in_context import TOLERANCE, RowsInContext
 from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.program import Program
@@ -237,7 +237,7 @@ class CollectiveRows(GroupRows):
         slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
-        variables_of(integrator)
+        require_holder(integrator)
         if slope is not None:
             integrator.program.set(self._of("rate", row, integrator), slope)
         if self._rates[row] != 0.0:
@@ -397,7 +397,7 @@ class CollectiveRows(GroupRows):
         return self._read(integrator, "work")
 
     def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
-        variables_of(integrator)
+        require_holder(integrator)
         return np.array([integrator.getGlobalVariableByName(self._of(name, k, integrator)) for k in range(self.n_rows)])
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:

@@ -260,7 +260,7 @@ def moved_atoms(system: openmm.System, forces: Sequence[openmm.Force]) -> set[in
 _LENGTH = re.compile(r"^(r|x|y|z|distance\([pg]\d+,[pg]\d+\)|pointdistance\(.*\))$")
 _ANGLE = re.compile(r"^(theta|(angle|dihedral)\([pg]\d+(,[pg]\d+)*\)|pointangle\(.*\)|pointdihedral\(.*\))$")
 _DIHEDRAL = re.compile(r"^dihedral\([pg]\d+,[pg]\d+,[pg]\d+,[pg]\d+\)$")
-_CONSTRAINTS: dict[tuple[str, str], type[Constraint]] = {
+_CONSTRAINTS: dict[tuple[str, str], Any] = {
     ("CustomBondForce", "r"): Distance,
     ("CustomAngleForce", "theta"): Angle,
     ("CustomTorsionForce", "theta"): Dihedral,
@@ -317,7 +317,7 @@ def as_constraint(force: openmm.Force, target: float) -> Constraint | None:
         groups = [force.getGroupParameters(g) for g in terms[0][0]]
         if any(weights for _, weights in groups):  # by mass without them, as in kcons
             return None
-        return kind(*(list(atoms) for atoms, _ in groups), target)
+        return kind(*(list(atoms) for atoms, _ in groups), target)  # type: ignore[no-any-return]
     compound = isinstance(force, openmm.CustomCompoundBondForce)
     return kind(list(terms[0][0] if compound else terms[0][: _TERMS[type(force).__name__][1]]), target)
 

@@ -26,8 +26,8 @@ from kcons.steppers.operations import Exchange
 
 #: A pivot below this fraction of the row's own norm means that the row depends on others, in double precision.
 PIVOT = 1e-10
-#: A push leaves at most a tenth of sigma.
-_LEFT = 0.1
+#: A push that is not measured leaves this part of sigma at most; what it leaves more, the next step takes away.
+_LEFT = 0.01
 #: Integrators whose programs hold rows, by the address of the object of OpenMM.
 _HOLDING: weakref.WeakValueDictionary[int, openmm.CustomIntegrator] = weakref.WeakValueDictionary()
 
@@ -196,6 +196,11 @@ class GroupRows(Part):
             self._gradients(p)
         if self._start == f"start{c}":
             p.each(self._start, "x", "to start again from")
+        if self.lean:
+            p.let(f"follows{c}", f"led*follows{c}", "do the last steps tell the first push?")
+        for k in range(self.n_rows):
+            line = f"select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)" if self.lean else "0"
+            p.let(self._of("push", k), line, "on the line through the last ones" if self.lean else "first without")
 
     def _gradients(self, p: Program, sizes: bool = True) -> None:
         """Rows, their Gram matrix and its inverse at x; v stays."""
@@ -273,7 +278,8 @@ class GroupRows(Part):
             p.let(f"flown{c}", f"flown{c}+select(first_stage, 0, {h})", "targets at the end of the drift")
         if self._base != "xu":
             p.each(self._base, "x", "positions as other parts leave them")
-        self._extrapolate(p)
+        if self.lean:  # joined with the passes before it
+            p.each("x", f"x+{self._pushes}", "where pushes of the last steps lead")
         p.let(f"iterations{c}", f"select(failed, iterations{c}, 0)", "a new solve")
         p.let(f"state{c}", "select(failed, 2, 1)", "after a failure only fly")
         # The first pass is written apart: a block within the loop makes the set-up of OpenMM take 15 times as long.
@@ -295,20 +301,6 @@ class GroupRows(Part):
             self._gradients(p)
         if self._leapfrog:
             self._end_step(p)
-
-    def _extrapolate(self, p: Program) -> None:
-        """The first pushes: none, or on the line through the last ones."""
-        c = self.code
-        if not self.lean:
-            for k in range(self.n_rows):
-                p.let(self._of("push", k), "0", "first without")
-            return
-        p.let(f"follows{c}", f"led*follows{c}", "do the last steps tell this push?")
-        for k in range(self.n_rows):
-            line = f"select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)"
-            p.let(self._of("push", k), line, "on the line through the last ones")
-        with p.when(f"follows{c} != 0", "there is such a line"):
-            p.each("x", f"{self._base}+{self._pushes}", "there, with what is foreseen")
 
     def _push(self, p: Program) -> None:
         if self.meets_system:
@@ -346,7 +338,7 @@ class GroupRows(Part):
         if self.lean:
             sure = f"between*step(tolerance{c}-{_LEFT!r}*residual{c})"
             again = f"select({sure}, 3, 1)"
-            if first:  # of what is foreseen, sigma within the tolerance is taken away, too
+            if first:  # of what is extrapolated, sigma within the tolerance is taken away, too
                 going = f"max({going}, follows{c}*{sure})"
         p.let(
             f"state{c}",
@@ -462,12 +454,16 @@ def clock_of(variables: dict[str, float], code: int) -> float:
     return variables[f"clock{code}"] + (variables[f"flown{code}"] if kept else 0.0)
 
 
-def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
-    """All global variables of the integrator that holds the rows, by name; `InputError` for what is none."""
+def require_holder(integrator: openmm.CustomIntegrator) -> None:
+    """Refuse a Context, a Simulation or whatever else is given for the integrator that holds the rows."""
     if not isinstance(integrator, openmm.CustomIntegrator):
         raise InputError(
             f"integrator is a {type(integrator).__name__}; give the integrator that holds the rows", item="integrator"
         )
+
+
+def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
+    """All global variables of an integrator by name."""
     numbers = range(integrator.getNumGlobalVariables())
     return {integrator.getGlobalVariableName(k): integrator.getGlobalVariable(k) for k in numbers}
 

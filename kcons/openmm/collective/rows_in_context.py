@@ -153,13 +153,23 @@ class RowsInContext:
                 self.context.setPositions(state.getPositions())
             self.context.setVelocities(state.getVelocities())
 
-    def _scaled_gram(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """A, M_par^+ A^T, A M_par^+ A^T and the size of each row without the constraints of the System."""
+    def _grams(self) -> tuple[FloatArray, FloatArray, FloatArray, list[int]]:
+        """A, M_par^+ A^T, A M_par^+ A^T, and the rows that add something to those before them."""
         gradients = self.gradients()
         directions = self._directions(gradients)
         gram = np.einsum("jai,kai->jk", gradients, directions)
+        gram = 0.5 * (gram + gram.T)
         own = np.einsum("kai,a->k", gradients**2, self._inverse_masses[:, 0])
-        return gradients, directions, 0.5 * (gram + gram.T), own
+        good = np.isfinite(own) & (own > 0)
+        size = np.sqrt(np.where(good, own, 1.0))
+        scaled = gram / (size[:, None] * size)
+        adding: list[int] = []
+        for k in np.flatnonzero(good).tolist():
+            before = scaled[np.ix_(adding, adding)], scaled[adding, k]
+            left = scaled[k, k] - (before[1] @ np.linalg.lstsq(*before, rcond=None)[0] if adding else 0.0)
+            if left > self._small:
+                adding.append(k)
+        return gradients, directions, gram, adding
 
     def gram(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(A, M_par^+ A^T, A M_par^+ A^T).
@@ -169,14 +179,9 @@ class RowsInContext:
         SingularGeometryError
             Rows that vanish, or depend on others or on the System's constraints.
         """
-        gradients, directions, gram, own = self._scaled_gram()
-        good = np.isfinite(own) & (own > 0)
-        scaled = gram / np.sqrt(np.where(good, own, 1.0)[:, None] * np.where(good, own, 1.0))
+        gradients, directions, gram, adding = self._grams()
         for k in range(self.rows.n_rows):
-            left = scaled[k, k] if good[k] else 0.0
-            if k and good[: k + 1].all():
-                left -= scaled[k, :k] @ np.linalg.lstsq(scaled[:k, :k], scaled[:k, k], rcond=None)[0]
-            if not left > self._small:
+            if k not in adding:
                 raise SingularGeometryError(
                     f"row {k} ({self.rows.names[k]}) vanishes, or depends on the rows before it or on the "
                     "constraints of the System. Leave out a row that others imply; a dihedral over a straight angle "
@@ -187,9 +192,7 @@ class RowsInContext:
 
     def rank(self) -> int:
         """Number of rows that are independent of one another and of the System's constraints."""
-        _, _, gram, own = self._scaled_gram()
-        size = np.sqrt(np.where(own > 0, own, 1.0))
-        return int(np.sum(np.linalg.eigvalsh(gram / (size[:, None] * size)) > self._small))
+        return len(self._grams()[3])
 
     @property
     def finest(self) -> float:

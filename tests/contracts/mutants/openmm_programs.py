@@ -291,6 +291,12 @@ MUTANTS = [
         "openmm_runs.py::test_a_run_goes_on_bit_for_bit",
     ),
     (
+        "openmm/callback_rows/callbacks.py",
+        "_READ[key] = engine = Engine(uuid.uuid4().hex, *recipe)",
+        "_READ[key] = engine = Engine(key, *recipe)",
+        "tests/openmm/callback_rows/test_callbacks.py::test_copies_of_a_system_have_engines_of_their_own",
+    ),
+    (
         "openmm/callback_rows/carried_constraints.py",
         "return self.motion.rank - 3 * fixed",
         "return self.motion.rank",

@@ -1,26 +1,22 @@
-"""Constraints of a System handed over to kcons: the same molecules, nothing half done."""
+"""Constraints of a System handed over to kcons: the same molecules, nothing half done, far targets."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import openmm
 import pytest
 from ase.build import molecule
-from openmm import app, unit
+from carried_systems import PEPTIDE, context_of, start, started, state_of
+from openmm import app
 
 from kcons.constraints import Dihedral, Distance, Plane
 from kcons.errors import ContradictionError, InputError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.callback_rows.hold import hold, take_constraints
+from kcons.openmm import ProjectedIntegrator, hold, take_constraints
 
-PEPTIDE = app.PDBFile(str(Path(__file__).parents[2] / "data" / "alanine-dipeptide-implicit.pdb"))
 TRIANGLE = np.array([[0, 0, 0], [0.09572, 0, 0], [-0.024, 0.09266, 0]])
-
-
-def reference(system, integrator):
-    return openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+SIDES = {(i, j): float(np.linalg.norm(TRIANGLE[i] - TRIANGLE[j])) for i, j in ((0, 1), (0, 2), (1, 2))}
+WATERS = [[a + i, a + j] for a in (0, 3, 6) for i, j in SIDES]
+X = np.array(PEPTIDE.positions._value)
 
 
 def peptide(constraints=app.AllBonds):
@@ -29,34 +25,28 @@ def peptide(constraints=app.AllBonds):
     )
 
 
-def waters(count, barostat=None):
+def waters(count, *forces):
     """Rigid waters in a box, and a dumbbell behind them."""
     system = openmm.System()
     system.setDefaultPeriodicBoxVectors([3, 0, 0], [0, 3, 0], [0, 0, 3])
+    x = [r + np.array([0.35 * k, 0.1, 0.1]) for k in range(count) for r in TRIANGLE] + [[0.1, 0.7, 0], [0.25, 0.7, 0]]
+    for mass in [15.999, 1.008, 1.008] * count + [12.0, 12.0]:
+        system.addParticle(mass)
+    for k in range(count):
+        for (i, j), length in SIDES.items():
+            system.addConstraint(3 * k + i, 3 * k + j, length)
+    system.addConstraint(3 * count, 3 * count + 1, 0.15)
     nonbonded = openmm.NonbondedForce()
     nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    x = []
-    for k in range(count):
-        for m, r in zip([15.999, 1.008, 1.008], TRIANGLE, strict=True):
-            system.addParticle(m)
-            x.append(r + np.array([0.35 * k, 0.1, 0.1]))
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            system.addConstraint(3 * k + i, 3 * k + j, float(np.linalg.norm(TRIANGLE[i] - TRIANGLE[j])))
-    for _ in range(2):
-        system.addParticle(12.0)
-    x += [[0.1, 0.7, 0], [0.25, 0.7, 0]]
-    system.addConstraint(3 * count, 3 * count + 1, 0.15)
     for _ in x:
         nonbonded.addParticle(0.0, 0.1, 0.0)
-    system.addForce(nonbonded)
-    if barostat is not None:
-        system.addForce(barostat)
+    for force in (nonbonded, *forces):
+        system.addForce(force)
     return system, np.array(x)
 
 
 def molecules(system):
-    context = reference(system, openmm.VerletIntegrator(0.001))
-    return [list(atoms) for atoms in context.getMolecules()]
+    return [list(atoms) for atoms in context_of(system, openmm.VerletIntegrator(0.001)).getMolecules()]
 
 
 def content(system):
@@ -68,85 +58,41 @@ def content(system):
 
 @pytest.mark.parametrize("constraints", [app.HBonds, app.AllBonds, app.HAngles], ids=str)
 def test_all_constraints_change_hands(constraints):
+    """As they were, and the energy and forces, and what is a molecule."""
     system = peptide(constraints)
-    lengths = {
-        frozenset(c[:2]): c[2]._value for c in map(system.getConstraintParameters, range(system.getNumConstraints()))
-    }
-    (rows,) = take_constraints(system)
+    held = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    kept = []
+    for taken in (False, True):
+        if taken:
+            (rows,) = take_constraints(system)
+        state = started(context_of(system, openmm.VerletIntegrator(1e-3)), X).getState(energy=True, forces=True)
+        kept.append((state.getPotentialEnergy(), state.getForces(asNumpy=True)._value.tolist(), molecules(system)))
+    assert kept[0] == kept[1]
     assert system.getNumConstraints() == 0
-    assert {frozenset(p): d for p, d in zip(rows.atoms.tolist(), rows.target, strict=True)} == lengths
+    found = {frozenset(p): d for p, d in zip(rows.atoms.tolist(), rows.target, strict=True)}
+    assert found == {frozenset((i, j)): d._value for i, j, d in held}
 
 
-def test_molecules_stay_what_they_were():
-    for system in (peptide(app.AllBonds), waters(4)[0]):
-        before = molecules(system)
-        take_constraints(system, keep_water=False)
-        assert system.getNumConstraints() == 0
-        assert molecules(system) == before
-
-
-def test_ties_have_no_strength():
-    system = peptide()
-    context = reference(system, openmm.VerletIntegrator(0.001))
-    context.setPositions(PEPTIDE.positions)
-    before = context.getState(energy=True, forces=True)
-    take_constraints(system)
-    context = reference(system, openmm.VerletIntegrator(0.001))
-    context.setPositions(PEPTIDE.positions)
-    after = context.getState(energy=True, forces=True)
-    assert after.getPotentialEnergy() == before.getPotentialEnergy()
-    assert np.array_equal(after.getForces(asNumpy=True)._value, before.getForces(asNumpy=True)._value)
-
-
-def test_rigid_water_stays_with_openmm():
+@pytest.mark.parametrize(
+    ("arguments", "options", "pairs", "left"),
+    [
+        ((), {}, [[9, 10]], 9),  # rigid water stays with OpenMM
+        (([4],), {}, [[3, 4], [3, 5], [4, 5]], 7),
+        (("hbonds",), {"keep_water": False}, WATERS, 1),
+        (("hbonds",), {}, [], 10),
+        (([],), {}, [], 10),
+        (("all",), {"keep_water": False}, [*WATERS, [9, 10]], 0),
+        (("all",), {"keep_water": False, "angles": True}, [*WATERS, [9, 10]], 0),
+    ],
+)
+def test_clusters_are_taken_whole(arguments, options, pairs, left):
     system, _ = waters(3)
-    (rows,) = take_constraints(system)
-    assert rows.atoms.tolist() == [[9, 10]]
-    assert system.getNumConstraints() == 9
-
-
-def test_chosen_atoms_take_their_cluster_along():
-    system, _ = waters(3)
-    (rows,) = take_constraints(system, [4])
-    assert sorted(map(sorted, rows.atoms.tolist())) == [[3, 4], [3, 5], [4, 5]]
-    assert system.getNumConstraints() == 7
-
-
-def test_clusters_with_hydrogens():
-    system, _ = waters(2)
-    (rows,) = take_constraints(system, "hbonds", keep_water=False)
-    assert rows.n_rows == 6
-    assert take_constraints(system, "hbonds") == []
-    assert system.getNumConstraints() == 1
-
-
-def test_angles_come_back_as_angles():
-    """The hydrogens' angles of HAngles are those of the force field."""
-    system = peptide(app.HAngles)
-    flexible = peptide(None)
-    angles = next(f for f in flexible.getForces() if isinstance(f, openmm.HarmonicAngleForce))
-    expected = {}
-    for k in range(angles.getNumAngles()):
-        i, j, m, theta, _ = angles.getAngleParameters(k)
-        expected[(min(i, m), j, max(i, m))] = theta._value
-    distances, bent = take_constraints(system, angles=True)
-    assert (distances.family, distances.n_rows) == ("Distance", 21)
-    assert (bent.family, bent.n_rows) == ("Angle", 9)
-    for (i, j, m), theta in zip(bent.atoms.tolist(), bent.target, strict=True):
-        assert theta == pytest.approx(expected[(min(i, m), j, max(i, m))], abs=1e-9)
-
-
-def test_water_and_straight_angles_stay_distances():
-    system, _ = waters(1)
-    rows = take_constraints(system, keep_water=False, angles=True)
-    assert [r.family for r in rows] == ["Distance"]
-    system = openmm.System()
-    for _ in range(4):
-        system.addParticle(12.0)
-    for i, j, d in ((0, 1, 0.116), (1, 2, 0.116), (0, 2, 0.232), (2, 3, 0.15)):
-        system.addConstraint(i, j, d)
-    (rows,) = take_constraints(system, angles=True)
-    assert rows.n_rows == 4
+    before = molecules(system)
+    rows = take_constraints(system, *arguments, **options)
+    assert [r.family for r in rows] == ["Distance"] * bool(pairs)
+    assert sorted(sorted(p) for r in rows for p in r.atoms.tolist()) == sorted(pairs)
+    assert system.getNumConstraints() == left
+    assert molecules(system) == before
 
 
 @pytest.mark.parametrize("which", ["bonds", [99], [-1], [0.5]])
@@ -155,8 +101,31 @@ def test_unknown_choices_change_nothing(which):
     before = content(system)
     with pytest.raises(InputError):
         take_constraints(system, which)
-    assert take_constraints(system, []) == []
     assert content(system) == before
+
+
+def test_angles_come_back_as_angles():
+    """The hydrogens' angles of HAngles are those of the force field."""
+    flexible = peptide(None)
+    angles = next(f for f in flexible.getForces() if isinstance(f, openmm.HarmonicAngleForce))
+    expected = {}
+    for k in range(angles.getNumAngles()):
+        i, j, m, theta, _ = angles.getAngleParameters(k)
+        expected[(min(i, m), j, max(i, m))] = theta._value
+    distances, bent = take_constraints(peptide(app.HAngles), angles=True)
+    assert (distances.family, distances.n_rows, bent.family, bent.n_rows) == ("Distance", 21, "Angle", 9)
+    for (i, j, m), theta in zip(bent.atoms.tolist(), bent.target, strict=True):
+        assert theta == pytest.approx(expected[(min(i, m), j, max(i, m))], abs=1e-9)
+
+
+def test_straight_angles_stay_distances():
+    system = openmm.System()
+    for _ in range(4):
+        system.addParticle(12.0)
+    for i, j, d in ((0, 1, 0.116), (1, 2, 0.116), (0, 2, 0.232), (2, 3, 0.15)):
+        system.addConstraint(i, j, d)
+    (rows,) = take_constraints(system, angles=True)
+    assert rows.n_rows == 4
 
 
 # -- holding --------------------------------------------------------------------------------------
@@ -167,19 +136,14 @@ def test_hold_moves_what_a_row_touches_and_nothing_else():
     part = hold(system, Distance([[0, 6]]), x)
     assert system.getNumConstraints() == 7
     assert part.motion.constraint_set.n_rows == 7
-    integrator = ProjectedIntegrator(0.001, parts=[part])
-    context = reference(system, integrator)
-    context.setPositions(x)
-    context.setVelocitiesToTemperature(300, 1)
-    context.applyVelocityConstraints(1e-10)
-    part.apply_velocities(context)
-    part.check(context)
+    context = context_of(system, integrator := ProjectedIntegrator(0.001, parts=[part]))
+    start(context, part, x)
+    integrator.applyVelocityConstraints(context)
     integrator.step(100)
     part.check(context)
-    there = context.getState(positions=True).getPositions(asNumpy=True)._value
+    there = state_of(context)[0]
     for k in range(4):
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            length = np.linalg.norm(TRIANGLE[i] - TRIANGLE[j])
+        for (i, j), length in SIDES.items():
             assert np.linalg.norm(there[3 * k + i] - there[3 * k + j]) == pytest.approx(length, abs=1e-7)
 
 
@@ -194,161 +158,76 @@ def test_angle_rows_and_distance_rows_of_hangles_are_the_same_motion():
     ends = []
     for angles in (False, True):
         system = peptide(app.HAngles)
-        part = hold(system, [], PEPTIDE.positions, take="all", angles=angles)
-        context = reference(system, ProjectedIntegrator(0.001, parts=[part]))
-        context.setPositions(PEPTIDE.positions)
-        part.apply_positions(context)
-        context.setVelocitiesToTemperature(300, 1)
-        part.apply_velocities(context)
+        part = hold(system, [], X, take="all", angles=angles)
+        context = context_of(system, ProjectedIntegrator(0.001, parts=[part]))
+        start(context, part, X)
         context.getIntegrator().step(1)
-        ends.append(context.getState(positions=True).getPositions(asNumpy=True)._value)
+        ends.append(state_of(context)[0])
     # One step of RATTLE along gradients of other rows: the same up to the third order of the step.
     assert np.abs(ends[0] - ends[1]).max() <= 1e-5
 
 
-def test_nothing_changes_when_hold_is_refused():
-    system, x = waters(2)
+@pytest.mark.parametrize(
+    ("rows", "x", "error", "words"),
+    [
+        ([Distance([[0, 3]], 0.2), Distance([[3, 0]], 0.3)], None, ContradictionError, "different targets"),
+        ([Distance([[0, 99]])], None, InputError, "99"),
+        (["bond"], None, InputError, "no kcons constraint"),
+        (None, None, InputError, "no kcons constraint"),
+        ([Distance([[0, 3]], 1.9)], None, InputError, "half the box"),
+        ([Distance([[0, 3]])], np.zeros((3, 3)), InputError, "shape"),
+        ([], None, InputError, "no rows"),
+    ],
+)
+def test_nothing_changes_when_hold_is_refused(rows, x, error, words):
+    system, there = waters(2)
     before = content(system)
-    for rows, error in (
-        ([Distance([[0, 3]], 0.2), Distance([[3, 0]], 0.3)], ContradictionError),
-        ([Distance([[0, 99]])], InputError),
-        (["bond"], InputError),
-        (None, InputError),
-        ([Distance([[0, 3]], 1.9)], InputError),
-        ([Distance([[0, 3]], -1.0)], ValueError),
-    ):
-        with pytest.raises(error):
-            hold(system, rows, x)
-    with pytest.raises(InputError):
-        hold(system, [Distance([[0, 3]])], x[:3])
-    with pytest.raises(InputError, match="no rows"):
-        hold(system, [], x)
+    with pytest.raises(error, match=words):
+        hold(system, rows, there if x is None else x)
     assert content(system) == before
-
-
-# -- barostats ------------------------------------------------------------------------------------
 
 
 def barostat():
     return openmm.MonteCarloBarostat(1.0, 300.0, 5)
 
 
-def test_a_row_between_molecules_and_a_barostat_are_refused():
-    system, x = waters(2, barostat())
+@pytest.mark.parametrize(
+    ("rows", "force", "words"),
+    [
+        (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #6 Distance\(0, 3\).*join=True"),
+        (Plane([6], [0, 0, 1]), barostat(), "ties atoms to a place"),
+        (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
+        (Distance([[6, 7]]), openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False), "setScaleMoleculesAsRigid"),
+    ],
+    ids=["between molecules", "place", "momentum", "scaled atoms"],
+)
+def test_agents_that_break_rows_are_refused(rows, force, words):
+    system, x = waters(2, force)
     before = content(system)
-    with pytest.raises(UnsupportedError, match=r"MonteCarloBarostat.*row #6 Distance\(0, 3\).*join=True"):
-        hold(system, Distance([[0, 3]]), x)
+    with pytest.raises(UnsupportedError, match=words):
+        hold(system, rows, x)
     assert content(system) == before
 
 
-def test_joined_molecules_move_as_one():
-    system, x = waters(6, barostat())
-    part = hold(system, Distance([[0, 3]]), x, join=True)
-    integrator = ProjectedIntegrator(0.001, parts=[part])
-    context = reference(system, integrator)
-    assert [0, 1, 2, 3, 4, 5] in [sorted(m) for m in context.getMolecules()]
-    context.setPositions(x)
-    context.setVelocitiesToTemperature(300, 1)
-    context.applyVelocityConstraints(1e-10)
-    part.apply_velocities(context)
-    part.check(context)
+@pytest.mark.parametrize(
+    ("rows", "options", "groups"),
+    [
+        (Distance([[0, 3]]), {"join": True}, [[0, 1, 2, 3, 4, 5], [6, 7]]),
+        ([], {"take": "all", "keep_water": False}, [[0, 1, 2], [3, 4, 5], [6, 7]]),
+    ],
+    ids=["joined", "within molecules"],
+)
+def test_molecules_move_whole_under_pressure(rows, options, groups):
+    system, x = waters(2, barostat())
+    part = hold(system, rows, x, **options)
+    context = context_of(system, integrator := ProjectedIntegrator(0.001, parts=[part]))
+    assert sorted(sorted(m) for m in context.getMolecules()) == groups
+    start(context, part, x)
+    integrator.applyVelocityConstraints(context)
     edge = context.getState().getPeriodicBoxVectors()[0][0]._value
     integrator.step(300)
     part.check(context)
     assert context.getState().getPeriodicBoxVectors()[0][0]._value != edge
-
-
-@pytest.mark.parametrize(
-    ("rows", "force", "words"),
-    [
-        (Plane([6], [0, 0, 1]), openmm.MonteCarloBarostat(1.0, 300.0), "ties atoms to a place"),
-        (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
-        (Distance([[6, 7]]), openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False), "setScaleMoleculesAsRigid"),
-    ],
-    ids=["place", "momentum", "scaled atoms"],
-)
-def test_agents_that_break_rows_are_refused(rows, force, words):
-    system, x = waters(2, force)
-    with pytest.raises(UnsupportedError, match=words):
-        hold(system, rows, x)
-
-
-def test_barostat_and_rows_within_molecules_go_together():
-    system, x = waters(2, barostat())
-    part = hold(system, [], x, take="all", keep_water=False)
-    context = reference(system, ProjectedIntegrator(0.001, parts=[part]))
-    context.setPositions(x)
-    part.apply_positions(context)
-    context.setVelocitiesToTemperature(300, 1)
-    part.apply_velocities(context)
-    context.getIntegrator().step(100)
-    part.check(context)
-    assert len(context.getMolecules()) == 3
-
-
-# -- `apply_positions` of rows from `hold`, with far targets: bonds of the System lead, and stay as they are --
-
-
-DATA = Path(__file__).parents[2] / "data"
-REFERENCE = openmm.Platform.getPlatformByName("Reference")
-
-
-def placed(system: openmm.System, rows, x: np.ndarray) -> openmm.Context:
-    context = openmm.Context(system, ProjectedIntegrator(0.001, parts=[rows]), REFERENCE)
-    context.setPositions(x)
-    return context
-
-
-def positions(context: openmm.Context) -> np.ndarray:
-    return context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-
-
-@pytest.mark.parametrize("hydrogen", [1.008, 3.024])
-@pytest.mark.parametrize("degrees", [150, 75, 30, -60])
-def test_masses_alone(degrees: float, hydrogen: float) -> None:
-    """A System without forces: distances say what is bonded, whatever the masses (heavy hydrogens)."""
-    atoms = molecule("CH3CH2OH")
-    x = 0.1 * atoms.positions
-    system = openmm.System()
-    for number, mass in zip(atoms.numbers, atoms.get_masses(), strict=True):
-        system.addParticle(hydrogen if number == 1 else mass)
-    rows = hold(system, Dihedral([[3, 2, 1, 0]], np.radians(degrees)), x)
-    context = placed(system, rows, x)
-    rows.apply_positions(context)
-    atoms.positions = 10 * positions(context)
-    assert rows.report(context).residual < 1e-13
-    assert abs(atoms.get_distance(2, 3) - 10 * np.linalg.norm(x[2] - x[3])) < 1e-9
-    rows.check(context)
-
-
-@pytest.mark.parametrize("constraints", [None, app.HBonds, app.AllBonds, app.HAngles])
-def test_alanine_dipeptide(constraints: object) -> None:
-    """Both torsions of the backbone far away, with constraints of the System that go into the rows or stay."""
-    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
-    field = app.ForceField("amber14-all.xml")
-    system = field.createSystem(pdb.topology, constraints=constraints)
-    x = pdb.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-    bonds = np.array([(b[0].index, b[1].index) for b in pdb.topology.bonds()])
-    rows = hold(system, Dihedral([[4, 6, 8, 14], [6, 8, 14, 16]], np.radians([-60.0, -45.0])), x)
-    context = placed(system, rows, x)
-    rows.apply_positions(context)
-    y = positions(context)
-    assert rows.report(context).residual < 1e-13
-    length = [np.linalg.norm(z[bonds[:, 0]] - z[bonds[:, 1]], axis=1) for z in (x, y)]
-    held = {tuple(sorted(a)) for c in rows.motion.constraint_set.constraints for a in c.atoms.tolist() if len(a) == 2}
-    others = np.array([tuple(sorted(b)) not in held for b in bonds.tolist()])
-    assert np.abs(length[1] - length[0])[others].max(initial=0.0) < 0.002
-    assert np.abs(length[1] - length[0]).max() < 0.004  # to the lengths of the force field
-
-
-def test_what_is_no_system_and_no_context() -> None:
-    for call in (take_constraints, lambda given: hold(given, Distance([[0, 3]]), PEPTIDE.positions)):
-        with pytest.raises(InputError, match=r"system is a Topology; give the openmm\.System"):
-            call(PEPTIDE.topology)
-    rows = hold(peptide(None), Distance([[0, 3]]), PEPTIDE.positions)
-    for call in (rows.check, rows.multipliers, rows.report, rows.apply_positions, rows.apply_velocities):
-        with pytest.raises(InputError, match=r"context is a VerletIntegrator; give the Context"):
-            call(openmm.VerletIntegrator(0.001))
 
 
 def test_two_parts_that_share_particles_are_refused():
@@ -359,3 +238,49 @@ def test_two_parts_that_share_particles_are_refused():
     with pytest.raises(UnsupportedError, match="two parts hold particle 1; give all rows"):
         ProjectedIntegrator(0.001, parts=parts)
     assert len(ProjectedIntegrator(0.001, parts=parts[::2]).parts) == 2
+
+
+def test_what_is_no_system_and_no_context():
+    for call in (take_constraints, lambda given: hold(given, Distance([[0, 3]]), PEPTIDE.positions)):
+        with pytest.raises(InputError, match=r"system is a Topology; give the openmm\.System"):
+            call(PEPTIDE.topology)
+    rows = hold(peptide(None), Distance([[0, 3]]), PEPTIDE.positions)
+    for call in (rows.check, rows.multipliers, rows.report, rows.apply_positions, rows.apply_velocities):
+        with pytest.raises(InputError, match=r"context is a VerletIntegrator; give the Context"):
+            call(openmm.VerletIntegrator(0.001))
+
+
+# -- far targets: bonds of the System lead, and stay as they are --------------------------------------
+
+
+@pytest.mark.parametrize("hydrogen", [1.008, 3.024])
+@pytest.mark.parametrize("degrees", [150, -60])
+def test_distances_say_what_is_bonded_where_there_are_no_forces(degrees, hydrogen):
+    atoms = molecule("CH3CH2OH")
+    x, system = 0.1 * atoms.positions, openmm.System()
+    for number, mass in zip(atoms.numbers, atoms.get_masses(), strict=True):
+        system.addParticle(hydrogen if number == 1 else mass)
+    rows = hold(system, Dihedral([[3, 2, 1, 0]], np.radians(degrees)), x)
+    context = started(context_of(system, ProjectedIntegrator(0.001, parts=[rows])), x)
+    rows.apply_positions(context)
+    y = state_of(context)[0]
+    assert rows.report(context).residual < 1e-13
+    assert abs(np.linalg.norm(y[2] - y[3]) - np.linalg.norm(x[2] - x[3])) < 1e-10
+    rows.check(context)
+
+
+@pytest.mark.parametrize("constraints", [None, app.HBonds, app.AllBonds, app.HAngles])
+def test_both_torsions_of_the_backbone_far_away(constraints):
+    """With constraints of the System that go into the rows or stay."""
+    system = app.ForceField("amber14-all.xml").createSystem(PEPTIDE.topology, constraints=constraints)
+    bonds = np.array([(b[0].index, b[1].index) for b in PEPTIDE.topology.bonds()])
+    rows = hold(system, Dihedral([[4, 6, 8, 14], [6, 8, 14, 16]], np.radians([-60.0, -45.0])), X)
+    context = started(context_of(system, ProjectedIntegrator(0.001, parts=[rows])), X)
+    rows.apply_positions(context)
+    y = state_of(context)[0]
+    assert rows.report(context).residual < 1e-13
+    length = [np.linalg.norm(z[bonds[:, 0]] - z[bonds[:, 1]], axis=1) for z in (X, y)]
+    held = {tuple(sorted(a)) for c in rows.motion.constraint_set.constraints for a in c.atoms.tolist() if len(a) == 2}
+    others = np.array([tuple(sorted(b)) not in held for b in bonds.tolist()])
+    assert np.abs(length[1] - length[0])[others].max(initial=0.0) < 0.002
+    assert np.abs(length[1] - length[0]).max() < 0.004  # to the lengths of the force field

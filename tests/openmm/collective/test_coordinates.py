@@ -394,6 +394,7 @@ def test_rows_that_make_no_sense_are_refused(rows, options, match):
     system = particles(5, bond(0, 1))
     system.getForce(0).setForceGroup(3)
     system.addConstraint(0, 1, 0.14)
+    assert CollectiveRows(particles(2), Row(bond(0, 1), 0.1), meets_system=True).meets_system
     with pytest.raises(InputError, match=match):
         CollectiveRows(system, rows(system), **{"positions": np.vstack([X, [1.0, 1, 1]])} | options)
     assert system.getNumForces() == 1

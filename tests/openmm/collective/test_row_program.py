@@ -35,29 +35,23 @@ from kcons.openmm.collective.coordinates import Row
 # -- multipliers ----------------------------------------------------------------------------------------
 
 
-def rotor(scheme="rattle", dt=0.002, row=None):
-    """A dumbbell of two masses, turning freely: the bond pulls with lambda = -mu omega^2 d."""
-    system = openmm.System()
-    system.addParticle(2.0)
-    system.addParticle(3.0)
-    part = CollectiveRows(system, [Row(bond(0, 1), 0.2)] if row is None else [row])
-    integrator = ProjectedIntegrator(dt, scheme, parts=[part])
-    x = np.array([[0.0, 0, 0], [0.2, 0, 0]])
-    v = np.array([[0.0, -3.0, 0], [0.0, 2.0, 0]])
-    context = context_of(system, integrator, x, v)
-    return context, integrator, part
-
-
-ROTOR = -(2.0 * 3.0 / 5.0) * 5.0**2 / 0.2
-
-
 @pytest.mark.parametrize("scheme", ["rattle", "suzuki4", "blanes-moan6", "geodesic"])
 def test_multiplier_of_a_rotor(scheme):
-    context, integrator, part = rotor(scheme, dt=0.001)
+    """A dumbbell of two masses, turning freely: the bond pulls with lambda = -mu omega^2 d."""
+    system = openmm.System()
+    for mass in (2.0, 3.0):
+        system.addParticle(mass)
+    part = CollectiveRows(system, [Row(bond(0, 1), 0.2)])
+    integrator = ProjectedIntegrator(0.001, scheme, parts=[part])
+    context = context_of(system, integrator, [[0, 0, 0], [0.2, 0, 0]], [[0, -3.0, 0], [0, 2.0, 0]])
     integrator.step(5)
-    assert part.multipliers_at(context) == pytest.approx([ROTOR], rel=1e-9)
+    expected = -(2.0 * 3.0 / 5.0) * 5.0**2 / 0.2
+    assert part.multipliers_at(context) == pytest.approx([expected], rel=1e-9)
     # An impulse along a chord: (omega dt)^2 off.
-    assert part.mean_multipliers(integrator) == pytest.approx([ROTOR], rel=2e-3)
+    assert part.mean_multipliers(integrator) == pytest.approx([expected], rel=2e-3)
+    if scheme == "blanes-moan6":  # none at a point of its step
+        with pytest.raises(UnsupportedError, match="mean_multipliers"):
+            part.multipliers(integrator)
 
 
 def test_multipliers_have_second_order():
@@ -88,14 +82,6 @@ def test_multipliers_of_a_static_load():
     assert part.multipliers(integrator) == pytest.approx([-30.0], abs=1e-9)
     assert part.mean_multipliers(integrator) == pytest.approx([-30.0], abs=1e-9)
     assert part.multipliers_at(context) == pytest.approx([-30.0], abs=1e-9)
-
-
-def test_multipliers_at_a_point_need_a_scheme_that_has_them():
-    _, integrator, part = held_chain([bond(0, 3)], scheme="blanes-moan6")
-    integrator.step(1)
-    with pytest.raises(UnsupportedError, match="mean_multipliers"):
-        part.multipliers(integrator)
-    assert np.isfinite(part.mean_multipliers(integrator)).all()
 
 
 # -- order, reversibility, energy -----------------------------------------------------------------------
@@ -130,26 +116,14 @@ def test_order_with_bonds_and_dihedrals(scheme, order, constraints):
 def test_reversible(platform, scheme, steps):
     context, integrator, _ = dipeptide(platform=platform, scheme=scheme)
     x, v = state_of(context)
+    energy = energy_of(context, integrator)
     integrator.step(steps)
+    assert abs(energy_of(context, integrator) - energy) < 0.5  # kJ/mol; the kinetic energy is about 60
     context.setVelocities(-state_of(context)[1])
     integrator.step(steps)
     back, turned = state_of(context)
     assert np.abs(back - x).max() <= 1e-12
     assert np.abs(turned + v).max() <= 1e-9
-
-
-@pytest.mark.slow
-def test_energy_neither_rises_nor_falls():
-    context, integrator, _ = dipeptide(app.HBonds, dt=0.0005)
-    energies = []
-    for _ in range(200):
-        integrator.step(10)
-        energies.append(energy_of(context, integrator))
-    time = 0.005 * np.arange(200)
-    slope = np.polyfit(time, energies, 1)[0]
-    # kJ/mol in a ps; the kinetic energy is about 60.
-    assert abs(slope) < 0.05
-    assert np.ptp(energies) < 0.5
 
 
 # -- moving targets -------------------------------------------------------------------------------------
@@ -183,29 +157,18 @@ def test_work_of_a_drive_is_the_change_of_energy():
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_a_step_that_failed_does_not_move_the_target():
+def test_failed_steps_and_constraints_alone_do_not_move_the_target():
     context, integrator, part = held_chain([Row(bond(0, 3), None, rate=0.2)])
     integrator.step(5)
-    x, v = state_of(context)
+    before, target = np.array(state_of(context)), part.targets(context)[0]
     integrator.setStepSize(2.0 * unit.picosecond)
     with pytest.raises(ConvergenceError):
         integrator.step(1)
+    assert np.array_equal(state_of(context), before)
     integrator.setStepSize(0.002)
-    assert np.array_equal(state_of(context)[0], x)
-    assert np.array_equal(state_of(context)[1], v)
-    integrator.step(5)
-    start = float(np.linalg.norm(CHAIN[0] - CHAIN[3]))
-    assert part.values(context)[0] == pytest.approx(start + 0.2 * 0.02, abs=1e-12)
-
-
-def test_constraints_applied_alone_do_not_move_the_target():
-    context, integrator, part = held_chain([Row(bond(0, 3), None, rate=0.2)])
-    integrator.step(5)
-    before = part.targets(context)[0]
     integrator.applyVelocityConstraints(context)
     integrator.applyConstraints(context)
-    integrator.applyVelocityConstraints(context)
-    assert part.targets(context)[0] == before
+    assert part.targets(context)[0] == target
     integrator.step(5)
     start = float(np.linalg.norm(CHAIN[0] - CHAIN[3]))
     assert part.values(context)[0] == pytest.approx(start + 0.2 * 0.02, abs=1e-12)
