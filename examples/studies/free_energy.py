@@ -388,7 +388,6 @@ def recording(turns: int = 40, steps: int = 200) -> dict[str, object]:
     from openmm import Platform, app
 
     from kcons.free_energy import HeldCoordinatesReporter, OpenMMWindows, Window
-    from kcons.openmm import Langevin as Bath
 
     pdb = app.PDBFile(str(Path(__file__).parents[2] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
     torsions = {"phi": Dihedral([[4, 6, 8, 14]]), "psi": Dihedral([[6, 8, 14, 16]])}
@@ -399,11 +398,10 @@ def recording(turns: int = 40, steps: int = 200) -> dict[str, object]:
         sampler = OpenMMWindows(pdb.topology, _system(pdb), pdb.positions, held, platform="Reference")
         start, _ = sampler.begin()
         window = Window(0, "up", tuple(start), tuple(start), 1)
-        bath = Bath(TEMPERATURE, FRICTION)
-        simulation = sampler._simulation(start, [0.0] * count, bath, STEP / 1000, window)
-        simulation.context.setPositions(pdb.positions)
-        simulation.integrator.applyConstraints()
-        simulation.integrator.setVelocitiesToTemperature(simulation.context, TEMPERATURE, 1)
+        settings = Settings(temperature=TEMPERATURE, timestep=STEP, friction=FRICTION, relax=0)
+        run = sampler.simulation(sampler.rows(), window, settings)
+        run.hold(window.start, window.target, "langevin", 1, 1)
+        simulation = run.simulation
         reporters = {every: HeldCoordinatesReporter(io.StringIO(), every, held) for every in (10, default)}
         for reporter in reporters.values():  # what is set up once
             simulation.reporters = [reporter]

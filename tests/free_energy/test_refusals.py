@@ -119,8 +119,10 @@ SAMPLERS = [
 # -- held coordinates: six atoms of a chain, and two more on a skate --
 
 X = np.array(
-    [[0, 0.1, 0.2], [1.1, 0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [2.2, -0.5, 2.4]]
-    + [[9, 9.1, 9.2], [10.1, 9, 8.9]]
+    [
+        *([0, 0.1, 0.2], [1.1, 0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9]),
+        *([3.1, 0.4, 1.9], [2.2, -0.5, 2.4], [9, 9.1, 9.2], [10.1, 9, 8.9]),
+    ]
 )
 R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), KnifeEdge(6, 7, (0, 0, 1))
 SET, STILL = ConstraintSet([R, CENTER, EDGE], X, np.ones(8)), np.zeros((8, 3))

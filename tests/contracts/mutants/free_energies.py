@@ -80,7 +80,7 @@ MUTANTS = [
         "free_energy/averages.py",
         "return factors[:, None] * (series",
         "return 1.0 * (series",
-        "tests/thermostats/test_correlated_series.py::test_errors_with_weights",
+        "tests/free_energy/test_averages.py::test_weights_that_belong_to_the_values",
     ),
     (
         "free_energy/profiles/gaussian_process.py",
