@@ -72,8 +72,9 @@ def main(full: bool) -> None:
     folder = Path("butane") if full else Path(tempfile.mkdtemp())
     folder.mkdir(exist_ok=True)
     given = read_input(input_in(folder, full))
-    windows = Windows(given.sampler, folder / "windows", given.settings, both_sides=full)
-    found = windows.run(given.targets, workers=2 if full else 1, progress=lambda *n: print(*n, flush=True))
+    how = {"workers": 2 if full else 1, "progress": lambda *n: print(*n, flush=True)}
+    windows = Windows(given.sampler, folder / "windows", given.settings, both_sides=full, **how)
+    found = windows.run(given.targets)
     for window in found.windows:
         degrees = np.degrees(window.value[0])
         print(f"{degrees:7.1f} {window.force[0]:8.2f} +- {window.error[0]:.2f} kJ/mol/rad, raw {window.raw[0]:.2f}")

@@ -228,13 +228,10 @@ def windows_of_phi(folder: Path) -> tuple[Windows, FreeEnergy]:
         pdb.topology, _system(pdb), pdb.positions, {"phi": Dihedral([[4, 6, 8, 14]])}, platform="Reference"
     )
     settings = Settings(timestep=STEP, temperature=TEMPERATURE, friction=FRICTION, production=PRODUCTION, every=25)
-    held = Windows(sampler, folder / "windows", settings)
-
-    def progress(*n: object) -> None:
-        print("windows", *n, flush=True)
-
-    held.run(np.linspace(-np.pi, np.pi, FIRST, endpoint=False), workers=1, progress=progress)
-    return held, held.improve(0.05, MOST, below=HIGHEST, workers=1, progress=progress, at_once=8)
+    said = {"workers": 1, "progress": lambda *n: print("windows", *n, flush=True)}
+    held = Windows(sampler, folder / "windows", settings, **said)
+    held.run(np.linspace(-np.pi, np.pi, FIRST, endpoint=False))
+    return held, held.improve(0.05, MOST, below=HIGHEST, at_once=8)
 
 
 def alanine(folder: Path) -> dict[str, object]:
@@ -306,7 +303,7 @@ def pulls(folder: Path, count: int = 64) -> dict[str, object]:
     held, result = windows_of_phi(folder)
     windows = result.profile.difference(start, end)
     settings = replace(held.settings, pull=5000)
-    found = Windows(held.sampler, folder / "pulls", settings).pull(start, end, count, workers=1)
+    found = Windows(held.sampler, folder / "pulls", settings, workers=1).pull(start, end, count)
     assert found.bar is not None and found.jarzynski_backward is not None
     ways = [f"{a:g}-to-{b:g}" for a, b in ((start, end), (end, start))]
     series = [[Series.load(file) for file in sorted((folder / "pulls").glob(f"pull-{way}-*.npz"))] for way in ways]

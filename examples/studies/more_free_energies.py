@@ -38,9 +38,9 @@ KT = 0.00831446261815324 * 300.0  # kJ/mol
 def sampled(
     sampler: object, places: object, folder: Path, settings: Settings, full: bool, both_sides: bool = True
 ) -> FreeEnergy:
-    windows = Windows(sampler, folder, settings, both_sides=full and both_sides)
     here = None if full else ThreadPoolExecutor(1)  # one window is not worth another process
-    found = windows.run(places, executor=here, workers=1, progress=lambda *n: print(folder.name, *n, flush=True))
+    how = {"executor": here, "workers": 1, "progress": lambda *n: print(folder.name, *n, flush=True)}
+    found = Windows(sampler, folder, settings, both_sides=full and both_sides, **how).run(places)
     if found.failed:
         raise SystemExit(f"{found.failed}; run it again to try these once more")
     return found
