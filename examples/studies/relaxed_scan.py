@@ -191,6 +191,18 @@ def by_sella(atoms: Atoms, quad: tuple[int, ...], value: float, positions: np.nd
     return counted.atoms.get_potential_energy(), counted.calls
 
 
+def by_ase(atoms: Atoms, quad: tuple[int, ...], value: float, positions: np.ndarray) -> tuple[float, int]:
+    """Energy in eV, and calls, of BFGS under the constraint of kcons."""
+    from ase.optimize import BFGS
+
+    counted = Counted(atoms)
+    counted.atoms.positions[:] = positions
+    counted.atoms.set_constraint(Constraints([Dihedral([list(quad)], value)]))
+    if not BFGS(counted.atoms, logfile=None).run(fmax=FMAX, steps=200):
+        raise RuntimeError("not converged")
+    return counted.atoms.get_potential_energy(), counted.calls
+
+
 def compared(name: str) -> dict[str, Any]:
     """One molecule: calls of each program, and how far its energies are from the sharp ones, in kJ/mol."""
     logging.disable(logging.CRITICAL)
@@ -230,7 +242,11 @@ def compared(name: str) -> dict[str, Any]:
     angles = [found.grid.at(attempt.point)[0] for attempt in found.attempts]
     sharp = np.array([by_geometric(atoms, quad, v, x, FMAX / 10)[0] for v, x in zip(angles, starts, strict=True)])
     result["off"]["kcons"] = float(np.max(np.abs([attempt.energy for attempt in found.attempts] - sharp))) * KJ
-    programs: dict[str, Callable[..., tuple[float, int]]] = {"geomeTRIC": by_geometric, "Sella": by_sella}
+    programs: dict[str, Callable[..., tuple[float, int]]] = {
+        "geomeTRIC": by_geometric,
+        "Sella": by_sella,
+        "ASE": by_ase,
+    }
     for program, relaxed in programs.items():
         energies, calls = zip(*(relaxed(atoms, quad, v, x) for v, x in zip(angles, starts, strict=True)), strict=True)
         result["calls"][program], result["points"][program] = sum(calls), list(calls)
@@ -272,13 +288,13 @@ def show(result: dict[str, Any]) -> None:
         return
     print(f"{result['points']} points, forces to {result['fmax']} eV/angstrom; calls of energy and forces by GFN2-xTB,")
     print("and how far energies are off, in kJ/mol: kcons, geomeTRIC, Sella")
-    print("molecule       barrier  kcons  geomeTRIC  Sella  its scan   off                     both ways")
+    print("molecule       barrier  kcons  geomeTRIC  Sella    ASE  its scan   off                     both ways")
     for r in result["molecules"]:
         calls = r["calls"]
         off = " ".join(f"{r['off'][name]:7.4f}" for name in ("kcons", "geomeTRIC", "Sella"))
         print(
             f"{r['molecule']:13s} {r['barrier']:8.2f} {calls['kcons']:6d} {calls['geomeTRIC']:10d} {calls['Sella']:6d} "
-            f"{calls[SCAN]:9d} {off} {r['both ways']['calls']:8d}"
+            f"{calls.get('ASE', 0):6d} {calls[SCAN]:9d} {off} {r['both ways']['calls']:8d}"
         )
     totals = {
         name: sum(r["calls"][name] for r in result["molecules"]) for name in ("kcons", "geomeTRIC", "Sella", SCAN)

@@ -120,14 +120,14 @@ MUTANTS = [
     ),
     (
         "free_energy/profiles/pulls.py",
-        "(1 / _effective(works) - 1 / len(works))",
-        "(1 / _effective(works))",
+        "(1 / effective - 1 / len(works))",
+        "(1 / effective)",
         "tests/free_energy/profiles/test_pulls.py::test_bias_of_the_exponential_average",
     ),
     (
         "free_energy/profiles/pulls.py",
-        "_times(jarzynski_back, -kT)",
-        "_times(jarzynski_back, kT)",
+        "_one_way(back, drawn_back, -kT)",
+        "_one_way(back, drawn_back, kT)",
         "tests/free_energy/profiles/test_pulls.py::test_directions_are_alike",
     ),
     (
