@@ -22,7 +22,7 @@ from scipy.special import expit, logsumexp
 
 from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers, positive
 from kcons.errors import InputError
-from kcons.free_energy.averages import pymbar
+from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
@@ -233,16 +233,14 @@ def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
 
 def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
     """Works over kT."""
-    values = numbers(works, item)
+    values = finite(works, item, "work")
     if values.ndim != 1 or len(values) < FEWEST:
         raise InputError(f"{item} has works of shape {values.shape}; give {FEWEST} pulls or more", item=item)
-    if not np.isfinite(values).all():
-        raise InputError(f"work {int(np.argmin(np.isfinite(values)))} of {item} is not finite; leave it out", item=item)
     return values / positive(thermal_energy, "thermal_energy")
 
 
 def _one_way(works: FloatArray, drawn: FloatArray, unit: float) -> tuple[Estimate, Estimate, float, float]:
-    """Jarzynski's average, the second cumulant, the bias of the first, and the pulls that count; in kT, backward -kT."""
+    """Jarzynski's average, the second cumulant, the bias of the first, the pulls that count; in kT, or -kT backward."""
 
     def jarzynski(w: FloatArray) -> FloatArray:
         return np.asarray(math.log(len(works)) - logsumexp(-w, axis=-1))
