@@ -23,8 +23,10 @@ model = partial(TBLite, method="GFN2-xTB", verbosity=0)  # makes a calculator: p
 sampler = AseWindows(atoms, model, {"torsion": torsion}, [bonds])
 settings = Settings(relax=2, pull=20, equilibration=20, production=5000 if full else 170, every=5)
 
-windows = Windows(sampler, f"free_energy{'_full' if full else ''}", settings, both_sides=full)
-result = windows.run(np.radians(np.arange(90, 181, 30)), executor=ThreadPoolExecutor(1))
+windows = Windows(
+    sampler, f"free_energy{'_full' if full else ''}", settings, both_sides=full, executor=ThreadPoolExecutor(1)
+)
+result = windows.run(np.radians(np.arange(90, 181, 30)))
 assert not result.failed
 for window in result.windows:
     angle, force, error = np.degrees(window.value[0]), window.force[0], window.error[0]

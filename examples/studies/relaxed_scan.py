@@ -188,6 +188,18 @@ def by_sella(atoms: Atoms, quad: tuple[int, ...], value: float, positions: np.nd
     return counted.atoms.get_potential_energy(), counted.calls
 
 
+def by_ase(atoms: Atoms, quad: tuple[int, ...], value: float, positions: np.ndarray) -> tuple[float, int]:
+    """Energy in eV, and calls, of BFGS under the constraint of kcons."""
+    from ase.optimize import BFGS
+
+    counted = Counted(atoms)
+    counted.atoms.positions[:] = positions
+    counted.atoms.set_constraint(Constraints([Dihedral([list(quad)], value)]))
+    if not BFGS(counted.atoms, logfile=None).run(fmax=FMAX, steps=200):
+        raise RuntimeError("not converged")
+    return counted.atoms.get_potential_energy(), counted.calls
+
+
 def compared(name: str) -> dict[str, Any]:
     """One molecule: calls of each program, and how far its energies are from the sharp ones, in kJ/mol."""
     logging.disable(logging.CRITICAL)
@@ -227,7 +239,11 @@ def compared(name: str) -> dict[str, Any]:
     angles = [found.grid.at(attempt.point)[0] for attempt in found.attempts]
     sharp = np.array([by_geometric(atoms, quad, v, x, FMAX / 10)[0] for v, x in zip(angles, starts, strict=True)])
     result["off"]["kcons"] = float(np.max(np.abs([attempt.energy for attempt in found.attempts] - sharp))) * KJ
-    programs: dict[str, Callable[..., tuple[float, int]]] = {"geomeTRIC": by_geometric, "Sella": by_sella}
+    programs: dict[str, Callable[..., tuple[float, int]]] = {
+        "geomeTRIC": by_geometric,
+        "Sella": by_sella,
+        "ASE": by_ase,
+    }
     for program, relaxed in programs.items():
         energies, calls = zip(*(relaxed(atoms, quad, v, x) for v, x in zip(angles, starts, strict=True)), strict=True)
         result["calls"][program], result["points"][program] = sum(calls), list(calls)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kcons.cli.parser import Command, Option
 from kcons.cli.scan import INCOMPLETE
@@ -33,29 +33,27 @@ def _free_energy(chosen: argparse.Namespace) -> int:
         )
     given = replace(given, scheduler=chosen.scheduler)
     folder: Path = chosen.out or Path(chosen.input.stem)
-    windows = Windows(given.sampler, folder, given.settings, **given.options)
+    how = {**given.options, "workers": given.processes if chosen.workers is None else chosen.workers}
+    windows = Windows(given.sampler, folder, given.settings, **how)
     # A folder belongs to settings, and pulls are slower than the way to a window.
     slow = replace(given.settings, pull=given.pull_steps)
-    pulls = Windows(given.sampler, folder / "pulls", slow, **given.options) if given.pulls else None
+    pulls = Windows(given.sampler, folder / "pulls", slow, **how) if given.pulls else None
     with windows.taken(), Bars() as watcher, given.executor() as executor:
 
         def progress(done: int, total: int, seconds: float) -> None:
             each = seconds / (total - done) if done < total else 0.0
             watcher.overall("windows", done * each, total * each)
 
-        how: dict[str, Any] = {
-            "executor": executor,
-            "workers": given.processes if chosen.workers is None else chosen.workers,
-            "progress": progress,
-        }
-        found = windows.run(given.targets, **how)
+        for each in filter(None, (windows, pulls)):
+            each.executor, each.progress = executor, progress
+        found = windows.run(given.targets)
         if given.improve and not found.failed:
-            found = windows.improve(**given.improve, **how)
+            found = windows.improve(**given.improve)
         # Before pulls, which may fail.
         written = found.write(folder)
         said = ""
         if given.pulls is not None and pulls is not None:
-            pulled = pulls.pull(**given.pulls, **how)
+            pulled = pulls.pull(**given.pulls)
             numbers, said = found.beside(pulled, given.pulls["start"], given.pulls["end"])
             written.append(folder / "pulls.json")
             with in_one_piece(written[-1]) as opened:

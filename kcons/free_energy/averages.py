@@ -83,6 +83,15 @@ def pymbar() -> ModuleType:
     return pymbar  # type: ignore[no-any-return]
 
 
+def finite(values: ArrayLike, item: str, row: str = "sample") -> FloatArray:
+    """Values as an array; `InputError` naming the first row that is not finite."""
+    array = numbers(values, item)
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        raise InputError(f"{item} of {row} {bad[0, 0] if array.ndim else 0} is not finite; leave it out", item=item)
+    return array
+
+
 def weighted_mean(
     values: ArrayLike,
     weights: ArrayLike | None = None,
@@ -215,7 +224,7 @@ def _checked(
     values: ArrayLike, weights: ArrayLike | None, log_weights: ArrayLike | None
 ) -> tuple[FloatArray, FloatArray]:
     """Values (n, d) and weights (n,) whose mean is about 1."""
-    series = numbers(values, "values")
+    series = finite(values, "values")
     series = series[:, None] if series.ndim == 1 else series
     if series.ndim != 2 or len(series) < FEWEST or not series.shape[1]:
         raise InputError(
@@ -226,13 +235,9 @@ def _checked(
         raise InputError("both weights and log_weights are given; give one of them", item="log_weights")
     item = "weights" if log_weights is None else "log_weights"
     given = weights if log_weights is None else log_weights
-    factors = np.zeros(len(series)) if given is None else numbers(given, item)
+    factors = np.zeros(len(series)) if given is None else finite(given, item)
     if factors.shape != (len(series),):
         raise InputError(f"{item} must have shape {(len(series),)}, not {factors.shape}", item=item)
-    for array, name in ((series, "values"), (factors, item)):
-        wrong = np.argwhere(~np.isfinite(array))
-        if len(wrong):
-            raise InputError(f"sample {wrong[0, 0]} of {name} is not finite; leave it out", item=name)
     if given is None or item == "log_weights":
         factors = np.exp(factors - factors.max())
     if (factors < 0).any() or not factors.any():

@@ -273,7 +273,7 @@ class HeldCoordinates:
         left, mixture = np.linalg.eigh(share)
         if left[0] < DEPENDENT:
             self._refuse([k for k in range(d) if abs(mixture[k, 0]) > 0.1])
-        log_det_z = float(np.linalg.slogdet(z)[1])
+        log_det_z = float(np.log(left).sum() + 2 * np.log(size[-d:]).sum())
         return _Metric(log_det_z, respond, z @ respond, respond @ weighed, root @ weighed)
 
     def _refuse(self, dependent: list[int]) -> None:

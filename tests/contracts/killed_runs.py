@@ -45,9 +45,8 @@ def windows(folder: Path) -> dict[str, object]:
 
     sampler = Noted(molecule("H2O2"), EMT, {"torsion": TORSION}, [Angle([[2, 0, 1], [0, 1, 3]])])
     settings = Settings(timestep=0.5, relax=5, pull=20, equilibration=30, production=100, every=2)
-    found = Windows(sampler, folder / "out", settings).run(
-        np.radians(np.linspace(60, 300, 40)), executor=ThreadPoolExecutor(1)
-    )
+    windows = Windows(sampler, folder / "out", settings, executor=ThreadPoolExecutor(1))
+    found = windows.run(np.radians(np.linspace(60, 300, 40)))
     assert not found.failed, found.failed
     return found.numbers()
 

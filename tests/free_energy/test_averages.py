@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import kstest
+from scipy.stats import kstest, norm
 
 from kcons.errors import UnsupportedError
 from kcons.free_energy import averages
@@ -29,6 +29,18 @@ def test_samples_are_worth_fewer_independent_ones():
         found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(100)]
         assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
         assert np.median([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
+
+
+@pytest.mark.filterwarnings("ignore:.*independent ones")  # in one of 300, a single block has most of the spread
+def test_weights_that_belong_to_the_values():
+    """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
+    rng, b, found = np.random.default_rng(2), 1.0, []
+    for _ in range(300):
+        x = ar1(rng, 3000, 0.6)
+        mean = weighted_mean(x, log_weights=b * x[:, 0] + 900.0)
+        found.append(abs(mean.value - b) / mean.error)
+    for part, off in ((0.68, 0.08), (0.95, 0.04)):
+        assert np.mean(np.array(found) < norm.ppf(0.5 + part / 2)) == pytest.approx(part, abs=off)
 
 
 def test_several_quantities_at_once_have_a_covariance():

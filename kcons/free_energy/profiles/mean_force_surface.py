@@ -20,6 +20,7 @@ from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, numbers, positive
 from kcons.errors import InputError
+from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, learn
 from kcons.thermostats import Estimate
 
@@ -249,7 +250,7 @@ def _consistency(process: GradientProcess) -> Consistency:
 def _checked(
     x: ArrayLike, f: ArrayLike, errors: ArrayLike, periods: Sequence[float | None] | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[float | None, ...]]:
-    places, forces, given = (numbers(values, name) for values, name in ((x, "x"), (f, "f"), (errors, "errors")))
+    places, forces, given = (finite(a, name, "window") for a, name in ((x, "x"), (f, "f"), (errors, "errors")))
     if places.ndim != 2 or not places.shape[1] or len(places) < places.shape[1] + 2:
         raise InputError(f"x has shape {places.shape}; give (n, d) with n of d + 2 or more", item="x")
     n, d = places.shape
@@ -257,10 +258,6 @@ def _checked(
         raise InputError(f"f must have shape {(n, d)}, not {forces.shape}", item="f")
     if given.shape not in ((n, d), (n, d, d)):
         raise InputError(f"errors must have shape {(n, d)} or {(n, d, d)}, not {given.shape}", item="errors")
-    for array, name in ((places, "x"), (forces, "f"), (given, "errors")):
-        wrong = np.argwhere(~np.isfinite(array))
-        if len(wrong):
-            raise InputError(f"{name} of window {wrong[0, 0]} is not finite; leave it out", item=name)
     if given.ndim == 2 and (given < 0).any():
         raise InputError(f"an error of window {np.argwhere(given < 0)[0, 0]} is negative", item="errors")
     covariances = given if given.ndim == 3 else given[:, :, None] ** 2 * np.eye(d)

@@ -23,6 +23,7 @@ from scipy.interpolate import CubicSpline
 
 from kcons.constraints.arguments import FloatArray, numbers, positive, whole_number
 from kcons.errors import InputError
+from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
 from kcons.thermostats import Estimate
 
@@ -340,14 +341,10 @@ def integrate(
 
 def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> _Windows:
     """Windows in order; those at one place are one, with the weights that their errors give them."""
-    arrays = [numbers(values, name) for values, name in ((x, "x"), (f, "f"), (e, "e"))]
+    arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
     for array, name in zip(arrays, "xfe", strict=True):
         if array.ndim != 1 or array.shape != arrays[0].shape:
             raise InputError(f"{name} must have shape {(arrays[0].size,)}, not {array.shape}", item=name)
-        if not np.isfinite(array).all():
-            raise InputError(
-                f"{name} of window {int(np.argmin(np.isfinite(array)))} is not finite; leave it out", item=name
-            )
     place, force, error = arrays
     if (error < 0).any():
         raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")

@@ -22,7 +22,7 @@ from scipy.special import expit, logsumexp
 
 from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers, positive
 from kcons.errors import InputError
-from kcons.free_energy.averages import pymbar
+from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
@@ -111,13 +111,11 @@ def pull_free_energy(
         or gain work, as those of the wrong sign do.
     """
     kT = positive(thermal_energy, "thermal_energy")
-    ahead = _works(forward, "forward", kT)
-    rng = generator_of(seed, "seed")
+    ahead, rng = _works(forward, "forward", kT), generator_of(seed, "seed")
     drawn = ahead[rng.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
-    jarzynski, cumulant = _both(ahead, drawn)
-    effective = _effective(ahead)
-    bias = _bias(ahead)
+    one = _one_way(ahead, drawn, kT)
     if backward is None:
+        effective = one[-1]
         if effective < FEW_INDEPENDENT:
             warnings.warn(
                 f"{effective:.1f} of {len(ahead)} pulls count in the average of exp(-W/kT), and it may be off by more "
@@ -125,16 +123,9 @@ def pull_free_energy(
                 UserWarning,
                 stacklevel=2,
             )
-        return Pulled(
-            _times(jarzynski, kT),
-            _times(cumulant, kT),
-            kT * bias,
-            effective,
-            kT * (float(ahead.mean()) - jarzynski.value),
-        )
+        return Pulled(*one, kT * float(ahead.mean()) - one[0].value)
     back = _works(backward, "backward", kT)
     drawn_back = back[rng.integers(len(back), size=(_SAMPLES, len(back)))]
-    jarzynski_back, cumulant_back = _both(back, drawn_back)
     difference, error = _bar(ahead, back)
     overlap = _overlap(ahead, back, difference)
     if overlap < _OVERLAP:
@@ -157,20 +148,8 @@ def pull_free_energy(
     if np.ptp(ahead) and np.ptp(back):
         sampled = _crossing(drawn, drawn_back)
         crossing = Estimate(kT * float(_crossing(ahead[None], back[None])[0]), kT * float(np.nanstd(sampled)))
-    return Pulled(
-        _times(jarzynski, kT),
-        _times(cumulant, kT),
-        kT * bias,
-        effective,
-        kT * float(ahead.mean() - difference),
-        _times(jarzynski_back, -kT),
-        _times(cumulant_back, -kT),
-        -kT * _bias(back),
-        _effective(back),
-        _times(Estimate(difference, error), kT),
-        crossing,
-        overlap,
-    )
+    dissipated, bar = kT * float(ahead.mean() - difference), Estimate(kT * difference, kT * error)
+    return Pulled(*one, dissipated, *_one_way(back, drawn_back, -kT), bar, crossing, overlap)
 
 
 def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
@@ -254,16 +233,14 @@ def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
 
 def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
     """Works over kT."""
-    values = numbers(works, item)
+    values = finite(works, item, "work")
     if values.ndim != 1 or len(values) < FEWEST:
         raise InputError(f"{item} has works of shape {values.shape}; give {FEWEST} pulls or more", item=item)
-    if not np.isfinite(values).all():
-        raise InputError(f"work {int(np.argmin(np.isfinite(values)))} of {item} is not finite; leave it out", item=item)
     return values / positive(thermal_energy, "thermal_energy")
 
 
-def _both(works: FloatArray, drawn: FloatArray) -> tuple[Estimate, Estimate]:
-    """Jarzynski's average and the second cumulant."""
+def _one_way(works: FloatArray, drawn: FloatArray, unit: float) -> tuple[Estimate, Estimate, float, float]:
+    """Jarzynski's average, the second cumulant, the bias of the first, the pulls that count; in kT, or -kT backward."""
 
     def jarzynski(w: FloatArray) -> FloatArray:
         return np.asarray(math.log(len(works)) - logsumexp(-w, axis=-1))
@@ -271,17 +248,12 @@ def _both(works: FloatArray, drawn: FloatArray) -> tuple[Estimate, Estimate]:
     def cumulant(w: FloatArray) -> FloatArray:
         return np.asarray(w.mean(axis=-1) - 0.5 * w.var(axis=-1, ddof=1))
 
-    first, second = (Estimate(float(f(works)), float(f(drawn).std(ddof=1))) for f in (jarzynski, cumulant))
-    return first, second
-
-
-def _effective(works: FloatArray) -> float:
-    return math.exp(2 * logsumexp(-works) - logsumexp(-2 * works))
-
-
-def _bias(works: FloatArray) -> float:
-    """Of Jarzynski's average over kT: var(w)/(2 n <w>^2), w = exp(-W/kT)."""
-    return 0.5 * (1 / _effective(works) - 1 / len(works))
+    first, second = (
+        Estimate(unit * float(f(works)), abs(unit) * float(f(drawn).std(ddof=1))) for f in (jarzynski, cumulant)
+    )
+    effective = math.exp(2 * logsumexp(-works) - logsumexp(-2 * works))
+    # var(w)/(2 n <w>^2), w = exp(-W/kT).
+    return first, second, unit * 0.5 * (1 / effective - 1 / len(works)), effective
 
 
 def _overlap(ahead: FloatArray, back: FloatArray, difference: float) -> float:
@@ -300,7 +272,3 @@ def _crossing(ahead: FloatArray, back: FloatArray) -> FloatArray:
         a, b = 1 / v - 1 / w, one / v - other / w
         c = one**2 / v - other**2 / w + np.log(v / w)
         return middle + c / (b + np.copysign(np.sqrt(b**2 - a * c), b))
-
-
-def _times(estimate: Estimate, factor: float) -> Estimate:
-    return Estimate(factor * estimate.value, abs(factor) * estimate.error)

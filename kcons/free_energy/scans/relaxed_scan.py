@@ -193,10 +193,16 @@ class _Surface:
             # In rings, other angles have to change, which the relaxation puts right.
             x = motion.restore_positions(before, bonds=[])
         if len(x) > MOST_ATOMS:
-            counted = _Counted(self)
-            found = minimise(motion, counted, x, tolerance=fmax, longest=FIRST, steps=evaluations)
+            calls = 0
+
+            def force(y: FloatArray, _: float) -> FloatArray:
+                nonlocal calls
+                calls += 1
+                return self.evaluate(y)[1]
+
+            found = minimise(motion, force, x, tolerance=fmax, longest=FIRST, steps=evaluations)
             energy, _ = self.evaluate(found.positions)
-            attempt.fill(found.positions, energy, found.largest, counted.evaluations)
+            attempt.fill(found.positions, energy, found.largest, calls)
             return
         internals = Internals(self.atoms.numbers, x, motion.lattice)
         memory = None
@@ -205,17 +211,6 @@ class _Surface:
         done = relax(motion, self.evaluate, internals, x, fmax=fmax, memory=memory, evaluations=evaluations)
         attempt.fill(done.positions, done.energy, done.largest, done.evaluations)
         attempt.memory, attempt.terms = done.memory, internals.terms
-
-
-class _Counted:
-    """Forces alone, counted."""
-
-    def __init__(self, surface: _Surface) -> None:
-        self.surface, self.evaluations = surface, 0
-
-    def __call__(self, x: FloatArray, time: float) -> FloatArray:
-        self.evaluations += 1
-        return self.surface.evaluate(x)[1]
 
 
 class _Wavefront:

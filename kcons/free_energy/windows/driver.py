@@ -66,6 +66,13 @@ class Windows:
     approach : float or array_like, shape (d,)
         From how far away it is pulled, in angstrom and radian.
     seed : int
+    executor : Executor, optional
+        Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
+        processes of this machine.
+    workers : int, optional
+        How many of these; by default one for each core.
+    progress : callable, optional
+        ``progress(finished, all, seconds left)``.
 
     Raises
     ------
@@ -85,8 +92,12 @@ class Windows:
         both_sides: bool = True,
         approach: ArrayLike = 0.1,
         seed: int = 1,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        progress: Callable[[int, int, float], None] | None = None,
     ) -> None:
-        self.sampler = sampler
+        self.sampler, self.executor, self.progress = sampler, executor, progress
+        self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         self.settings = settings or Settings()
         self.both_sides, self.seed = both_sides, seed_number(seed)
         self.start, self.periods = sampler.begin()
@@ -106,27 +117,13 @@ class Windows:
         """Keep other runs out of the folder, over several calls. Each of `run`, `improve` and `pull` does so itself."""
         return self._results.taken()
 
-    def run(
-        self,
-        targets: ArrayLike | Iterable[Sequence[float]],
-        *,
-        executor: Executor | None = None,
-        workers: int | None = None,
-        progress: Callable[[int, int, float], None] | None = None,
-    ) -> FreeEnergy:
+    def run(self, targets: ArrayLike | Iterable[Sequence[float]]) -> FreeEnergy:
         """Sample windows at `targets`, but for those that are finished already.
 
         Parameters
         ----------
         targets : array_like, shape (n,) or (n, d)
             In angstrom and radian.
-        executor : Executor, optional
-            Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
-            processes of this machine.
-        workers : int, optional
-            How many of these; by default one for each core.
-        progress : callable
-            ``progress(finished, all, seconds left)``.
 
         Returns
         -------
@@ -139,7 +136,7 @@ class Windows:
             for place in map(tuple, places.tolist()):
                 asked = [n for n, target in enumerate(self._targets) if target == place and n not in numbers]
                 numbers += asked[:1] or self._added([place])
-            return self._run(numbers, executor, workers, progress)
+            return self._run(numbers)
 
     def _added(self, places: Iterable[Sequence[float]]) -> list[int]:
         """Numbers of new windows."""
@@ -147,16 +144,10 @@ class Windows:
         self._targets += map(tuple, places)
         return list(range(first, len(self._targets)))
 
-    def _run(
-        self,
-        numbers: Sequence[int],
-        executor: Executor | None,
-        workers: int | None,
-        progress: Callable[[int, int, float], None] | None,
-    ) -> FreeEnergy:
+    def _run(self, numbers: Sequence[int]) -> FreeEnergy:
         jobs = [job for number in numbers for job in self._jobs(number)]
         missing = [job for job in jobs if not self._finished(job)]
-        failed = self._sample(missing, executor, workers, progress, len(jobs))
+        failed = self._sample(missing, len(jobs))
         for job in jobs:
             self._failed.pop(job.name, None)
         self._failed |= failed
@@ -169,9 +160,6 @@ class Windows:
         *,
         between: tuple[float, float] | None = None,
         below: float | None = None,
-        executor: Executor | None = None,
-        workers: int | None = None,
-        progress: Callable[[int, int, float], None] | None = None,
         at_once: int = 1,
     ) -> FreeEnergy:
         """Add windows where they help most until the profile's largest standard error is below `error` (kJ/mol).
@@ -196,7 +184,7 @@ class Windows:
                     break
                 places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
                 known = len(self._failed)
-                result = self._run(self._added([place] for place in places), executor, workers, progress)
+                result = self._run(self._added([place] for place in places))
                 if len(self._failed) > known:
                     break
         return result
@@ -213,17 +201,7 @@ class Windows:
             jobs.append(Window(number, side, begin, end, seed))
         return jobs
 
-    def pull(
-        self,
-        start: ArrayLike,
-        end: ArrayLike,
-        count: int = 20,
-        *,
-        both_ways: bool = True,
-        executor: Executor | None = None,
-        workers: int | None = None,
-        progress: Callable[[int, int, float], None] | None = None,
-    ) -> Pulled:
+    def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20, *, both_ways: bool = True) -> Pulled:
         """F(end) - F(start) from the works of pulls, kJ/mol: Jarzynski, and BAR with pulls both ways.
 
         Each pull begins in equilibrium (`Settings.equilibration`), takes `Settings.pull` steps at a constant rate, and
@@ -257,7 +235,7 @@ class Windows:
         every = list(chain(*jobs))
         with self.taken():
             missing = [job for job in every if not self.file(job).exists()]
-            failed = self._sample(missing, executor, workers, progress, len(every))
+            failed = self._sample(missing, len(every))
         if failed:
             said = f"{len(failed)} of {len(every)} pulls failed; {': '.join(next(iter(failed.items())))}"
             if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs):
@@ -285,22 +263,15 @@ class Windows:
         """Where a finished window is kept."""
         return self.folder / f"{window.name}.npz"
 
-    def _sample(
-        self,
-        jobs: Sequence[Window],
-        executor: Executor | None,
-        workers: int | None,
-        progress: Callable[[int, int, float], None] | None,
-        total: int,
-    ) -> dict[str, str]:
+    def _sample(self, jobs: Sequence[Window], total: int) -> dict[str, str]:
+        """Run windows or pulls, again where a process was killed; why those failed that did."""
         failed: dict[str, str] = {}
         tries: dict[str, int] = dict.fromkeys((job.name for job in jobs), 0)
         left, began, done = list(jobs), time.monotonic(), 0
-        cores = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         while left:
             again: list[Window] = []
             try:
-                with nullcontext(executor) if executor else _processes(cores, len(left)) as pool:
+                with nullcontext(self.executor) if self.executor else _processes(self.workers, len(left)) as pool:
                     running: dict[Future[None], Window] = {}
                     for job in left:
                         running[pool.submit(_sampled, self.sampler, job, self.settings, self.file(job))] = job
@@ -318,11 +289,11 @@ class Windows:
                             if problem is not None:
                                 failed[job.name] = problem
                                 note.write_text(problem, encoding="utf-8")
-                            if progress is not None:
+                            if self.progress is not None:
                                 spent = time.monotonic() - began
-                                progress(total - len(jobs) + done, total, spent / done * (len(jobs) - done))
+                                self.progress(total - len(jobs) + done, total, spent / done * (len(jobs) - done))
             except BrokenExecutor:
-                if executor is not None:
+                if self.executor is not None:
                     raise  # nothing can be sent to it any more
                 again = [job for job in left if not self.file(job).exists() and job.name not in failed]
             left = again

@@ -169,12 +169,19 @@ class Workers:
     scheduler: Text | None = None
 
 
-#: Keys of [sampling]: those of `Settings`, and arguments of `Windows`.
+#: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
 _OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "seed": Single}
-_SAMPLING = {f.name: Single for f in fields(Settings)} | _OF_WINDOWS
-#: Tables that may be left out.
-_OPTIONAL = {"forces": Forces, "held": HeldRows, "improve": Improve, "pulls": Pulls, "workers": Workers}
-_TABLES = ("structure", "forces", "coordinate", "held", "sampling", "improve", "pulls", "workers")
+#: Tables of a file; [sampling] becomes `Settings`.
+_TABLES: dict[str, Any] = {
+    "structure": Structure,
+    "forces": Forces,
+    "coordinate": Coordinate,
+    "held": HeldRows,
+    "sampling": {f.name: Single for f in fields(Settings)} | _OF_WINDOWS,
+    "improve": Improve,
+    "pulls": Pulls,
+    "workers": Workers,
+}
 
 
 @dataclass(frozen=True)
@@ -260,19 +267,24 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     """
     path = as_path(file, "file")
     data = _toml(path)
+    tables: dict[str, Any] = {"forces": Forces(), "coordinate": [], "sampling": {}, "workers": Workers()}
     for name, content in data.items():
         _refuse_unknown(name, _TABLES, "the input file")
         if (name == "coordinate") != isinstance(content, list):
             brackets = "[[coordinate]], once for each" if name == "coordinate" else f"[{name}], once"
             raise InputError(f"write {brackets}", item=name)
-    sampling = _checked("sampling", data.get("sampling", {}), _SAMPLING)
-    if "structure" not in data:
-        raise InputError("the input file has no structure; write [structure] with file = ...", item="structure")
-    structure = _read(Structure, "structure", data["structure"])
-    tables = {name: _read(kind, name, data.get(name, {})) for name, kind in _OPTIONAL.items() if name in data}
-    entries = [_read(Coordinate, "coordinate", entry) for entry in data.get("coordinate", [])]
-    if not entries:
-        raise InputError("the input file has no [[coordinate]]", item="coordinate")
+        kind = _TABLES[name]
+        tables[name] = (
+            [_read(kind, name, each) for each in content] if kind is Coordinate else _read(kind, name, content)
+        )
+    structure: Any = tables.get("structure")
+    sampling, entries = tables["sampling"], tables["coordinate"]
+    for name, found, how in (
+        ("structure", structure, "[structure] with file = ..."),
+        ("coordinate", entries, "[[coordinate]]"),
+    ):
+        if not found:
+            raise InputError(f"the input file has no {name}; write {how}", item=name)
     coordinates: dict[str, Constraint] = {}
     for entry in entries:
         if entry.called in coordinates:
@@ -284,8 +296,8 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    improve, pulls, workers = tables.get("improve"), tables.get("pulls", Pulls()), tables.get("workers", Workers())
-    if improve is not None and (len(coordinates) > 1 or len(targets) < 3):
+    pulls, workers = tables.get("pulls"), tables["workers"]
+    if "improve" in data and (len(coordinates) > 1 or len(targets) < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
             f"{len(targets)} windows: leave it out, or begin with 3 windows or more along one",
@@ -296,9 +308,9 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         Settings(**sampling),
         targets,
         options,
-        dict(data["improve"]) if improve else None,
-        _pulls(pulls, coordinates, targets) if "pulls" in tables else None,
-        pulls.steps,
+        data.get("improve"),
+        None if pulls is None else _pulls(pulls, coordinates, targets),
+        Pulls.steps if pulls is None else pulls.steps,
         workers.processes,
         workers.scheduler,
     )
@@ -319,27 +331,21 @@ def _toml(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def _read(kind: type[Any], name: str, entry: Any) -> Any:
-    """A table as an object of a dataclass."""
-    hints = get_type_hints(kind, include_extras=True)
-    known = {each.metadata.get("key", each.name): each for each in fields(kind)}
-    given = _checked(name, entry, {key: hints[each.name] for key, each in known.items()})
-    for key, each in known.items():
-        if key not in given and each.default is MISSING:
-            raise InputError(f"[{name}] has no {key}; give {_rule(hints[each.name]).words}", item=key)
-    return kind(**{known[key].name: value for key, value in given.items()})
-
-
-def _checked(name: str, entry: Any, hints: Mapping[str, Any]) -> dict[str, Any]:
-    """A table whose keys are known and whose values are what their annotations say."""
+def _read(kind: Any, name: str, entry: Any) -> Any:
+    """A table as an object of a dataclass; as a dict where `kind` is one of keys and annotations."""
     if not isinstance(entry, dict):
         raise InputError(f"{name} is {short(entry)}; write [{name}] and its keys below", item=name)
+    own = {} if isinstance(kind, dict) else {each.metadata.get("key", each.name): each for each in fields(kind)}
+    hints = get_type_hints(kind, include_extras=True) if own else kind
+    rules = {key: _rule(hints[own[key].name if own else key]) for key in own or hints}
     for key, value in entry.items():
-        _refuse_unknown(key, hints, f"[{name}]")
-        rule = _rule(hints[key])
-        if not rule.test(value):
-            raise InputError(f"{key} of [{name}] is {short(value)}; give {rule.words}", item=key)
-    return dict(entry)
+        _refuse_unknown(key, rules, f"[{name}]")
+        if not rules[key].test(value):
+            raise InputError(f"{key} of [{name}] is {short(value)}; give {rules[key].words}", item=key)
+    for key, each in own.items():
+        if key not in entry and each.default is MISSING:
+            raise InputError(f"[{name}] has no {key}; give {rules[key].words}", item=key)
+    return kind(**{own[key].name: value for key, value in entry.items()}) if own else dict(entry)
 
 
 def _rule(hint: Any) -> Rule:
@@ -405,7 +411,7 @@ def _sampler(
     coordinates: Mapping[str, Constraint],
     allow_modules: Collection[str],
 ) -> Sampler:
-    forces, place = tables.get("forces", Forces()), folder / structure.file
+    forces, place = tables["forces"], folder / structure.file
     if not place.is_file():
         raise InputError(f"there is no file {place}", item="structure")
     if (forces.calculator is None) == (forces.system is None):

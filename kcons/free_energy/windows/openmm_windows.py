@@ -120,13 +120,13 @@ class _Simulation:
         self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
         if settings.relax:
             self.hold(window.start, window.start, "langevin", window.seed, None)
-            self._integrator.minimizeEnergy(self._simulation.context, _FORCE, settings.relax)
-            self._x = positions_of(self._simulation.context)
-        self._simulation: app.Simulation
+            self._integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
+            self._x = positions_of(self.simulation.context)
+        self.simulation: app.Simulation
 
     @property
     def _integrator(self) -> Any:
-        return self._simulation.integrator
+        return self.simulation.integrator
 
     def hold(
         self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
@@ -150,8 +150,8 @@ class _Simulation:
         residue = topology.addResidue("X", topology.addChain())
         for _ in range(system.getNumParticles()):
             topology.addAtom("X", None, residue)
-        self._simulation = app.Simulation(topology, system, integrator, *chosen)
-        context = self._simulation.context
+        self.simulation = app.Simulation(topology, system, integrator, *chosen)
+        context = self.simulation.context
         context.setPositions(self._x)
         self._integrator.applyConstraints()
         if velocities is None:
@@ -166,11 +166,11 @@ class _Simulation:
                 context.setVelocities(v)
 
     def step(self, steps: int) -> None:
-        self._simulation.step(steps)
-        self._x, self._v = positions_of(self._simulation.context), velocities_of(self._simulation.context)
+        self.simulation.step(steps)
+        self._x, self._v = positions_of(self.simulation.context), velocities_of(self.simulation.context)
 
     def record(self, steps: int, every: int, *, start: bool = False) -> Series:
-        simulation = self._simulation
+        simulation = self.simulation
         simulation.currentStep = 0
         reporter = HeldCoordinatesReporter(io.StringIO(), every, self._sampler.coordinates)
         if start:

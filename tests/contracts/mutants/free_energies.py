@@ -80,7 +80,7 @@ MUTANTS = [
         "free_energy/averages.py",
         "return factors[:, None] * (series",
         "return 1.0 * (series",
-        "tests/thermostats/test_correlated_series.py::test_errors_with_weights",
+        "tests/free_energy/test_averages.py::test_weights_that_belong_to_the_values",
     ),
     (
         "free_energy/profiles/gaussian_process.py",
@@ -120,14 +120,14 @@ MUTANTS = [
     ),
     (
         "free_energy/profiles/pulls.py",
-        "(1 / _effective(works) - 1 / len(works))",
-        "(1 / _effective(works))",
+        "(1 / effective - 1 / len(works))",
+        "(1 / effective)",
         "tests/free_energy/profiles/test_pulls.py::test_bias_of_the_exponential_average",
     ),
     (
         "free_energy/profiles/pulls.py",
-        "_times(jarzynski_back, -kT)",
-        "_times(jarzynski_back, kT)",
+        "_one_way(back, drawn_back, -kT)",
+        "_one_way(back, drawn_back, kT)",
         "tests/free_energy/profiles/test_pulls.py::test_directions_are_alike",
     ),
     (

@@ -50,9 +50,9 @@ def test_a_window_far_from_the_structure(tmp_path, thermostat):
 
 
 def test_a_window_without_a_pull(tmp_path):
-    found = Windows(sampler(), tmp_path, Settings(**{**SHORT.__dict__, "pull": 0}), both_sides=False)
-    with ThreadPoolExecutor(1) as executor:
-        result = found.run([np.pi / 3], executor=executor)
+    settings = Settings(**{**SHORT.__dict__, "pull": 0})
+    found = Windows(sampler(), tmp_path, settings, both_sides=False, executor=ThreadPoolExecutor(1))
+    result = found.run([np.pi / 3])
     assert result.failed == {} and len(result.windows) == 1
 
 

@@ -28,8 +28,8 @@ from window_samplers import Fake
 from kcons.free_energy import Settings, Windows
 if __name__ == "__main__":
     windows = Windows(Fake(sys.argv[1] + "/diary", wait=float(sys.argv[3])), sys.argv[1] + "/out",
-                      Settings(production=640, every=10))
-    windows.run(np.linspace(-np.pi, np.pi, 9)[:-1], workers=int(sys.argv[2]))
+                      Settings(production=640, every=10), workers=int(sys.argv[2]))
+    windows.run(np.linspace(-np.pi, np.pi, 9)[:-1])
 """
 
 
@@ -37,16 +37,22 @@ def diary(folder):
     return (folder / "diary").read_text().split()
 
 
-def run(folder, places=PLACES, executor=None, **fake):
-    windows = Windows(Fake(str(folder / "diary"), **fake), folder / "out", SETTINGS)
-    return windows, windows.run(places, executor=executor or ThreadPoolExecutor(2))
+def made(folder, settings=SETTINGS, out="out", how=None, **fake):
+    """Windows by two threads, unless `how` says something else."""
+    diary = str(folder / "diary")
+    return Windows(Fake(diary, **fake), folder / out, settings, **(how or {"executor": ThreadPoolExecutor(2)}))
+
+
+def run(folder, places=PLACES, **fake):
+    windows = made(folder, **fake)
+    return windows, windows.run(places)
 
 
 def test_windows_and_their_profile(tmp_path):
     told = []
-    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
-    with ThreadPoolExecutor(2) as executor:
-        result = windows.run(PLACES, executor=executor, progress=lambda *numbers: told.append(numbers))
+    windows = made(tmp_path)
+    windows.progress = lambda *numbers: told.append(numbers)
+    result = windows.run(PLACES)
     assert result.failed == {} and len(result.windows) == 8
     assert [done for done, _, _ in told] == list(range(1, 17)) and told[-1] == (16, 16, 0.0)
     for window in result.windows:
@@ -88,16 +94,15 @@ def test_the_same_object_asked_again_has_the_same_windows(tmp_path):
     """Those that failed are tried again; a place that is given twice is two windows."""
     windows, first = run(tmp_path, [-1.0, 0.0, 1.0, 1.0], fails=("window-0001-up",))
     windows.sampler.fails = ()
-    with ThreadPoolExecutor(1) as executor:
-        again = windows.run([1.0, 0.0, -1.0, 1.0], executor=executor)
-        assert again.failed == {} and len(first.windows) == len(again.windows) == 4
-        assert len(diary(tmp_path)) == 9
-        assert sorted(w.number for w in windows.run([0.0, 2.0], executor=executor).windows) == [0, 1, 2, 3, 4]
+    again = windows.run([1.0, 0.0, -1.0, 1.0])
+    assert again.failed == {} and len(first.windows) == len(again.windows) == 4
+    assert len(diary(tmp_path)) == 9
+    assert sorted(w.number for w in windows.run([0.0, 2.0]).windows) == [0, 1, 2, 3, 4]
 
 
 def test_without_a_pull_windows_begin_where_they_end(tmp_path):
-    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(pull=0, production=320, every=10))
-    windows.run([0.5], executor=ThreadPoolExecutor(1))
+    windows = made(tmp_path, Settings(pull=0, production=320, every=10))
+    windows.run([0.5])
     assert [(job.start, job.target) for job in windows._jobs(0)] == [((0.5,), (0.5,))] * 2
 
 
@@ -108,33 +113,29 @@ def test_hysteresis_is_seen(tmp_path):
 
 def test_windows_are_added_where_they_help(tmp_path):
     windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
-    with ThreadPoolExecutor(2) as executor:
-        better = windows.improve(0.5, 20, executor=executor, at_once=2)
+    better = windows.improve(0.5, 20, at_once=2)
     assert first.profile.error.max() > 0.5 and len(first.windows) == 5
     assert 5 < len(better.windows) < 20 and better.profile.error.max() <= 0.5
     # Of the lowest place alone nothing is to be known.
-    near = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
-    with ThreadPoolExecutor(1) as executor:
-        near.run(np.linspace(-np.pi, np.pi, 6)[:-1], executor=executor)
-        found = near.improve(0.5, 20, below=1e-6, executor=executor)
+    near, _ = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
+    found = near.improve(0.5, 20, below=1e-6)
     errors = found.profile.error[found.profile.lower_than(1e-6)]
     assert errors.max() <= 0.5 < found.profile.error.max() and len(found.windows) == 5
 
 
 def test_windows_that_failed_before_others_are_added_are_still_told_of(tmp_path):
     windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1], fails=("window-0001-up",))
-    with ThreadPoolExecutor(1) as executor:
-        better = windows.improve(0.5, 20, executor=executor)
-        assert len(first.failed) == 1 and better.failed == first.failed and better.profile.error.max() <= 0.5
-        windows.sampler.fails = ()
-        assert windows.run([PLACES[0]], executor=executor).failed == first.failed  # not what was tried again
-        assert windows.run(np.linspace(-np.pi, np.pi, 6)[:-1], executor=executor).failed == {}
+    better = windows.improve(0.5, 20)
+    assert len(first.failed) == 1 and better.failed == first.failed and better.profile.error.max() <= 0.5
+    windows.sampler.fails = ()
+    assert windows.run([PLACES[0]]).failed == first.failed  # not what was tried again
+    assert windows.run(np.linspace(-np.pi, np.pi, 6)[:-1]).failed == {}
 
 
 def test_a_second_run_in_the_same_folder_is_told(tmp_path):
     """While the first one samples; its windows are as they would have been."""
-    first = Windows(Fake(str(tmp_path / "diary"), wait=0.3), tmp_path / "out", SETTINGS)
-    second = Windows(Fake(str(tmp_path / "other")), tmp_path / "out", SETTINGS)
+    first = made(tmp_path, wait=0.3, how={"executor": ThreadPoolExecutor(4)})
+    second = Windows(Fake(str(tmp_path / "other")), tmp_path / "out", SETTINGS, executor=ThreadPoolExecutor(1))
     refused = []
 
     def meanwhile(*_):
@@ -143,28 +144,26 @@ def test_a_second_run_in_the_same_folder_is_told(tmp_path):
                 attempt()
             refused.append(attempt)
 
-    with ThreadPoolExecutor(4) as executor:
-        assert len(first.run(PLACES[:2], executor=executor, progress=meanwhile).windows) == 2
-        assert len(refused) == 12 and not (tmp_path / "other").exists()
-        assert len(second.run(PLACES[:2], executor=executor).windows) == 2
+    first.progress = meanwhile
+    assert len(first.run(PLACES[:2]).windows) == 2
+    assert len(refused) == 12 and not (tmp_path / "other").exists()
+    assert len(second.run(PLACES[:2]).windows) == 2
     assert not (tmp_path / "other").exists()
 
 
 def test_of_two_that_begin_together_with_other_settings_one_is_told(tmp_path):
     """Both have looked into an empty folder."""
-    one = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
-    other = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
-    with ThreadPoolExecutor(1) as executor:
-        one.run(PLACES[:1], executor=executor)
-        with pytest.raises(OccupiedError, match="windows of other settings"):
-            other.run(PLACES[:1], executor=executor)
+    one, other = made(tmp_path), made(tmp_path, Settings(production=320, every=10))
+    one.run(PLACES[:1])
+    with pytest.raises(OccupiedError, match="windows of other settings"):
+        other.run(PLACES[:1])
 
 
 @pytest.mark.parametrize("name", ["window-0000-up.npz", "free_energy.json", "profile.png"])
 def test_files_of_others_are_not_taken_for_windows(tmp_path, name):
     (tmp_path / name).write_text("precious")
     with pytest.raises(OccupiedError, match=f"other files called {name}; give another folder"):
-        Windows(Fake(str(tmp_path / "diary")), tmp_path, SETTINGS)
+        made(tmp_path, out=".")
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "precious"
 
 
@@ -196,8 +195,7 @@ def test_a_killed_worker_changes_nothing(tmp_path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
     _, expected = run(whole)
-    windows = Windows(Fake(str(broken / "diary"), kills=("window-0003-up",)), broken / "out", SETTINGS)
-    result = windows.run(PLACES, workers=2)
+    _, result = run(broken, kills=("window-0003-up",), how={"workers": 2})
     assert diary(broken).count("window-0003-up") >= 2
     assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
 
@@ -245,8 +243,8 @@ def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
         distributed.Client(cluster.scheduler_address) as client,
     ):
-        fake = Fake(str(broken / "diary"), kills=("window-0003-up",), wait=0.05)
-        result = Windows(fake, broken / "out", SETTINGS).run(PLACES, executor=client.get_executor(pure=False))
+        how = {"executor": client.get_executor(pure=False)}
+        _, result = run(broken, kills=("window-0003-up",), wait=0.05, how=how)
     assert diary(broken).count("window-0003-up") == 2
     assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
 
@@ -254,10 +252,8 @@ def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
 @pytest.mark.parametrize("both_ways", [True, False])
 def test_pulls_give_the_free_energy_of_the_coordinate(tmp_path, both_ways):
     """That of the held system, and kT ln 2 for Z that is four times as large at the end."""
-    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
-    with ThreadPoolExecutor(1) as executor:
-        found = windows.pull(-0.5, 0.5, 60, both_ways=both_ways, executor=executor)
-        again = windows.pull(-0.5, 0.5, 60, both_ways=both_ways, executor=executor)
+    windows = made(tmp_path)
+    found, again = (windows.pull(-0.5, 0.5, 60, both_ways=both_ways) for _ in range(2))
     exact = 4.0 + KT * np.log(2)
     assert abs(found.best.value - exact) < 3 * found.best.error < 2
     assert (found.bar is None) == (not both_ways) and again.best == found.best
@@ -266,27 +262,22 @@ def test_pulls_give_the_free_energy_of_the_coordinate(tmp_path, both_ways):
         with pytest.raises(InputError, match=r"are the same|targets must be finite"):
             windows.pull(*same)
     with pytest.raises(InputError, match=r"settings\.pull is 0"):
-        Windows(Fake(str(tmp_path / "diary")), tmp_path / "no", Settings(pull=0)).pull(0, 1)
+        made(tmp_path, Settings(pull=0), "no").pull(0, 1)
 
 
 def test_pulls_by_long_steps(tmp_path):
     """Velocities of fast modes are too hot or too cold there: work has the part of canonical ones."""
-    found = []
-    with ThreadPoolExecutor(1) as executor:
-        for hot, kJ in ((0.0, 1.0), (1.5, 2.0)):
-            fake = Fake(str(tmp_path / "diary"), hot=hot, kJ=kJ)
-            found.append(Windows(fake, tmp_path / str(hot), SETTINGS).pull(-0.5, 0.5, 20, executor=executor))
+    ways = ((0.0, 1.0), (1.5, 2.0))
+    found = [made(tmp_path, out=str(hot), hot=hot, kJ=kJ).pull(-0.5, 0.5, 20) for hot, kJ in ways]
     assert found[1].best.value == pytest.approx(found[0].best.value, rel=1e-10)
 
 
 def test_pulls_that_fail_are_told_of(tmp_path):
-    names = [f"pull--0.5-to-0.5-{k:04d}" for k in range(3)]
-    one, many = (Fake(str(tmp_path / "diary"), fails=tuple(names[:n])) for n in (1, 3))
-    with ThreadPoolExecutor(1) as executor:
-        with pytest.warns(UserWarning, match=r"1 of 14 pulls failed; pull--0.5-to-0.5-0000: RuntimeError.*left out"):
-            assert Windows(one, tmp_path / "one", SETTINGS).pull(-0.5, 0.5, 7, executor=executor).best.error > 0
-        with pytest.raises(InputError, match=r"3 of 14 pulls failed;.*did not converge.*needs 5 each way"):
-            Windows(many, tmp_path / "many", SETTINGS).pull(-0.5, 0.5, 7, executor=executor)
+    names = tuple(f"pull--0.5-to-0.5-{k:04d}" for k in range(3))
+    with pytest.warns(UserWarning, match=r"1 of 14 pulls failed; pull--0.5-to-0.5-0000: RuntimeError.*left out"):
+        assert made(tmp_path, out="one", fails=names[:1]).pull(-0.5, 0.5, 7).best.error > 0
+    with pytest.raises(InputError, match=r"3 of 14 pulls failed;.*did not converge.*needs 5 each way"):
+        made(tmp_path, out="many", fails=names).pull(-0.5, 0.5, 7)
 
 
 def test_bad_input(tmp_path):
@@ -294,26 +285,26 @@ def test_bad_input(tmp_path):
         Windows(Fake(str(tmp_path / "diary")), 3, SETTINGS)
     with pytest.raises(OccupiedError, match=r"windows of other settings; give another folder"):
         run(tmp_path)
-        Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
+        made(tmp_path, Settings(production=320, every=10))
     with pytest.raises(OccupiedError, match=r"windows of other system;"):
-        Windows(Fake(str(tmp_path / "diary"), digest="another system"), tmp_path / "out", SETTINGS)
+        made(tmp_path, digest="another system")
     with pytest.raises(OccupiedError, match=r"window-0001-up.npz was sampled elsewhere than at -1\.5708"):
         run(tmp_path, PLACES[::2])
     assert len(diary(tmp_path)) == 16
     for text in ('{"seed', "[1]", '{"precious": 1}'):
         (tmp_path / "out/settings.json").write_text(text)
         with pytest.raises(OccupiedError, match=r"other files called settings\.json"):
-            Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
-    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
+            made(tmp_path)
+    windows = made(tmp_path, out="other")
     for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1)), 1.1):
         with pytest.raises(InputError, match="targets must be finite"):
             windows.run(wrong)
     for wrong in (0, -1, 1.5):
         with pytest.raises(InputError, match=f"workers is {wrong}; give a whole number, 1 or more"):
-            windows.run([0.0], workers=wrong)
+            made(tmp_path, out="never", how={"workers": wrong})
     with pytest.raises(InputError, match="count is 4; give a whole number, 5 or more"):
         windows.pull(0, 1, 4)
     for more in ({"approach": [1.0, 2.0]}, {"approach": np.nan}, {"approach": "x"}, {"seed": None}):
         with pytest.raises(InputError, match=next(iter(more))):
-            Windows(Fake(str(tmp_path / "diary")), tmp_path / "never", SETTINGS, **more)
+            made(tmp_path, out="never", how=more)
     assert not (tmp_path / "never").exists()

@@ -111,8 +111,9 @@ def sampled(tmp_path):
         Fake(str(tmp_path / "diary"), fails=("window-0001-up",), shift=0.4),
         tmp_path / "out",
         Settings(production=640, every=10),
+        executor=ThreadPoolExecutor(1),
     )
-    return windows.run(np.linspace(-np.pi, np.pi, 9)[:-1], executor=ThreadPoolExecutor(1))
+    return windows.run(np.linspace(-np.pi, np.pi, 9)[:-1])
 
 
 def test_table_and_sentences(sampled):
@@ -139,8 +140,8 @@ def test_files(sampled, tmp_path):
 def test_a_profile_or_why_there_is_none(places, tmp_path):
     """What `integrate` takes: three windows at different places."""
     profile = len(set(places)) == 3
-    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=640, every=10))
-    found = windows.run(places, executor=ThreadPoolExecutor(1))
+    how = {"settings": Settings(production=640, every=10), "executor": ThreadPoolExecutor(1)}
+    found = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", **how).run(places)
     said = found.summary()
     names = [path.name for path in found.write(tmp_path)]
     assert ("from the lowest to the highest point" in said) == ("profile.csv" in names) == profile
