@@ -193,6 +193,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             self._look_for_grid(numbers)
         self._bind(int(numbers[0]))
         self._damage = damage_of(self._trajectory)
+        self.results = Results()  # those of an earlier run need not go to other processes
         self._first_pass = self.asked.mode == "mean"
         if self._first_pass:
             super().run(**chosen, **options)
@@ -263,7 +264,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._rank: int | None = None
         if self._wants_rank:
             try:
-                self._rank = Motion(self._rows.set, self._rows.positions).rank
+                self._rank = Motion(self._rows.set, precision.stored(ts.positions)).rank
             except KconsError as error:
                 self.asked.remarks.append(f"no rank: {error}")
 

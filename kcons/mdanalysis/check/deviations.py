@@ -124,8 +124,6 @@ class RowTable:
 
     Attributes
     ----------
-    positions : ndarray, shape (n_atoms, 3)
-        As the file holds them.
     set : ConstraintSet
     units : ndarray of int, shape (n_rows,)
         Which of `UNITS` a row has; coordinates of one's own count as lengths.
@@ -153,7 +151,7 @@ class RowTable:
         time, self.tolerance = float(ts.time), tolerance
         self._dimensions, self._cell = b"", (NO_LATTICE, np.inf)
         lattice, limit = self._cell_of(ts.dimensions)
-        x = self.positions = precision.stored(ts.positions)
+        x = precision.stored(ts.positions)
         self.set = held = ConstraintSet(given, x, masses, cell=lattice[0] if limit < np.inf else None, time=time)
         self.measured = _by_row(given, [item.target is None for item in given])
         angular = _by_row(given, [item.period is not None for item in given])
