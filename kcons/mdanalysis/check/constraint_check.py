@@ -290,7 +290,9 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
         MDAnalysis' own loop ends in an error there, and sends the whole analysis back.
         """
-        numbers, trajectory, previous = indexed_frames[:, 1], self._trajectory, -1
+        # Frames may be counted from the end.
+        trajectory, previous = self._trajectory, -1
+        numbers = indexed_frames[:, 1] % trajectory.n_frames
         found = Found.nothing(self._rows.set.n_rows, numbers)
         shown = getattr(self, "_verbose", False) if verbose is None else verbose
         with quiet(), ProgressBar(total=len(numbers), verbose=shown, **(progressbar_kwargs or {})) as bar:
