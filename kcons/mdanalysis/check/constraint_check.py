@@ -163,6 +163,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
     # -- running --------------------------------------------------------------------------------
 
+    @quiet()
     def run(
         self,
         start: int | None = None,
@@ -234,7 +235,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         seen = []
         for k in np.unique(np.linspace(0, len(numbers) - 1, GRID_FRAMES).astype(int)).tolist():
             # A frame that cannot be read, or has no numbers, is told of where it is looked at.
-            with quiet(), suppress(*READ_ERRORS):
+            with suppress(*READ_ERRORS):
                 seen.append(np.array(self._trajectory[numbers[k]].positions[used]))
         step = grid_of(seen) if seen and np.isfinite(seen).all() else 0.0
         self._precision = replace(self._precision, step=step)
@@ -247,8 +248,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     def _bind(self, frame: int) -> None:
         """Rows and their targets at one frame, which must be finite."""
         try:
-            with quiet():
-                ts = self._trajectory[frame]
+            ts = self._trajectory[frame]
             bad = self._used[~np.isfinite(ts.positions[self._used]).all(axis=1)]
             if len(bad):
                 raise NonFiniteError(f"position of atom {bad[0]} is {ts.positions[bad[0]]}")
@@ -259,8 +259,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._largest = float(np.abs(ts.positions[self._used]).max())
         masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
         precision = self._precision_at(frame)
-        with quiet():
-            self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
+        self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
         self._rank: int | None = None
         if self._wants_rank:
             try:
@@ -278,10 +277,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             "another frame, or write the file again",
             item="trajectory",
         )
-
-    def _prepare_sliced_trajectory(self, slicer: Any) -> None:
-        with quiet():
-            super()._prepare_sliced_trajectory(slicer)
 
     def _compute(
         self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
@@ -325,8 +320,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             assert found.broken is not None
             raise self._nothing(found.broken.frame, found.broken.reason)
         if found.broken is None and self._to_the_end:
-            with quiet():
-                found.broken = self._damage or ending_of(self._trajectory)
+            found.broken = self._damage or ending_of(self._trajectory)
         text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
         masses = self._rows.set.masses
         n_in_file = int(self._trajectory.n_frames)
@@ -343,8 +337,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         """
         if "check" not in self.results:
             raise InputError("nothing was looked at yet; call run() first", item="check")
-        result: CheckResult = self.results.check
-        return result
+        return self.results.check  # type: ignore[no-any-return]
 
 
 def _masses(
@@ -479,9 +472,7 @@ def check_trajectory(
         )
     if workers > 1:
         chosen |= {"backend": "multiprocessing", "n_workers": workers}
-    with quiet():
-        check.run(**chosen)
-    return check.check
+    return check.run(**chosen).check
 
 
 def _held(universe: Any, constrain: str | None, held: dict[str, Any]) -> HeldRows:
