@@ -1,7 +1,7 @@
 """How fast `kcons check` reads a long trajectory, beside the reader alone, and how much memory it takes.
 
     python examples/studies/check_speed.py --quick --out DIR     files of 2 MB, seconds
-    python examples/studies/check_speed.py --out DIR             files of 1 GB, some minutes
+    python examples/studies/check_speed.py --out DIR             files of 0.3 GB, some minutes
 
 The files are made in a temporary folder and deleted: rigid water that tumbles and wanders through a periodic cell, all
 three distances of each molecule held. DIR/trajectory_check.csv has a row for each format, number of atoms and kind of
@@ -126,7 +126,7 @@ def main() -> None:
         print(json.dumps(measured(sys.argv[2], int(sys.argv[3]), sys.argv[4])))
         return
     chosen = harness.options(__doc__, "trajectory_check").parse_args()
-    size = 2e6 if chosen.quick else 1e9
+    size = 2e6 if chosen.quick else 3e8
     pieces = {f"{ending}-{n}": partial(case, ending, n, size) for ending, n in (SMALL if chosen.quick else CASES)}
     rows = harness.run(chosen.out / "trajectory_check.csv", pieces, size=size)
     print(tables(rows)["speed"].to_string(index=False))
