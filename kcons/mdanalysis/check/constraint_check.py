@@ -189,6 +189,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         open_ended = end is None or end < 0 or end > self._trajectory.n_frames or (first or 0) < 0
         self._to_the_end = Path(self._path).is_file() and frames is None and open_ended
         numbers = self._numbers(chosen)
+        if frames is not None:
+            chosen["frames"] = numbers
         remarks = list(self.asked.remarks)
         if self._may_be_on_grid:
             self._look_for_grid(numbers)
@@ -205,7 +207,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         return self
 
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
-        """Frames to look at, at least one."""
+        """Frames to look at, at least one, counted from the beginning."""
         numbers: Sequence[int]
         count, name = self._trajectory.n_frames, self.asked.names[0]
         if chosen["frames"] is None:
@@ -224,7 +226,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 )
             for frame in asked[(asked < -count) | (asked >= count)]:
                 raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
-            numbers = asked.tolist()
+            numbers = (asked % count).tolist()
         if not len(numbers):
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
@@ -285,9 +287,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
         MDAnalysis' own loop ends in an error there, and sends the whole analysis back.
         """
-        # Frames may be counted from the end.
-        trajectory, previous = self._trajectory, -1
-        numbers = indexed_frames[:, 1] % trajectory.n_frames
+        numbers, trajectory, previous = indexed_frames[:, 1], self._trajectory, -1
         found = Found.nothing(self._rows.set.n_rows, numbers)
         shown = getattr(self, "_verbose", False) if verbose is None else verbose
         with quiet(), ProgressBar(total=len(numbers), verbose=shown, **(progressbar_kwargs or {})) as bar:
