@@ -83,7 +83,7 @@ def _rows(result: CheckResult) -> Table:
             Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else ""),
             f"{row.allowed:.2e}",
             f"{row.mean:.1e}",
-            str(row.frame),
+            "" if row.frame is None else str(row.frame),
         ]
         for row in result.worst
     ]
