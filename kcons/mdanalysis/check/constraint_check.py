@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
-from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
@@ -32,7 +31,6 @@ from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, op
 from kcons.mdanalysis.topology import (
     constraints_of,
     host_of,
-    masses_guessed,
     require_angstrom,
     topology_of,
     velocities_known,
@@ -132,9 +130,10 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             removed = whole_number(removed, "removed", 0)
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
-        labels = AtomNames(universe)
+        described = topology_of(universe)
+        labels = AtomNames(universe, described.elements)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        self._masses, reason = _masses(universe, given, self._used, labels)
+        self._masses, reason = _masses(universe, described.masses, given, self._used, labels)
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
             given, mode, text = tuple(file.apply(given, labels)), "given", str(file.path)
@@ -341,7 +340,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
 
 def _masses(
-    universe: Any, given: Sequence[Constraint], used: NDArray[np.int64], labels: AtomNames
+    universe: Any, masses: FloatArray, given: Sequence[Constraint], used: NDArray[np.int64], labels: AtomNames
 ) -> tuple[FloatArray | None, str]:
     """Masses; or None where they cannot be used, and why.
 
@@ -350,23 +349,18 @@ def _masses(
     InputError
         Constraints on atoms that do not exist, or that need masses.
     """
-    if used[-1] >= len(universe.atoms):
+    if used[-1] >= len(masses):
         raise InputError(
-            f"there is no atom {used[-1]}; the topology has atoms 0 to {len(universe.atoms) - 1}",
+            f"there is no atom {used[-1]}; the topology has atoms 0 to {len(masses) - 1}",
             item="constraints",
             atoms=[int(used[-1])],
         )
-    try:
-        masses: FloatArray = np.asarray(universe.atoms.masses, dtype=np.float64)
-        if masses_guessed(universe):
-            masses = topology_of(universe).masses
-    except (NoDataError, AttributeError):
+    bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
+    if not len(bad):
+        return masses, ""
+    reason = f"{labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}"
+    if not hasattr(universe.atoms, "masses"):
         reason = "the topology has no masses"
-    else:
-        bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
-        if not len(bad):
-            return masses, ""
-        reason = f"{labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}"
     reason += "; give a topology with masses, such as PSF, PRMTOP or TPR"
     needing = next((item for item in given if item.uses_masses), None)
     if needing is not None:
