@@ -139,6 +139,7 @@ def load_trajectory(
     _look_at(Path(trajectory), "trajectory")
     named = _format(trajectory, format, "format")
     failure, n_frames = "", 0
+    n_atoms: int | None = None
     with _opening():
         try:
             universe.load_new(str(trajectory), format=named)

@@ -1,12 +1,15 @@
 """Files that cannot be opened, or are not of the same atoms."""
 
+import gzip
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 import water_files as files
 
-from kcons.constraints import Distance
 from kcons.errors import InputError, UnreadableError
-from kcons.mdanalysis import ConstraintCheck, check_trajectory, load_trajectory, open_universe
+from kcons.mdanalysis import check_trajectory, load_trajectory, open_universe
 
 N = 30
 WATER = (("OW", 15.999), ("HW1", 1.008), ("HW2", 1.008))
@@ -17,16 +20,8 @@ def x():
     return files.water(N, 8)
 
 
-def checked(path, **run):
-    made = files.universe(N)
-    load_trajectory(made, path)
-    return ConstraintCheck(made, Distance(files.pairs(N), files.targets(N))).run(**run).check
-
-
-def cut(path, new, bytes_left):
-    data = path.read_bytes()
-    new.write_bytes(data[:bytes_left] if bytes_left > 0 else data[: len(data) + bytes_left])
-    return new
+def checked(path):
+    return files.checked(path, N)
 
 
 def test_nothing_readable_is_an_error(tmp_path, x):
@@ -58,7 +53,7 @@ def test_files_of_ase_are_told_from_broken_ones(tmp_path):
     with pytest.raises(
         InputError, match=r"ASE's own format: .*write_ase, or .* run\.traj run\.pdb \(run\.xyz .* no cell"
     ):
-        load_trajectory(files.universe(N), path)
+        files.loaded(path, N)
 
 
 @pytest.mark.parametrize(
@@ -89,9 +84,6 @@ def test_a_format_whose_package_is_missing(tmp_path, monkeypatch, ending, error,
 
 
 def test_the_extra_brings_h5py():
-    import tomllib
-    from pathlib import Path
-
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     assert any(name.startswith("h5py") for name in project["optional-dependencies"]["mdanalysis"])
 
@@ -101,8 +93,6 @@ def test_the_extra_brings_h5py():
 
 @pytest.mark.parametrize("name", ["run.lammpstrj", "run.dump", "run.lammpstrj.gz", "run.LAMMPSTRJ"])
 def test_endings_of_lammps(tmp_path, x, name):
-    import gzip
-
     text = files.write_text(tmp_path / "w.lammpsdump", files.whole(x)).read_bytes()
     (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith("gz") else text)
     result = checked(tmp_path / name)
@@ -175,9 +165,10 @@ def test_a_format_of_the_topology_can_be_named(tmp_path, x):
 
 
 def test_netcdf_that_was_cut_off_says_so(tmp_path, x):
-    path = cut(files.write(tmp_path / "whole.nc", x), tmp_path / "cut.nc", -900)
+    path = tmp_path / "cut.nc"
+    path.write_bytes(files.write(tmp_path / "whole.nc", x).read_bytes()[:-900])
     with pytest.raises(UnreadableError, match=r"cut\.nc.*cut off"):
-        load_trajectory(files.universe(N), path)
+        files.loaded(path, N)
 
 
 @pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "nc"])

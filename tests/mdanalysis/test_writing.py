@@ -8,11 +8,22 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import ase.constraints
+import ase.units
+import h5py
 import numpy as np
+import openmm
 import pytest
 import water_files as files
+from ase import Atoms
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.calculators.tip3p import TIP3P
+from ase.md.verlet import VelocityVerlet
+from openmm import app, unit
 from water_files import mda
 
+from kcons.ase import ConstrainedDynamics, Constraints, constrain
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
@@ -23,7 +34,6 @@ from kcons.mdanalysis import (
     OpenMMReporter,
     RunUnits,
     TrajectoryWriter,
-    load_trajectory,
     write_ase,
 )
 from kcons.motion import Motion
@@ -69,16 +79,8 @@ def test_residuals_of_another_trajectory_are_not_overwritten(tmp_path, what):
     TrajectoryWriter(tmp_path / "run.xtc", 3 * N).close()
 
 
-def read(path):
-    made = files.universe(N)
-    load_trajectory(made, path)
-    return made
-
-
 @pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "nc", "scipy.nc", "h5md"])
 def test_core_runs(tmp_path, ending, monkeypatch):
-    if ending == "h5md":
-        pytest.importorskip("h5py")
     if ending == "scipy.nc":  # written by SciPy where netCDF4 is not installed
         monkeypatch.setattr("MDAnalysis.coordinates.TRJ.netCDF4", None)
         ending = "nc"
@@ -87,7 +89,7 @@ def test_core_runs(tmp_path, ending, monkeypatch):
     states = []
     with TrajectoryWriter(path, 3 * N, motion=motion, interval=0.02) as writer:
         run(made, state, 0.002, 50, observers=[writer, states.append], every=10)
-    universe = read(path)
+    universe = files.loaded(path, N)
     assert universe.trajectory.n_frames == len(states) == 6
     accuracy = 6e-3 if ending == "xtc" else 2e-6
     for ts, s in zip(universe.trajectory, states, strict=True):
@@ -114,19 +116,18 @@ def test_a_state_goes_with_its_own_cell(tmp_path):
     with TrajectoryWriter(tmp_path / "alone.xtc", 3 * N) as writer:
         writer(there)
     for name, sides in (("run.xtc", [12.0, 13.2]), ("alone.xtc", [13.2])):
-        found = [float(ts.dimensions[0]) for ts in read(tmp_path / name).trajectory]
+        found = [float(ts.dimensions[0]) for ts in files.loaded(tmp_path / name, N).trajectory]
         np.testing.assert_allclose(found, sides, rtol=1e-5)
 
 
 def test_observables_of_h5md(tmp_path):
-    h5py = pytest.importorskip("h5py")
     made, state, motion = system()
     path = tmp_path / "r.h5md"
     states = []
     with TrajectoryWriter(path, 3 * N, motion=motion, forces=True) as writer:
         run(made, state, 0.002, 10, observers=[writer, states.append], every=5)
     assert writer.side_file is None
-    last = read(path).trajectory[-1]
+    last = files.loaded(path, N).trajectory[-1]
     s = states[-1]
     expected = motion.multipliers(s.positions, s.velocities, s.forces, s.time)
     np.testing.assert_allclose(last.data["multipliers"], expected, rtol=1e-6, atol=1e-6)
@@ -142,7 +143,7 @@ def test_side_file_is_auxiliary_data(tmp_path):
     with TrajectoryWriter(path, 3 * N, motion=motion, interval=0.01) as writer:
         after = run(made, state, 0.002, 20, observers=[writer], every=5)
     assert writer.side_file == tmp_path / "r.xvg"
-    universe = read(path)
+    universe = files.loaded(path, N)
     universe.trajectory.add_auxiliary({"constraints": 0}, str(writer.side_file))
     assert universe.trajectory.n_frames == 5
     aux = mda.auxiliary.XVG.XVGReader(str(writer.side_file))
@@ -160,45 +161,28 @@ sys.path[:0] = {paths!r}
 import test_writing as t
 from kcons.steppers import run
 made, state, motion = t.system()
-writer = t.TrajectoryWriter(sys.argv[1], 3 * t.N, motion=motion, interval=0.002)
-run(made, state, 0.002, 4, observers=[writer])
+options = dict(motion=motion, interval=0.002)
+writers = [t.TrajectoryWriter("{folder}/k" + e + "." + e, 3 * t.N, **options) for e in {endings!r}]
+run(made, state, 0.002, 4, observers=writers)
 print("written", flush=True)
 os.kill(os.getpid(), 9)
 """
 
 
 def test_a_run_that_is_killed_keeps_its_frames(tmp_path):
-    """All formats in one process each time would be slow; those that buffer differently."""
-    endings = ["dcd", "xtc", "trr", "nc"]
-    try:
-        import h5py  # noqa: F401
-
-        endings.append("h5md")
-    except ImportError:
-        pass
-    code = KILLED.format(paths=[os.path.dirname(__file__), str(Path(__file__).parents[1] / "systems")])
-    code = code.replace("writer =", "writers = [").replace("interval=0.002)", "interval=0.002) for e in sys.argv[2:]]")
-    code = code.replace("sys.argv[1],", 'sys.argv[1] + "/k" + e + "." + e,').replace("[writer]", "writers")
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path), *endings], capture_output=True, text=True, check=False
-    )
+    """All formats in one process: those that buffer differently."""
+    endings = ["dcd", "xtc", "trr", "nc", "h5md"]
+    paths = [os.path.dirname(__file__), str(Path(__file__).parents[1] / "systems")]
+    code = KILLED.format(paths=paths, folder=tmp_path, endings=endings)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "written" in done.stdout and done.returncode == -signal.SIGKILL, done.stderr
     for ending in endings:
-        universe = read(tmp_path / f"k{ending}.{ending}")
-        assert universe.trajectory.n_frames == 5, ending
-        rows = Distance(files.pairs(N), files.targets(N))
-        check = ConstraintCheck(universe, rows, tolerance=0.0, rank=False).run().check
+        check = files.checked(tmp_path / f"k{ending}.{ending}", N, tolerance=0.0, rank=False)
         assert check.status == "kept" and check.broken is None and len(check.frames) == 5, (ending, check.broken)
-        assert len((tmp_path / "kdcd.xvg").read_text().split("\n")) > 5
+    assert len((tmp_path / "kdcd.xvg").read_text().split("\n")) > 5
 
 
 def test_ase_dynamics(tmp_path):
-    ase = pytest.importorskip("ase")
-    from ase.calculators.tip3p import TIP3P
-    from ase.md.verlet import VelocityVerlet
-
-    from kcons.ase import ConstrainedDynamics, Constraints
-
     x = files.whole(files.water(2, 1, side=12.0, seed=3))[0]
     rows = Distance(files.pairs(2), files.targets(2))
     for ours in (True, False):
@@ -210,8 +194,7 @@ def test_ase_dynamics(tmp_path):
         with write_ase(dynamics, path, interval=4, forces=True) as writer:
             dynamics.run(8)
         assert writer.n_frames == 3 and writer.motion is not None
-        made = files.universe(2)
-        load_trajectory(made, path)
+        made = files.loaded(path, 2)
         last = made.trajectory[-1]
         assert last.time == pytest.approx(8e-3, rel=1e-5)
         np.testing.assert_allclose(last.positions, atoms.positions, atol=1e-5)
@@ -226,9 +209,6 @@ def test_ase_dynamics(tmp_path):
 
 
 def test_openmm_simulations(tmp_path):
-    openmm = pytest.importorskip("openmm")
-    from openmm import app, unit
-
     x = files.whole(files.water(2, 1, seed=3))[0] / 10
     force_system = openmm.System()
     topology = app.Topology()
@@ -252,8 +232,7 @@ def test_openmm_simulations(tmp_path):
     simulation.reporters.append(reporter)
     simulation.step(20)
     reporter.close()
-    made = files.universe(2)
-    load_trajectory(made, path)
+    made = files.loaded(path, 2)
     assert [round(ts.time, 6) for ts in made.trajectory] == [0.005, 0.01, 0.015, 0.02]
     state = simulation.context.getState(positions=True, velocities=True)
     last = made.trajectory[-1]
@@ -289,13 +268,6 @@ def test_bad_input(tmp_path):
 
 
 def test_multipliers_count_hookean_objects_and_friction(tmp_path):
-    pytest.importorskip("ase")
-    import ase.constraints
-    from ase.build import molecule
-    from ase.calculators.emt import EMT
-
-    from kcons.ase import ConstrainedDynamics, constrain
-
     atoms = molecule("CH3CH2OH")
     atoms.calc = EMT()
     atoms.set_momenta(np.random.default_rng(1).normal(size=(len(atoms), 3)))
@@ -320,13 +292,6 @@ def test_multipliers_count_hookean_objects_and_friction(tmp_path):
 
 @pytest.mark.parametrize("ours", [True, False])
 def test_constraints_that_change_in_a_run(tmp_path, ours):
-    pytest.importorskip("ase")
-    from ase.build import molecule
-    from ase.calculators.emt import EMT
-    from ase.md.verlet import VelocityVerlet
-
-    from kcons.ase import ConstrainedDynamics, constrain
-
     atoms = molecule("CH3CH2OH")
     atoms.calc = EMT()
     constrain(atoms, Distance([[0, 1]]))
@@ -352,12 +317,6 @@ def test_constraints_that_change_in_a_run(tmp_path, ours):
 
 
 def test_cells_that_boxes_of_mdanalysis_are_not(tmp_path):
-    pytest.importorskip("ase")
-    from ase import Atoms
-    from ase.calculators.emt import EMT
-
-    from kcons.ase import ConstrainedDynamics, constrain
-
     x = [[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]
     turned = Atoms("N2", x, cell=[[9, 3, 0], [-1, 9, 0], [0, 0, 9]], pbc=True, calculator=EMT())
     constrain(turned, Distance([[0, 1]]))

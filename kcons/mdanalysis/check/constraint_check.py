@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
-from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
@@ -32,7 +31,6 @@ from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, op
 from kcons.mdanalysis.topology import (
     constraints_of,
     host_of,
-    masses_guessed,
     require_angstrom,
     topology_of,
     velocities_known,
@@ -132,9 +130,10 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             removed = whole_number(removed, "removed", 0)
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
-        labels = AtomNames(universe)
+        described = topology_of(universe)
+        labels = AtomNames(universe, described.elements)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        self._masses, reason = _masses(universe, given, self._used, labels)
+        self._masses, reason = _masses(universe, described.masses, given, self._used, labels)
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
             given, mode, text = tuple(file.apply(given, labels)), "given", str(file.path)
@@ -163,6 +162,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
     # -- running --------------------------------------------------------------------------------
 
+    @quiet()
     def run(
         self,
         start: int | None = None,
@@ -188,11 +188,14 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         open_ended = end is None or end < 0 or end > self._trajectory.n_frames or (first or 0) < 0
         self._to_the_end = Path(self._path).is_file() and frames is None and open_ended
         numbers = self._numbers(chosen)
+        if frames is not None:
+            chosen["frames"] = numbers
         remarks = list(self.asked.remarks)
         if self._may_be_on_grid:
             self._look_for_grid(numbers)
         self._bind(int(numbers[0]))
         self._damage = damage_of(self._trajectory)
+        self.results = Results()  # those of an earlier run need not go to other processes
         self._first_pass = self.asked.mode == "mean"
         if self._first_pass:
             super().run(**chosen, **options)
@@ -203,7 +206,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         return self
 
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
-        """Frames to look at, at least one."""
+        """Frames to look at, at least one, counted from the beginning."""
         numbers: Sequence[int]
         count, name = self._trajectory.n_frames, self.asked.names[0]
         if chosen["frames"] is None:
@@ -222,7 +225,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 )
             for frame in asked[(asked < -count) | (asked >= count)]:
                 raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
-            numbers = asked.tolist()
+            numbers = (asked % count).tolist()
         if not len(numbers):
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
@@ -233,7 +236,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         seen = []
         for k in np.unique(np.linspace(0, len(numbers) - 1, GRID_FRAMES).astype(int)).tolist():
             # A frame that cannot be read, or has no numbers, is told of where it is looked at.
-            with quiet(), suppress(*READ_ERRORS):
+            with suppress(*READ_ERRORS):
                 seen.append(np.array(self._trajectory[numbers[k]].positions[used]))
         step = grid_of(seen) if seen and np.isfinite(seen).all() else 0.0
         self._precision = replace(self._precision, step=step)
@@ -246,8 +249,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     def _bind(self, frame: int) -> None:
         """Rows and their targets at one frame, which must be finite."""
         try:
-            with quiet():
-                ts = self._trajectory[frame]
+            ts = self._trajectory[frame]
             bad = self._used[~np.isfinite(ts.positions[self._used]).all(axis=1)]
             if len(bad):
                 raise NonFiniteError(f"position of atom {bad[0]} is {ts.positions[bad[0]]}")
@@ -258,12 +260,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._largest = float(np.abs(ts.positions[self._used]).max())
         masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
         precision = self._precision_at(frame)
-        with quiet():
-            self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
+        self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
         self._rank: int | None = None
         if self._wants_rank:
             try:
-                self._rank = Motion(self._rows.set, self._rows.positions).rank
+                self._rank = Motion(self._rows.set, precision.stored(ts.positions)).rank
             except KconsError as error:
                 self.asked.remarks.append(f"no rank: {error}")
 
@@ -277,10 +278,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             "another frame, or write the file again",
             item="trajectory",
         )
-
-    def _prepare_sliced_trajectory(self, slicer: Any) -> None:
-        with quiet():
-            super()._prepare_sliced_trajectory(slicer)
 
     def _compute(
         self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
@@ -322,8 +319,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             assert found.broken is not None
             raise self._nothing(found.broken.frame, found.broken.reason)
         if found.broken is None and self._to_the_end:
-            with quiet():
-                found.broken = self._damage or ending_of(self._trajectory)
+            found.broken = self._damage or ending_of(self._trajectory)
         text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
         masses = self._rows.set.masses
         n_in_file = int(self._trajectory.n_frames)
@@ -340,12 +336,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         """
         if "check" not in self.results:
             raise InputError("nothing was looked at yet; call run() first", item="check")
-        result: CheckResult = self.results.check
-        return result
+        return self.results.check  # type: ignore[no-any-return]
 
 
 def _masses(
-    universe: Any, given: Sequence[Constraint], used: NDArray[np.int64], labels: AtomNames
+    universe: Any, masses: FloatArray, given: Sequence[Constraint], used: NDArray[np.int64], labels: AtomNames
 ) -> tuple[FloatArray | None, str]:
     """Masses; or None where they cannot be used, and why.
 
@@ -354,23 +349,18 @@ def _masses(
     InputError
         Constraints on atoms that do not exist, or that need masses.
     """
-    if used[-1] >= len(universe.atoms):
+    if used[-1] >= len(masses):
         raise InputError(
-            f"there is no atom {used[-1]}; the topology has atoms 0 to {len(universe.atoms) - 1}",
+            f"there is no atom {used[-1]}; the topology has atoms 0 to {len(masses) - 1}",
             item="constraints",
             atoms=[int(used[-1])],
         )
-    try:
-        masses: FloatArray = np.asarray(universe.atoms.masses, dtype=np.float64)
-        if masses_guessed(universe):
-            masses = topology_of(universe).masses
-    except (NoDataError, AttributeError):
+    bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
+    if not len(bad):
+        return masses, ""
+    reason = f"{labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}"
+    if not hasattr(universe.atoms, "masses"):
         reason = "the topology has no masses"
-    else:
-        bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
-        if not len(bad):
-            return masses, ""
-        reason = f"{labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}"
     reason += "; give a topology with masses, such as PSF, PRMTOP or TPR"
     needing = next((item for item in given if item.uses_masses), None)
     if needing is not None:
@@ -476,9 +466,7 @@ def check_trajectory(
         )
     if workers > 1:
         chosen |= {"backend": "multiprocessing", "n_workers": workers}
-    with quiet():
-        check.run(**chosen)
-    return check.check
+    return check.run(**chosen).check
 
 
 def _held(universe: Any, constrain: str | None, held: dict[str, Any]) -> HeldRows:

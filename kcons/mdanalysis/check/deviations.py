@@ -124,8 +124,6 @@ class RowTable:
 
     Attributes
     ----------
-    positions : ndarray, shape (n_atoms, 3)
-        As the file holds them.
     set : ConstraintSet
     units : ndarray of int, shape (n_rows,)
         Which of `UNITS` a row has; coordinates of one's own count as lengths.
@@ -153,7 +151,7 @@ class RowTable:
         time, self.tolerance = float(ts.time), tolerance
         self._dimensions, self._cell = b"", (NO_LATTICE, np.inf)
         lattice, limit = self._cell_of(ts.dimensions)
-        x = self.positions = precision.stored(ts.positions)
+        x = precision.stored(ts.positions)
         self.set = held = ConstraintSet(given, x, masses, cell=lattice[0] if limit < np.inf else None, time=time)
         self.measured = _by_row(given, [item.target is None for item in given])
         angular = _by_row(given, [item.period is not None for item in given])
@@ -298,18 +296,6 @@ def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _difference(x, i, j, step):  # type: ignore[no-untyped-def]
-    """Vector from atom j to atom i, of coordinates as the file holds them."""
-    x1, y1, z1 = np.float64(x[i, 0]), np.float64(x[i, 1]), np.float64(x[i, 2])
-    x2, y2, z2 = np.float64(x[j, 0]), np.float64(x[j, 1]), np.float64(x[j, 2])
-    if step > 0.0:
-        inverse = 1.0 / step
-        x1, y1, z1 = np.rint(x1 * inverse) * step, np.rint(y1 * inverse) * step, np.rint(z1 * inverse) * step
-        x2, y2, z2 = np.rint(x2 * inverse) * step, np.rint(y2 * inverse) * step, np.rint(z2 * inverse) * step
-    return x1 - x2, y1 - y2, z1 - z2
-
-
-@njit(cache=True, nogil=True)
 def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untyped-def]
     """Deviations of all rows in one frame.
 
@@ -334,7 +320,12 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
     x, bits, is_held, v = atoms
     lattice, limit, step, base, factor, reach = space
     table, given, runs = held
-    powers = np.empty(len(x), dtype=np.float32)
+    powers, points = np.empty(len(x), dtype=np.float32), np.empty((len(x), 3))
+    # As the file holds them.
+    numbers, stored, inverse = x.reshape(-1), points.reshape(-1), 1.0 / step if step > 0.0 else 0.0
+    for k in range(len(numbers)):
+        exact = np.float64(numbers[k])
+        stored[k] = np.rint(exact * inverse) * step if step > 0.0 else exact
     exponents = powers.view(np.int32)
     least, bad = np.float32(reach).view(np.int32), False
     for a in range(len(x)):
@@ -351,7 +342,7 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
             row, rate = table[r], 0.0
             i, j = row.i, row.j
             if i >= 0:
-                dx, dy, dz = _difference(x, i, j, step)
+                dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
                 square = dx * dx + dy * dy + dz * dz
                 if not square < limit:
                     dx, dy, dz = nearest_image(dx, dy, dz, lattice)

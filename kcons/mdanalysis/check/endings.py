@@ -21,6 +21,9 @@ from MDAnalysis.lib.util import anyopen
 from kcons.errors import NonFiniteError
 from kcons.mdanalysis.loading import READ_ERRORS, format_of
 
+#: Bytes of a file that are mapped into memory at a time.
+MAPPED = 1 << 25
+
 
 @dataclass(frozen=True)
 class Break:
@@ -126,11 +129,17 @@ def _damage(reader: Any, path: str) -> Break | None:
     n_frames = min(reader.n_frames - 1, (os.path.getsize(path) - begin) // file._framesize)
     if n_frames < 1 or (records + 8).sum() != file._framesize:
         return None
-    words = np.memmap(path, _order(path) + "i4", "r", begin, (n_frames, file._framesize // 4))
     # Records are framed by their lengths.
     ends = np.cumsum(records + 8)
-    wrong = (words[:, (ends - records - 8) // 4] != records) | (words[:, ends // 4 - 1] != records)
-    return Break(1 + int(np.argmax(wrong.any(axis=1))), "its records are damaged") if wrong.any() else None
+    places = np.concatenate([ends - records - 8, ends - 4]) // 4
+    at_once = max(MAPPED // file._framesize, 1)
+    for first in range(0, n_frames, at_once):
+        shape = min(at_once, n_frames - first), file._framesize // 4
+        words = np.memmap(path, _order(path) + "i4", "r", begin + first * file._framesize, shape)
+        wrong = (words[:, places] != np.tile(records, 2)).any(axis=1)
+        if wrong.any():
+            return Break(1 + first + int(np.argmax(wrong)), "its records are damaged")
+    return None
 
 
 def _order(path: str) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+import numpy as np
 from rich import box
 from rich.table import Table
 from rich.text import Text
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 COLORS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete": "yellow"}
 #: What `write` writes.
 FILES = ("check.json", "check.png", "check.txt")
-#: Ticks on the axis of frames are numbers of frames where times say nothing.
-_NO_TIMES = "frame"
 #: Deviations that are this part of the largest, or less, are not drawn.
 _NOTHING = 1e-6
 
@@ -85,7 +83,7 @@ def _rows(result: CheckResult) -> Table:
             Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else ""),
             f"{row.allowed:.2e}",
             f"{row.mean:.1e}",
-            str(row.frame),
+            "" if row.frame is None else str(row.frame),
         ]
         for row in result.worst
     ]
@@ -107,26 +105,24 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     grid = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
     timed = len(set(result.times)) == len(result.times)
     x = result.times if timed else [float(frame) for frame in result.frames]
+    marker = "." if len(x) < 60 else ""
     for axes, unit in zip(grid, result.units, strict=False):
-        largest, rms, rounding = (result.series[f"{name} {unit.unit}"] for name in ("largest", "rms", "rounding"))
-        if any(value > 0 for value in largest):
+        largest, rms, rounding = (np.array(result.series[f"{k} {unit.unit}"]) for k in ("largest", "rms", "rounding"))
+        if (largest > 0).any():
             axes.set_yscale("log")
         # The frame that gives targets is off by 0, or by the rounding of this program: no point of such a line.
-        least = _NOTHING * max(largest)
-        largest, rms = ([value if value > least else math.nan for value in values] for values in (largest, rms))
-        axes.plot(x, largest, color="#D55E00", linewidth=1.0, marker="." if len(x) < 60 else "", label="largest")
-        axes.plot(x, rms, color="#0072B2", linewidth=1.0, marker="." if len(x) < 60 else "", label="rms")
+        for color, label, values in (("#D55E00", "largest", largest), ("#0072B2", "rms", rms)):
+            shown = np.where(values > _NOTHING * largest.max(), values, np.nan)
+            axes.plot(x, shown, color=color, linewidth=1.0, marker=marker, label=label)
         # Rounding of the targets comes to that of each frame.
-        of_targets = unit.bound - max(rounding)
-        lines = [("black", ":", 0.0, "rounding of the file, at most")]
+        allowed = rounding + unit.bound - rounding.max()
+        lines = [("black", ":", allowed, "rounding of the file, at most")]
         if unit.tolerance > 0:
-            lines.append(("#555555", "--", unit.tolerance, f"rounding and tolerance of {result.tolerance:g}"))
-        for color, style, more, label in lines:
-            level = [value + of_targets + more for value in rounding]
-            if len(x) < 2:
-                axes.axhline(level[0], color=color, linestyle=style, linewidth=1.0, label=label)
-            else:
-                axes.plot(x, level, color=color, linestyle=style, linewidth=1.0, label=label)
+            label = f"rounding and tolerance of {result.tolerance:g}"
+            lines.append(("#555555", "--", allowed + unit.tolerance, label))
+        for color, style, level, label in lines:
+            line = axes.axhline(level[0]) if len(x) < 2 else axes.plot(x, level)[0]
+            line.set(color=color, linestyle=style, linewidth=1.0, label=label)
         axes.set_ylabel(f"deviation / {unit.unit}")
         axes.legend(fontsize=8, loc="best")
     if result.temperature is not None:
@@ -135,7 +131,7 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     if result.broken is not None and x:
         for axes in grid:
             axes.axvline(x[-1], color="#999999", linestyle="--", linewidth=1.0)
-    grid[-1].set_xlabel("time / ps" if timed else _NO_TIMES)
+    grid[-1].set_xlabel("time / ps" if timed else "frame")
     figure.suptitle(f"{Path(result.trajectory).name}: {result.n_rows} rows, {result.status}", fontsize=11)
     figure.savefig(path, dpi=150, format="png")
 

@@ -97,8 +97,8 @@ class RowResult:
         Absolute deviation and what was allowed, in the frame where the first exceeds the second most.
     mean : float
         Over the frames.
-    frame : int
-        That frame.
+    frame : int or None
+        That frame; None where nothing could be told in any.
     """
 
     row: int
@@ -109,7 +109,7 @@ class RowResult:
     largest: float
     mean: float
     allowed: float
-    frame: int
+    frame: int | None
 
 
 @dataclass
@@ -328,7 +328,7 @@ def _row(table: RowTable, labels: AtomNames, found: Found, row: int) -> RowResul
         largest=float(mine["largest"]),
         mean=float(found.mean("total")[row]),
         allowed=float(mine["largest"] - mine["margin"]),
-        frame=int(mine["frame"]),
+        frame=int(mine["frame"]) if mine["counted"] else None,
     )
 
 

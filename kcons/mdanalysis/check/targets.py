@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
 from kcons.errors import InputError
-from kcons.mdanalysis.topology import texts, topology_of
+from kcons.mdanalysis.topology import texts
 
 #: Entries by the family of rows that they are for, and how many atoms these have.
 _KINDS = {"Distance": ("length", 2), "Angle": ("angle", 3)}
@@ -45,21 +45,24 @@ _KEYS = {"atoms", "elements", "residue", "value"}
 class AtomNames:
     """What all atoms of a Universe are called, as far as its topology has names.
 
+    Parameters
+    ----------
+    universe : MDAnalysis.Universe
+    known : ndarray of str, shape (n_atoms,)
+        Elements that names and masses tell.
+
     Attributes
     ----------
     names, elements, residues : ndarray of str, shape (n_atoms,)
         '' where the topology does not say; elements are then what names and masses tell, or first letters.
     """
 
-    def __init__(self, universe: Any) -> None:
+    def __init__(self, universe: Any, known: NDArray[np.str_]) -> None:
         self.names, self.residues, self._numbers, elements = (
             texts(universe.atoms, name, len(universe.atoms)) for name in ("names", "resnames", "resids", "elements")
         )
-        if not np.all(elements != ""):
-            known = topology_of(universe).elements
-            first = np.char.lstrip(self.names, "0123456789'\"*").astype("U1")
-            elements = np.where(elements == "", np.where(known == "", first, known), elements)
-        self.elements: NDArray[np.str_] = elements
+        first = np.char.lstrip(self.names, "0123456789'\"*").astype("U1")
+        self.elements: NDArray[np.str_] = np.where(elements == "", np.where(known == "", first, known), elements)
 
     def atom(self, index: int) -> str:
         """For example 'SOL12:OW', or 'atom 35' where there are no names."""

@@ -359,7 +359,8 @@ def test_rows_that_were_made_for_a_part_are_refused(water):
     check = ConstraintCheck(whole, constraints_of(whole.atoms, "none"))
     with pytest.raises(InputError, match=r"nothing was looked at yet; call run\(\) first"):
         _ = check.check
-    assert check.run(frames=[0, -1, 5]).check.frames == [0, -1, 5] and check.check.n_rows == 3 * N
+    assert check.run(frames=[0, -1, 5]).check.frames == [0, 22, 5] and check.check.n_rows == 3 * N
+    assert check.run(frames=[k in (3, 9) for k in range(23)]).check.frames == [3, 9]
 
 
 # -- backends ---------------------------------------------------------------------------------------

@@ -376,8 +376,8 @@ def test_a_frame_with_another_number_of_atoms(tmp_path, x, ending, wrong):
     assert result.status == "incomplete" and result.frames == [0, 1, 2] and result.broken.frame == 3
     assert "frame 3 cannot be used, nor what follows" in result.verdict or ending == "lammpsdump"
     assert "where its number of atoms has to be, 90" in result.verdict or ending == "lammpsdump"
-    # Frames beyond, which may lie where the reader looks for them, are no better.
-    assert checked(path, step=2).frames == [0, 2]
+    # Frames beyond, which may lie where the reader looks for them, are no better, however they are counted.
+    assert checked(path, step=2).frames == [0, 2] and checked(path, frames=[1, -1]).frames == [1]
 
 
 def test_empty_lines_at_the_end_are_no_frame(tmp_path, x):
