@@ -8,8 +8,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from kcons.cli.parser import Command, Option
 from kcons.cli.terminal import console, rendered, say_written
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
@@ -19,48 +20,6 @@ if TYPE_CHECKING:
 
 #: The exit status of each result; 2 is wrong use.
 EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
-
-
-def add(commands: Any) -> None:
-    """Its options."""
-    check = commands.add_parser(
-        "check",
-        help="how well a trajectory of any engine kept its constraints",
-        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift, judged "
-        "by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file "
-        "that ends too early, or has a NaN.",
-    )
-    check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
-    check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
-    check.add_argument(
-        "--format", metavar="NAME", help="of the trajectory, where its name does not tell: LAMMPSDUMP, ..."
-    )
-    check.add_argument("--topology-format", metavar="NAME", help="of the topology, where its name does not tell")
-    check.add_argument(
-        "--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, allangles or none"
-    )
-    check.add_argument("--select", default="all", help="rows within this selection only (MDAnalysis' language)")
-    check.add_argument("--no-rigid-water", action="store_true", help="do not expect water to be rigid")
-    check.add_argument("--rigid-residues", nargs="+", default=(), metavar="NAME", help="residues that are held rigid")
-    check.add_argument("--rigid-bodies", nargs="+", default=(), metavar="SELECTION", help="atoms that are held rigid")
-    check.add_argument(
-        "--targets", default="first", help="first (frame, default), mean, topology (its coordinates), or a TOML file"
-    )
-    check.add_argument("--tolerance", type=float, default=1e-4, help="relative, of the engine (default 1e-4)")
-    check.add_argument("--precision", type=float, help="step of the coordinates in the file, Å, where not known")
-    check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
-    check.add_argument("--workers", type=int, default=1, help="processes (default 1)")
-    check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
-    check.add_argument(
-        "--forces",
-        help="also the temperatures of the configurations, by forces as for compare (amber14-all,amber14/tip3p, gfn2)",
-    )
-    check.add_argument(
-        "--temperature", type=float, metavar="K", help="with --forces: say whether the temperatures are this one"
-    )
-    check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
-    check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")
-    check.set_defaults(run=_check)
 
 
 def _check(chosen: argparse.Namespace) -> int:
@@ -150,3 +109,41 @@ def _result(chosen: argparse.Namespace, check_trajectory: Callable[..., CheckRes
         worst=chosen.worst,
         rank=not chosen.no_rank,
     )
+
+
+COMMAND = Command(
+    "check",
+    "how well a trajectory of any engine kept its constraints",
+    "Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift, judged "
+    "by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file "
+    "that ends too early, or has a NaN.",
+    (
+        Option("trajectory", "any trajectory that MDAnalysis reads", type=Path),
+        Option("--topology", "any topology that MDAnalysis reads", type=Path, required=True),
+        Option("--format", "of the trajectory, where its name does not tell: LAMMPSDUMP, ...", metavar="NAME"),
+        Option("--topology-format", "of the topology, where its name does not tell", metavar="NAME"),
+        Option(
+            "--constrain", "hbonds (default), allbonds, hangles, allangles or none", default="hbonds", metavar="NAME"
+        ),
+        Option("--select", "rows within this selection only (MDAnalysis' language)", default="all"),
+        Option("--no-rigid-water", "do not expect water to be rigid", action="store_true"),
+        Option("--rigid-residues", "residues that are held rigid", nargs="+", default=(), metavar="NAME"),
+        Option("--rigid-bodies", "atoms that are held rigid", nargs="+", default=(), metavar="SELECTION"),
+        Option(
+            "--targets", "first (frame, default), mean, topology (its coordinates), or a TOML file", default="first"
+        ),
+        Option("--tolerance", "relative, of the engine (default 1e-4)", type=float, default=1e-4),
+        Option("--precision", "step of the coordinates in the file, Å, where not known", type=float),
+        Option("--frames", "frames to look at (default all)", metavar="A:B:STEP"),
+        Option("--workers", "processes (default 1)", type=int, default=1),
+        Option("--worst", "rows to name (default 10)", type=int, default=10),
+        Option(
+            "--forces",
+            "also the temperatures of the configurations, by forces as for compare (amber14-all,amber14/tip3p, gfn2)",
+        ),
+        Option("--temperature", "with --forces: say whether the temperatures are this one", type=float, metavar="K"),
+        Option("--no-rank", "leave out rank and temperature", action="store_true"),
+        Option("--out", "folder for check.json, .png and .txt (default ./check-TRAJECTORY)", type=Path),
+    ),
+    _check,
+)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from kcons.cli import listing
-from kcons.cli.parser import Parser
-from kcons.cli.systems import check_name, molecules, owner, test_system
+from kcons.cli.parser import Command, Option
+from kcons.cli.systems import SYSTEM, check_name, molecules, owner, test_system
 from kcons.cli.terminal import console, names, numbers
 from kcons.errors import InputError
 
@@ -26,53 +26,6 @@ SETTINGS = ("size", "seed", "quick", "dt")
 PRODUCTION_STEPS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
-def add(commands: Any, common: Parser) -> None:
-    """Its options."""
-    compare = commands.add_parser(
-        "compare",
-        parents=[common],
-        help="how much error each method makes, for how much time",
-        description="Run a test system or a file through several methods: which one to use, at which step; a ranking; "
-        "a CSV file and a picture of error against cost. Trajectories are compared, or averages at a temperature.",
-    )
-    compare.add_argument(
-        "--dt",
-        type=numbers,
-        help="time steps, comma separated, in the unit that tables show; "
-        "steppers with several force evaluations a step take longer ones at the same cost",
-    )
-    compare.add_argument(
-        "--methods",
-        type=names,
-        help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
-    )
-    compare.add_argument(
-        "--out",
-        type=Path,
-        help="folder for compare.csv, .png and .txt (default ./compare-SYSTEM, for averages ./compare-SYSTEM-averages)",
-    )
-    compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
-    compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
-    compare.add_argument("--resume", action="store_true", help="go on from the rows of compare.csv in the folder")
-    compare.add_argument(
-        "--target-error",
-        type=float,
-        metavar="E",
-        help="also find the cheapest method and step that make at most this error, by measurement",
-    )
-    compare.add_argument(
-        "--criterion",
-        choices=("error", "drift", "temperature"),
-        help="what methods are ranked by: error of the trajectory (default), drift of the energy; temperature runs "
-        "thermostats instead, and looks at the temperature of the configurations",
-    )
-    compare.add_argument("--slow", metavar="FORCES", help="of a file: expensive forces, as in --forces, with --fast")
-    compare.add_argument(
-        "--fast", metavar="FORCES", help="and cheap ones: how long may the step be? (--slow gfn2 --fast amber14-all)"
-    )
-    compare.set_defaults(run=run, of=compare)
-
-
 def run(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return listing.of_everything()
@@ -82,7 +35,7 @@ def run(chosen: argparse.Namespace) -> int:
 
     temperature = _asks_for_averages(chosen)  # complain before any work
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
-    named = f"compare-{Path(chosen.scene).stem}" + ("-averages" if temperature else "")
+    named = f"compare-{Path(chosen.system).stem}" + ("-averages" if temperature else "")
     folder: Path = chosen.out or Path(named)
     asked = _asked(chosen, budget, temperature)
     files = [f"compare.{kind}" for kind in ("csv", "png", "txt")]
@@ -153,8 +106,8 @@ def _asks_for_averages(chosen: argparse.Namespace) -> bool:
                 raise InputError(f"--{other} needs --{name}: give the {what} forces, too", item=name)
         if chosen.slow == chosen.fast:
             raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
-        if chosen.scene is None or not Path(chosen.scene).is_file():
-            raise InputError(f"--slow and --fast are for files, not for {chosen.scene!r}", item="scene")
+        if chosen.system is None or not Path(chosen.system).is_file():
+            raise InputError(f"--slow and --fast are for files, not for {chosen.system!r}", item="system")
     check_name(chosen)
     return True
 
@@ -204,7 +157,7 @@ def _asked(chosen: argparse.Namespace, budget: float, averages: bool) -> dict[st
     """What the rows of a table depend on."""
     settings = {name: getattr(chosen, name) for name in SETTINGS}
     settings |= {"averages": True, "slow": chosen.slow, "fast": chosen.fast} if averages else {}
-    return {"system": owner(chosen.scene), **settings, "budget": budget, **molecules(chosen)}
+    return {"system": owner(chosen.system), **settings, "budget": budget, **molecules(chosen)}
 
 
 def _earlier(path: Path, asked: dict[str, Any]) -> Any:
@@ -230,7 +183,7 @@ def _production(chosen: argparse.Namespace, system: Any, budget: float, watcher:
     """Which step is right for averages, for a user's own molecule whose forces are cheap enough for the budget."""
     from kcons.comparison import measure, production, test_systems
 
-    if chosen.scene in test_systems.SYSTEMS or system.units.energy != "eV" or chosen.quick:
+    if chosen.system in test_systems.SYSTEMS or system.units.energy != "eV" or chosen.quick:
         return ""
     seconds = measure.force_seconds(system)
     if seconds > production.CHEAP * budget:
@@ -251,10 +204,10 @@ def _expression(chosen: argparse.Namespace) -> str:
     said |= {"quick": True} if chosen.quick else {}
     said |= molecules(chosen)
     words = [f"{name}={_literal(value)}" for name, value in said.items()]
-    if chosen.scene not in test_systems.SYSTEMS:
-        return f"test_systems.from_file({', '.join([_literal(chosen.scene), *words])})"
+    if chosen.system not in test_systems.SYSTEMS:
+        return f"test_systems.from_file({', '.join([_literal(chosen.system), *words])})"
     size = [] if chosen.size is None else [str(chosen.size)]
-    return f"test_systems.build({', '.join([_literal(chosen.scene), *size, *words])})"
+    return f"test_systems.build({', '.join([_literal(chosen.system), *size, *words])})"
 
 
 def _literal(value: Any) -> str:
@@ -262,3 +215,50 @@ def _literal(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     return f"[{', '.join(map(_literal, value))}]" if isinstance(value, list) else repr(value)
+
+
+COMMAND = Command(
+    "compare",
+    "how much error each method makes, for how much time",
+    "Run a test system or a file through several methods: which one to use, at which step; a ranking; "
+    "a CSV file and a picture of error against cost. Trajectories are compared, or averages at a temperature.",
+    (
+        *SYSTEM,
+        Option(
+            "--dt",
+            "time steps, comma separated, in the unit that tables show; "
+            "steppers with several force evaluations a step take longer ones at the same cost",
+            type=numbers,
+        ),
+        Option(
+            "--methods",
+            "methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
+            type=names,
+        ),
+        Option(
+            "--out",
+            "folder for compare.csv, .png and .txt (default ./compare-SYSTEM, for averages ./compare-SYSTEM-averages)",
+            type=Path,
+        ),
+        Option("--quick", "smaller system, half the horizon, a budget of 5 s", action="store_true"),
+        Option("--budget", "seconds for each method (default 20)", type=float),
+        Option("--resume", "go on from the rows of compare.csv in the folder", action="store_true"),
+        Option(
+            "--target-error",
+            "also find the cheapest method and step that make at most this error, by measurement",
+            type=float,
+            metavar="E",
+        ),
+        Option(
+            "--criterion",
+            "what methods are ranked by: error of the trajectory (default), drift of the energy; temperature runs "
+            "thermostats instead, and looks at the temperature of the configurations",
+            choices=("error", "drift", "temperature"),
+        ),
+        Option("--slow", "of a file: expensive forces, as in --forces, with --fast", metavar="FORCES"),
+        Option(
+            "--fast", "and cheap ones: how long may the step be? (--slow gfn2 --fast amber14-all)", metavar="FORCES"
+        ),
+    ),
+    run,
+)

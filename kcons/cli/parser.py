@@ -47,19 +47,14 @@ class Command(NamedTuple):
     run: Callable[[argparse.Namespace], int]
     kept: str = ""
 
-    def add(self, commands: Any, parents: Sequence[Parser] = ()) -> None:
-        parser = commands.add_parser(self.name, help=self.help, description=self.description, parents=list(parents))
-        add_options(parser, self.options)
+    def add(self, commands: Any) -> None:
+        parser = commands.add_parser(self.name, help=self.help, description=self.description)
+        groups: dict[str, Any] = {"": parser}
+        for option in self.options:
+            if option.group not in groups:
+                groups[option.group] = parser.add_argument_group(option.group)
+            groups[option.group].add_argument(option.name, **option.how)
         parser.set_defaults(run=self.run, of=parser, kept=self.kept)
-
-
-def add_options(parser: argparse.ArgumentParser, options: Sequence[Option]) -> None:
-    """Make a parser know the options of a table."""
-    groups: dict[str, Any] = {"": parser}
-    for option in options:
-        if option.group not in groups:
-            groups[option.group] = parser.add_argument_group(option.group)
-        groups[option.group].add_argument(option.name, **option.how)
 
 
 class Parser(argparse.ArgumentParser):

@@ -6,20 +6,9 @@ import argparse
 from typing import Any
 
 from kcons.cli import listing
-from kcons.cli.parser import Parser
-from kcons.cli.systems import check_name, molecules, test_system
+from kcons.cli.parser import Command
+from kcons.cli.systems import SYSTEM, check_name, molecules, test_system
 from kcons.errors import InputError
-
-
-def add(commands: Any, common: Parser) -> None:
-    """Its options."""
-    plan = commands.add_parser(
-        "plan",
-        parents=[common],
-        help="clusters, rank, degrees of freedom and the solver picked for each kind of cluster",
-        description="What the engine will do for a system, before any run.",
-    )
-    plan.set_defaults(run=run, of=plan)
 
 
 def run(chosen: argparse.Namespace) -> int:
@@ -29,7 +18,7 @@ def run(chosen: argparse.Namespace) -> int:
 
     check_name(chosen)
     given = molecules(chosen)
-    if test_systems.is_other_file(chosen.scene) and test_systems.by_mdanalysis(chosen.scene, given):
+    if test_systems.is_other_file(chosen.system) and test_systems.by_mdanalysis(chosen.system, given):
         return plan_file(chosen, given)
     system = test_system(chosen)
     print(system.title)
@@ -45,7 +34,7 @@ def plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
         if name in given:
             option = name.replace("_", "-") if name == "add_hydrogens" else name.replace("_", "")
             raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
-    found = any_file.plan(chosen.scene, **given)
+    found = any_file.plan(chosen.system, **given)
     print(found.title)
     for note in found.notes:
         print(note)
@@ -54,3 +43,12 @@ def plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
         print(f"{sites:,} virtual sites, placed by their molecules")
     print(found.motion.report(found.positions))
     return 0
+
+
+COMMAND = Command(
+    "plan",
+    "clusters, rank, degrees of freedom and the solver picked for each kind of cluster",
+    "What the engine will do for a system, before any run.",
+    (*SYSTEM,),
+    run,
+)

@@ -8,37 +8,78 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kcons.cli.parser import Option
 from kcons.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from kcons.comparison.test_systems import TestSystem
 
 
+#: Options of `compare` and `plan` about the system.
+_MOLECULES = "molecules in OpenMM: alanine, dhfr, dhfr-water, villin, and files"
+_FILES = "any file that MDAnalysis reads; these options make it read PDB files, too"
+SYSTEM = (
+    Option(
+        "system",
+        "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads",
+        nargs="?",
+        metavar="SYSTEM",
+    ),
+    Option("--size", "number of molecules, bonds or particles", type=int),
+    Option("--seed", "of the initial velocities (default 1)", type=int, default=1),
+    Option("--list", "list test systems and methods, and leave", action="store_true"),
+    Option(
+        "--constrain",
+        "beside rigid water (default hbonds for files; the last two for files that MDAnalysis reads)",
+        choices=("hbonds", "allbonds", "hangles", "allangles", "none"),
+        group=_MOLECULES,
+    ),
+    Option(
+        "--forcefield",
+        "files of OpenMM (default amber14-all.xml amber14/tip3pfb.xml)",
+        nargs="+",
+        metavar="XML",
+        group=_MOLECULES,
+    ),
+    Option("--add-hydrogens", "add hydrogens that a file lacks, at pH 7", action="store_true", group=_MOLECULES),
+    Option("--platform", "of OpenMM (default: Reference up to 200 atoms, CPU above)", group=_MOLECULES),
+    Option("--coordinates", "coordinates, where the topology file has none", type=Path, metavar="FILE", group=_FILES),
+    Option(
+        "--forces",
+        "openmm (default), force fields of OpenMM by name, comma separated (amber14-all,amber14/tip3p), or emt, "
+        "lj, tip3p, gfn1, gfn2, or another calculator of ASE; not for plan",
+        group=_FILES,
+    ),
+    Option("--select", "hold only what is within this selection of MDAnalysis", metavar="WORDS", group=_FILES),
+    Option("--rigid-residues", "residues held rigid", nargs="+", metavar="NAME", group=_FILES),
+)
+
+
 def check_name(chosen: argparse.Namespace) -> None:
     from kcons.comparison import test_systems
 
     known = ", ".join(test_systems.SYSTEMS)
-    if chosen.scene is None:
-        raise InputError(f"name a test system: {known}; or a PDB file", item="scene")
-    if test_systems.is_file(chosen.scene) or test_systems.is_other_file(chosen.scene):
-        if not Path(chosen.scene).is_file():
-            raise InputError(f"there is no file {chosen.scene}", item="scene")
+    if chosen.system is None:
+        raise InputError(f"name a test system: {known}; or a PDB file", item="system")
+    if test_systems.is_file(chosen.system) or test_systems.is_other_file(chosen.system):
+        if not Path(chosen.system).is_file():
+            raise InputError(f"there is no file {chosen.system}", item="system")
         if chosen.size is not None:
             raise InputError("a file has the size it has; leave --size out", item="size")
-    elif chosen.scene not in test_systems.SYSTEMS:
+    elif chosen.system not in test_systems.SYSTEMS:
         raise InputError(
-            f"there is no test system {chosen.scene!r}"
-            f"{did_you_mean(chosen.scene, test_systems.SYSTEMS)}; "
+            f"there is no test system {chosen.system!r}"
+            f"{did_you_mean(chosen.system, test_systems.SYSTEMS)}; "
             f"there are {known}; or give a PDB file",
-            item="scene",
+            item="system",
         )
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
-def owner(scene: str) -> str:
+def owner(system: str) -> str:
     """What results belong to: a test system by name, or a file by its path."""
-    return str(Path(scene).resolve()) if Path(scene).is_file() else scene
+    return str(Path(system).resolve()) if Path(system).is_file() else system
 
 
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
@@ -59,12 +100,12 @@ def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
 def test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSystem:
     from kcons.comparison import test_systems
 
-    if test_systems.is_file(chosen.scene) or test_systems.is_other_file(chosen.scene):
-        if chosen.add_hydrogens and test_systems.by_mdanalysis(chosen.scene, molecules(chosen)):
+    if test_systems.is_file(chosen.system) or test_systems.is_other_file(chosen.system):
+        if chosen.add_hydrogens and test_systems.by_mdanalysis(chosen.system, molecules(chosen)):
             raise InputError("--add-hydrogens is for PDB and mmCIF files with OpenMM", item="add_hydrogens")
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", UserWarning)
-            found = test_systems.from_file(chosen.scene, chosen.seed, quick=quick, **molecules(chosen))
+            found = test_systems.from_file(chosen.system, chosen.seed, quick=quick, **molecules(chosen))
         for text in dict.fromkeys(str(w.message) for w in said if w.category is UserWarning):
             print(f"kcons: {text}", file=sys.stderr)
         return found
@@ -72,4 +113,4 @@ def test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSyste
         raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
     for name in sorted(test_systems.FILE_OPTIONS & set(molecules(chosen))):
         raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in test systems", item=name)
-    return test_systems.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **molecules(chosen))
+    return test_systems.build(chosen.system, chosen.size, chosen.seed, quick=quick, **molecules(chosen))

@@ -43,6 +43,6 @@ def attempts(monkeypatch) -> list[tuple[float, float, bool]]:
     return made
 
 
-def scene_system(system, far: float = 8.0) -> tuple[System, list[float]]:
+def system_of_test(system, far: float = 8.0) -> tuple[System, list[float]]:
     motion = Motion(system.constraint_set, system.positions)
     return counted(System(motion, system.potential.forces), far=far)

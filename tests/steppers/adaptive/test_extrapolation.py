@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference import cases
-from stepper_attempts import attempts, counted, end_of, scene_system
+from stepper_attempts import attempts, counted, end_of, system_of_test
 from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
 from stepper_systems import gravity, growing_rod, rotor, skate, spherical_pendulum, system_of
 
@@ -59,7 +59,7 @@ def test_eight_orders_and_another_base() -> None:
 def test_errors_are_proportional_to_the_tolerance(name, most) -> None:
     test_system = test_systems.build(name)
     exact = test_system.reference().positions
-    system, times = scene_system(test_system)
+    system, times = system_of_test(test_system)
     tolerances, errors, calls = np.array([1e-5, 1e-7, 1e-9, 1e-11]), [], []
     for tolerance in tolerances:
         times.clear()
@@ -111,7 +111,7 @@ def test_fewer_evaluations_than_dop853(name) -> None:
     test_system = replace(test_systems.build(name), tolerances=tuple(tolerances))
     theirs = compare(test_system, ["dop853"], budget=60.0, rounds=0)
     exact = test_system.reference().positions
-    system, times = scene_system(test_system)
+    system, times = system_of_test(test_system)
     errors, calls = [], []
     for tolerance in [1e-5, *tolerances, 1e-11, 1e-12]:
         times.clear()
@@ -138,7 +138,7 @@ def test_what_is_held_holds_at_loose_tolerances(make) -> None:
 def test_rounding_is_no_reason_for_small_steps(tolerance) -> None:
     for name in ("triple-pendulum", "sphere-pendulum-top"):
         test_system = test_systems.build(name)
-        system, times = scene_system(test_system)
+        system, times = system_of_test(test_system)
         states = list(
             Extrapolation(tolerance).states(
                 system, State(test_system.positions, test_system.velocities), test_system.horizon
