@@ -32,8 +32,8 @@ from kcons.errors import (
     NonFiniteError,
     SingularGeometryError,
 )
+from kcons.models.integration import check_run, projecting
 from kcons.models.multibody_functions import MultibodyFunctions, largest, shown
-from kcons.models.projected_steps import check_sizes, projecting, solver_of, span_of, times_of
 
 #: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
 DEPENDENT = 1e-10
@@ -228,11 +228,10 @@ class Multibody(MultibodyFunctions):
         NonFiniteError
             A function gave a NaN or infinity.
         """
-        t0, t1 = span_of(t_span)
-        wanted = None if t_eval is None else times_of(t_eval, t0, t1)
-        solver = solver_of(method)
+        solver, (t0, t1), wanted = check_run(
+            t_span, t_eval, method, options | {"rtol": rtol, "atol": atol}, 2 * np.size(q)
+        )
         q, v = self._state(q, v, t0)
-        check_sizes(options | {"rtol": rtol, "atol": atol}, 2 * len(q))
         n, rank = len(q), len(self._start(q, v, t0).rows)
         latest: dict[str, Any] = {}
 
@@ -272,8 +271,8 @@ class Multibody(MultibodyFunctions):
             )
         states, motions = [], []
         for t, y in zip(ode.t, np.transpose(ode.y), strict=True):
-            states.append(y if wanted is None else project(t, y))
-            q, v = np.split(lent(states[-1]), 2)
+            states.append(y)
+            q, v = np.split(lent(y), 2)
             motions.append(self._motion(self._place(q, t, rank), v))
         q, v = np.split(np.array(states).reshape(-1, 2 * n), 2, axis=1)
         a, multipliers = (

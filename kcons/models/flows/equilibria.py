@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import FloatArray, numbers, whole_number
 from kcons.errors import InputError
-from kcons.models.flows.flow import FloatArray, Flow
-from kcons.models.flows.stability import Classification, classify
+from kcons.models.flows.flow import Flow
+from kcons.models.flows.linear import Classification, classify
 
 #: Equilibria closer than this, in parts of the size of the box, are one.
 SAME = 1e-6
@@ -64,42 +64,33 @@ def find_equilibria(
     InputError
         A box that is not finite or has the wrong shape.
     """
-    edges = numbers(box, "box")
-    if edges.shape != (flow.n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
-        raise InputError(f"the box has shape ({flow.n}, 2), its lower edges first", item="box")
-    if starts < 1:
-        raise InputError("there is at least one start", item="starts")
+    edges, starts, n = numbers(box, "box"), whole_number(starts, "starts"), flow.n
+    if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
+        raise InputError(f"the box has shape ({n}, 2), its lower edges first", item="box")
     low, width = edges[:, 0], edges[:, 1] - edges[:, 0]
-    rng = np.random.default_rng(seed)
-    fixed = [np.full(flow.n, 0.5)]
-    if flow.n <= 6:
-        fixed += [np.array([(c >> k) & 1 for k in range(flow.n)], dtype=np.float64) for c in range(2**flow.n)]
-    points = np.concatenate([np.array(fixed), rng.random((max(starts - len(fixed), 0), flow.n))])[: max(starts, 1)]
-    points = low + width * points
+    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * n), axis=-1).reshape(-1, n) if n <= 6 else np.zeros((0, n))
+    fixed = np.vstack([np.full((1, n), 0.5), corners])
+    spread = np.random.default_rng(seed).random((max(starts - len(fixed), 0), n))
+    points = low + width * np.vstack([fixed, spread])[:starts]
+    found: list[FloatArray] = []
     with np.errstate(all="ignore"):
         speeds = [float(np.linalg.norm(flow.velocity(time, p))) for p in points]
-    size = float(np.median([s for s in speeds if np.isfinite(s)] or [1.0])) or 1.0
-    found: list[FloatArray] = []
-    for point in points:
-        try:
-            with np.errstate(all="ignore"):
+        size = float(np.median([s for s in speeds if np.isfinite(s)] or [1.0])) or 1.0
+        for point in points:
+            try:
                 result = root(
                     lambda X: flow.velocity(time, X),
                     point,
                     jac=lambda X: flow.jacobian(time, X),
-                    method="hybr",
                     options={"xtol": 1e-13},
                 )
-        except InputError:  # the search has left all numbers
-            continue
-        X = _polished(flow, time, np.asarray(result.x))
-        place = (X - low) / width
-        if not np.all(np.isfinite(X)) or np.min(place) < -SAME or np.max(place) > 1 + SAME:
-            continue
-        if float(np.linalg.norm(flow.velocity(time, X))) > tolerance * size:
-            continue
-        if all(np.max(np.abs(X - other) / width) > SAME for other in found):
-            found.append(X)
+                X = _polished(flow, time, np.asarray(result.x))
+                place, left = (X - low) / width, float(np.linalg.norm(flow.velocity(time, X)))
+            except InputError:  # the search has left all numbers
+                continue
+            inside = np.min(place) >= -SAME and np.max(place) <= 1 + SAME and left <= tolerance * size
+            if inside and all(np.max(np.abs(X - other) / width) > SAME for other in found):
+                found.append(X)
     found.sort(key=lambda X: [round(float(value), 9) for value in X])
     return [equilibrium_at(flow, X, time) for X in found]
 
@@ -107,8 +98,8 @@ def find_equilibria(
 def equilibrium_at(flow: Flow, position: ArrayLike, time: float = 0.0) -> Equilibrium:
     """What the flow does around a point where it vanishes.
 
-    The Jacobian counts as known to the accuracy of its differences and of the point. So a centre of a flow that is
-    given without its Jacobian is a centre whose stability cannot be told.
+    The Jacobian counts as known to the accuracy of its differences and of the point. So a center of a flow that is
+    given without its Jacobian is a center whose stability cannot be told.
     """
     X = numbers(position, "position")
     A, V = flow.jacobian(time, X), flow.velocity(time, X)
@@ -122,8 +113,6 @@ def equilibrium_at(flow: Flow, position: ArrayLike, time: float = 0.0) -> Equili
 def _polished(flow: Flow, time: float, X: FloatArray) -> FloatArray:
     """Two Newton steps of least norm, kept where they help."""
     for _ in range(2):
-        if not np.all(np.isfinite(X)) or np.max(np.abs(X), initial=0.0) > 1e100:
-            return X
         V = flow.velocity(time, X)
         trial = X - np.linalg.lstsq(flow.jacobian(time, X), V, rcond=1e-10)[0]
         if not np.all(np.isfinite(trial)) or np.linalg.norm(flow.velocity(time, trial)) >= np.linalg.norm(V):
