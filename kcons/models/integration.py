@@ -132,6 +132,19 @@ def check_run(
     return METHODS[method], (t0, t1), times
 
 
+def called(
+    item: str, function: Callable[..., ArrayLike], shape: tuple[int, ...], *arguments: Any, scalar: bool = False
+) -> FloatArray:
+    """What a function of the user gives, of that shape, or with `scalar` one number for all.
+
+    It can read arrays among its arguments and not change them.
+    """
+    value = numbers(function(*(lent(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
+    if value.shape != shape and not (scalar and value.shape == ()):
+        raise InputError(f"{item} returned shape {value.shape}, not {shape}", item=item)
+    return np.broadcast_to(value, shape)
+
+
 def jacobian_by_differences(
     velocity: Callable[[float, FloatArray], ArrayLike], t: float, X: ArrayLike, step: float | FloatArray = STEP
 ) -> FloatArray:
@@ -164,6 +177,7 @@ def check_derivative(
     *,
     rounding: float = 0.0,
     smooth: float = WRONG,
+    remedy: str = "or leave it out",
 ) -> None:
     """Refuse a derivative that differences with a step and with half of it contradict.
 
@@ -177,10 +191,8 @@ def check_derivative(
     coarse, fine : ndarray
     rounding : float
         Of differences.
-
-    Raises
-    ------
-    InputError
+    remedy : str
+        What to do beside correcting it.
     """
     size = float(np.max(np.abs(fine), initial=0.0))
     apart = np.abs(fine - coarse)
@@ -195,6 +207,6 @@ def check_derivative(
         k = tuple(np.argwhere(wrong)[0].tolist())
         raise InputError(
             f"{item} gives {given[k]:.6g} for entry {list(k)}, but differences of {of} give {fine[k]:.6g}; "
-            "correct it, or leave it out",
+            f"correct it, {remedy}",
             item=item,
         )

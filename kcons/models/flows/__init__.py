@@ -3,7 +3,7 @@
 - `flow`: a flow and its phase-space volume
 - `linear`: linear flows: eigenvalues as far as they can be told, Jordan form, stability
 - `equilibria`: where a flow rests
-- `mechanics`: from a Lagrangian to Hamilton's equations, symplectic steps
+- `mechanics`: from a Lagrangian to Hamilton's equations
 - `known_flows`: flows with known solutions
 """
 
@@ -27,12 +27,10 @@ from kcons.models.flows.linear import (
     classify,
     jordan_block,
     jordan_block_propagator,
-    jordan_blocks,
     jordan_form,
 )
 from kcons.models.flows.mechanics import (
     HamiltonianFlow,
-    SymplecticTrajectory,
     action,
     hamiltonian,
     lagrange_residual,
@@ -57,7 +55,6 @@ __all__ = [
     "Pendulum",
     "PhaseVolume",
     "Stability",
-    "SymplecticTrajectory",
     "Thermostat",
     "action",
     "classify",
@@ -67,7 +64,6 @@ __all__ = [
     "jacobian_by_differences",
     "jordan_block",
     "jordan_block_propagator",
-    "jordan_blocks",
     "jordan_form",
     "lagrange_residual",
     "momentum",

@@ -58,11 +58,6 @@ def find_equilibria(
     -------
     list of Equilibrium
         Sorted by position. A search can miss one; more starts make that less likely.
-
-    Raises
-    ------
-    InputError
-        A box that is not finite or has the wrong shape.
     """
     edges, starts, n = numbers(box, "box"), whole_number(starts, "starts"), flow.n
     if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):

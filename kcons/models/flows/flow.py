@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import FloatArray, check_call, lent, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, check_call, numbers, whole_number
 from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
-from kcons.models.integration import STEP, check_derivative, jacobian_by_differences
+from kcons.models.integration import STEP, called, check_derivative, jacobian_by_differences
 
 Field = Callable[[float, FloatArray], ArrayLike]
 
@@ -32,11 +32,6 @@ class Flow:
         Number of variables.
     jacobian : callable (t, X) -> (n, n), optional
         A_kl = dV_k/dX_l (notes eq. 27); by differences where it is not given.
-
-    Raises
-    ------
-    InputError
-        If n < 1; functions of other arguments.
     """
 
     def __init__(self, velocity: Field, n: int, jacobian: Field | None = None) -> None:
@@ -48,20 +43,14 @@ class Flow:
 
     def velocity(self, t: float, X: ArrayLike) -> FloatArray:
         """V(X, t), shape (n,) (notes eqs. 2, 3)."""
-        V = numbers(self._velocity(t, lent(self._state(X))), "velocity")
-        if V.shape != (self.n,):
-            raise InputError(f"V has shape {V.shape}, not ({self.n},)", item="velocity")
-        return V
+        return called("velocity", self._velocity, (self.n,), t, self._state(X))
 
     def jacobian(self, t: float, X: ArrayLike) -> FloatArray:
         """A = dV/dX, shape (n, n) (notes eq. 27)."""
         X = self._state(X)
         if self._jacobian is None:
             return jacobian_by_differences(self._velocity, t, X)
-        A = numbers(self._jacobian(t, lent(X)), "jacobian")
-        if A.shape != (self.n, self.n):
-            raise InputError(f"the Jacobian has shape {A.shape}, not ({self.n}, {self.n})", item="jacobian")
-        return A
+        return called("jacobian", self._jacobian, (self.n, self.n), t, X)
 
     def jacobian_error(self, t: float, X: ArrayLike) -> FloatArray:
         """How far `jacobian` may be off, shape (n, n): 0 where it is given, else what half the steps change."""
@@ -76,12 +65,7 @@ class Flow:
         return [jacobian_by_differences(self._velocity, t, self._state(X), step) for step in (STEP, STEP / 2)]
 
     def check_jacobian(self, t: float, X: ArrayLike) -> None:
-        """Refuse a Jacobian that differences contradict, and differences that do not serve.
-
-        Raises
-        ------
-        InputError
-        """
+        """Refuse a Jacobian that differences contradict, and differences that do not serve."""
         given = None if self._jacobian is None else self.jacobian(t, X)
         check_derivative("jacobian", "the velocity", given, *self._differences(t, X))
 

@@ -15,7 +15,6 @@ from kcons.constraints.arguments import (
     FloatArray,
     check_call,
     finite_number,
-    lent,
     numbers,
     positive,
     whole_number,
@@ -24,19 +23,14 @@ from kcons.errors import InputError
 from kcons.models.flows.flow import Flow, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
 from kcons.models.flows.mechanics import HamiltonianFlow
+from kcons.models.integration import called
 
 #: Part of the energy of the separatrix, within which elliptic functions of double precision lose their digits.
 NEAR_SEPARATRIX = 1e-9
 
 
 class DampedOscillator(LinearFlow):
-    """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22).
-
-    Raises
-    ------
-    InputError
-        If Omega is not positive or eta negative.
-    """
+    """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22)."""
 
     def __init__(self, omega: float = 1.0, eta: float = 0.2) -> None:
         self.omega, self.eta = positive(omega, "omega"), finite_number(eta, "eta")
@@ -115,13 +109,7 @@ class HarmonicOscillator(DampedOscillator):
 
 
 class Pendulum(HamiltonianFlow):
-    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57).
-
-    Raises
-    ------
-    InputError
-        If Omega is not positive.
-    """
+    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57)."""
 
     def __init__(self, omega: float = 1.0) -> None:
         self.omega = positive(omega, "omega")
@@ -130,7 +118,6 @@ class Pendulum(HamiltonianFlow):
             1,
             lambda q, p: self.omega * np.sin(q),
             lambda q, p: self.omega * p,
-            separable=True,
         )
         self._jacobian = lambda t, X: np.array([[0.0, self.omega], [-self.omega * np.cos(X[0]), 0.0]])
 
@@ -139,11 +126,6 @@ class Pendulum(HamiltonianFlow):
 
         With k^2 = H/(2 Omega): sin(theta/2) = k sn(Omega t + u_0 | k^2) for k < 1, and theta/2 = am(k Omega t + u_0 |
         1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
-
-        Raises
-        ------
-        InputError
-            A start that is near the separatrix, and not on it.
         """
         theta0, rate0 = self._state(X0)
         times = numbers(t, "t")
@@ -194,11 +176,6 @@ class ParticleOnSphere(Flow):
     radius, mass : float
     force : callable (x) -> (3,), optional
         None for free motion.
-
-    Raises
-    ------
-    InputError
-        If radius or mass is not positive.
     """
 
     def __init__(
@@ -213,18 +190,12 @@ class ParticleOnSphere(Flow):
         x, v = numbers(x, "x"), numbers(v, "v")
         a = -(v @ v) / self.radius**2 * x
         if self.force is not None:
-            f = numbers(self.force(lent(x)), "force") / self.mass
+            f = called("force", self.force, (3,), x) / self.mass
             a = a + f - x * (x @ f) / self.radius**2
         return np.asarray(a)
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
-        """The free motion x(t), shape (3,) or (k, 3).
-
-        Raises
-        ------
-        InputError
-            x0 is off the sphere, or v0 leaves it.
-        """
+        """The free motion x(t), shape (3,) or (k, 3)."""
         x0, v0 = np.split(self._state(np.concatenate([np.ravel(numbers(x0, "x0")), np.ravel(numbers(v0, "v0"))])), 2)
         speed = float(np.linalg.norm(v0))
         if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
@@ -270,11 +241,6 @@ class Thermostat(Flow):
     momentum_removed : int
         Number of directions in which the total momentum is zero and stays so (the forces sum to zero there): 0, or the
         dimension of space, the components running fastest. They do not count as degrees of freedom.
-
-    Raises
-    ------
-    InputError
-        Masses that are not positive.
     """
 
     def __init__(
@@ -297,13 +263,7 @@ class Thermostat(Flow):
         return self.masses.size - self.removed
 
     def state(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
-        """X of positions and velocities.
-
-        Raises
-        ------
-        InputError
-            Without kinetic energy, or with a total momentum although it was said to be removed.
-        """
+        """X of positions and velocities."""
         x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
         if x.shape != self.masses.shape or v.shape != self.masses.shape:
             raise InputError(f"x and v have {self.masses.size} components each, as the masses", item="x")
@@ -329,10 +289,7 @@ class Thermostat(Flow):
         return float(w @ (self._force(self.positions(X)) / self.root) / (w @ w))
 
     def _force(self, x: FloatArray) -> FloatArray:
-        f = numbers(self.force(lent(x)), "force")
-        if f.shape not in ((), x.shape):
-            raise InputError(f"force returned shape {f.shape}, not {x.shape}", item="force")
-        return np.broadcast_to(f, x.shape)
+        return called("force", self.force, x.shape, x, scalar=True)
 
     def _field(self, t: float, X: FloatArray) -> FloatArray:
         w = X[self.masses.size :]

@@ -59,11 +59,6 @@ class LinearFlow(Flow):
     Parameters
     ----------
     matrix : array_like, shape (n, n)
-
-    Raises
-    ------
-    InputError
-        A matrix that is not square, real and finite.
     """
 
     def __init__(self, matrix: ArrayLike) -> None:
@@ -82,10 +77,6 @@ class LinearFlow(Flow):
         """T and J with A = T J T^-1, as far as double precision allows (notes eqs. 10-13)."""
         return jordan_form(self.matrix)
 
-    def jordan_blocks(self) -> list[JordanBlocks]:
-        """Eigenvalues with the sizes of their blocks (notes eqs. 10-12)."""
-        return self.jordan_form().blocks
-
     def classification(self) -> Classification:
         """Kind and stability (notes eq. 14, completed)."""
         return classify(self.matrix)
@@ -95,29 +86,17 @@ class LinearFlow(Flow):
 
 
 class Spectrum(NamedTuple):
-    """A = S T S^-1 with T upper triangular; eigenvalues in the order of its diagonal.
-
-    Attributes
-    ----------
-    values : ndarray of complex, shape (n,)
-    errors : ndarray, shape (n,)
-        How far each may be off, for all changes of the entries by their rounding and by the errors given.
-    conditions : ndarray, shape (n,)
-        1/|y^H x| of the left and right eigenvectors of unit length, of the balanced matrix: by how much a change of the
-        matrix is multiplied. Infinite, or near 1/(machine precision), where the matrix is defective.
-    noise : ndarray, shape (n,)
-        Norm of the change of its own block that was allowed for; 0 for an entry that is an eigenvalue as it stands.
-    triangular : ndarray of complex, shape (n, n)
-        T.
-    basis : ndarray of complex, shape (n, n)
-        S: a permutation, a scaling by powers of two, a unitary matrix.
-    """
+    """A = S T S^-1 with T upper triangular; eigenvalues in the order of its diagonal."""
 
     values: ComplexArray
+    #: How far each may be off, for all changes of the entries by their rounding and by the errors given.
     errors: FloatArray
+    #: 1/|y^H x| of the left and right eigenvectors of unit length of the balanced matrix: what multiplies its changes.
     conditions: FloatArray
+    #: Norm of the change of its own block that was allowed for; 0 for an entry that is an eigenvalue as it stands.
     noise: FloatArray
     triangular: ComplexArray
+    #: S: a permutation, a scaling by powers of two, a unitary matrix.
     basis: ComplexArray
 
 
@@ -129,11 +108,6 @@ def spectrum(matrix: ArrayLike, error: ArrayLike = 0.0) -> Spectrum:
     matrix : array_like, shape (n, n)
     error : array_like, shape (n, n) or a number
         How far the entries may be off, beyond their rounding.
-
-    Raises
-    ------
-    InputError
-        A matrix that is not square, real and finite, or errors that are negative or do not belong to it.
     """
     A, E = _square(matrix), numbers(error, "error")
     if E.ndim and E.shape != A.shape:
@@ -308,11 +282,6 @@ def jordan_form(matrix: ArrayLike, error: ArrayLike = 0.0) -> JordanForm:
     matrix : array_like, shape (n, n)
     error : array_like, shape (n, n) or a number
         How far the entries may be off, beyond their rounding.
-
-    Raises
-    ------
-    InputError
-        A matrix that is not square, real and finite, or errors that do not belong to it.
     """
     found = spectrum(matrix, error)
     pieces: list[tuple[JordanBlocks, ComplexArray]] = []
@@ -327,11 +296,6 @@ def jordan_form(matrix: ArrayLike, error: ArrayLike = 0.0) -> JordanForm:
     pieces.sort(key=lambda piece: (-piece[0].eigenvalue.real, -piece[0].eigenvalue.imag))
     J = scipy.linalg.block_diag(*[jordan_block(b.eigenvalue, size) for b, _ in pieces for size in b.sizes])
     return JordanForm(np.concatenate([c for _, c in pieces], axis=1), J.astype(np.complex128), [b for b, _ in pieces])
-
-
-def jordan_blocks(matrix: ArrayLike, error: ArrayLike = 0.0) -> list[JordanBlocks]:
-    """Eigenvalues and block sizes, sorted by real part, largest first (notes eqs. 10-12); see `jordan_form`."""
-    return jordan_form(matrix, error).blocks
 
 
 def _mean(values: ComplexArray) -> complex:
@@ -489,11 +453,6 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
     error : array_like, shape (n, n) or a number
         How far the entries may be off, beyond their rounding: of a Jacobian by differences, for example. Without any,
         real parts of exactly zero are found, for up to 24 variables.
-
-    Raises
-    ------
-    InputError
-        A matrix that is not square, real and finite, or errors that do not belong to it.
     """
     A, found = _square(matrix), spectrum(matrix, error)
     groups = _clusters(found.values, found.errors)
@@ -511,7 +470,7 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
     else:
         kind = Kind.CENTER if present == {0} else Kind.FOCUS if turning else Kind.NODE
     if kind is Kind.NODE and len(groups) == 1 and len(A) > 1:
-        blocks = jordan_blocks(A, error)
+        blocks = jordan_form(A, error).blocks
         if len(blocks) == 1:
             detail = "star" if blocks[0].sizes[0] == 1 else "improper"
     stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN

@@ -67,11 +67,6 @@ class Relaxation(EntropyLaw):
         T(s_eq - s_0); left out, it is computed from the start, g(x_0) - g_eq.
     partial : bool
         Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
-
-    Raises
-    ------
-    InputError
-        If tau is not positive, or the budget negative or not finite.
     """
 
     def __init__(self, tau: float, budget: float | None = None, *, partial: bool = False) -> None:
@@ -155,11 +150,6 @@ class PrescribedProduction(EntropyLaw):
         Its time derivative.
     until : float
         The time up to which it will be asked for: so far it is checked.
-
-    Raises
-    ------
-    InputError
-        If `rate` is not the derivative of `produced`, or `until` is not positive.
     """
 
     #: Times at which a prescription is looked at before a run.
@@ -183,12 +173,7 @@ class PrescribedProduction(EntropyLaw):
             )
 
     def _looked_at(self, elapsed: float) -> float:
-        """A time from the start that lies in what was checked.
-
-        Raises
-        ------
-        InputError
-        """
+        """A time from the start that lies in what was checked."""
         if max(elapsed - self.until, -elapsed) > 1e-9 * self.until:
             raise InputError(
                 f"the prescribed production is known from the start until {self.until:g} after it: end the run there, "

@@ -51,11 +51,6 @@ class Hypercycle(GrowthModel):
     mu0 : array_like, shape (n,), optional
         Standard chemical potentials; those of figure 11 where left out, (0.1 + 0.05 l) kT with l = 1..n.
     kT : float
-
-    Raises
-    ------
-    InputError
-        If n < 2, or a rate constant is not a positive number.
     """
 
     def __init__(self, n: int = 5, k_h: float = 3.0, mu0: ArrayLike | None = None, kT: float = 1.0) -> None:

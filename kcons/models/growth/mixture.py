@@ -31,11 +31,6 @@ class Mixture:
     mu0 : array_like, shape (n,)
         Standard chemical potentials; a shift common to all of them changes nothing where sum x is kept.
     kT : float
-
-    Raises
-    ------
-    InputError
-        If mu0 is not finite or kT is not positive.
     """
 
     def __init__(self, mu0: ArrayLike, kT: float = 1.0) -> None:

@@ -15,8 +15,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import FloatArray, check_call, finite_number, lent, numbers, positive, whole_number
+from kcons.constraints.arguments import FloatArray, check_call, finite_number, numbers, positive, whole_number
 from kcons.errors import InputError, NonFiniteError
+from kcons.models.integration import called
 
 #: A function of time and populations, arguments in SciPy's order.
 OfState = Callable[[float, FloatArray], ArrayLike]
@@ -40,13 +41,7 @@ class Populations(NamedTuple):
 
     @classmethod
     def from_values(cls, time: float | FloatArray, x: ArrayLike) -> Self:
-        """Populations from x.
-
-        Raises
-        ------
-        InputError
-            If a population is negative, zero or not finite.
-        """
+        """Populations from x."""
         array = numbers(x, "x0").copy()
         if array.ndim not in (1, 2) or array.size == 0:
             raise InputError(f"populations have shape (n,) or (n, k), not {array.shape}", item="x0")
@@ -66,13 +61,7 @@ class Populations(NamedTuple):
 
     @classmethod
     def start(cls, time: float, n: int, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
-        """The start of a run with n species, given as populations or as their logarithms.
-
-        Raises
-        ------
-        InputError
-            Both or none; another number of species; logarithms that are not finite; as `from_values`.
-        """
+        """The start of a run with n species, given as populations or as their logarithms."""
         if (x0 is None) == (log_x0 is None):
             raise InputError("give the start either as x0 or as log_x0", item="x0")
         p = cls.from_logarithms(time, numbers(log_x0, "log_x0").copy()) if x0 is None else cls.from_values(time, x0)
@@ -94,11 +83,6 @@ class GrowthModel:
         Psi >= 0; left out, Psi = 0.
     n : int
         Number of species.
-
-    Raises
-    ------
-    InputError
-        `n` is no whole number from 1 on; functions of other arguments.
     """
 
     def __init__(self, rates: OfState, sources: OfState | None = None, *, n: int) -> None:
@@ -110,7 +94,7 @@ class GrowthModel:
 
     def rates(self, p: Populations) -> FloatArray:
         """phi, shape (n,) (notes eq. 62)."""
-        return evaluate(self._rates, p, (self.n,), "the rates")
+        return called("rates", self._rates, (self.n,), p.time, p.x, scalar=True)
 
     def sources(self, p: Populations) -> FloatArray | None:
         """Psi, shape (n,), or None where there are none.
@@ -122,7 +106,7 @@ class GrowthModel:
         """
         if self._sources is None:
             return None
-        psi = evaluate(self._sources, p, (self.n,), "the sources")
+        psi = called("sources", self._sources, (self.n,), p.time, p.x, scalar=True)
         if np.any(psi < 0):
             raise NonFiniteError(
                 f"source {int(np.argmax(psi < 0))} is negative ({psi[psi < 0][0]:.6g}): write losses as rates, "
@@ -153,22 +137,8 @@ class GrowthModel:
         return self.drift(Populations(t, x, np.full_like(x, np.nan)))
 
 
-def evaluate(function: OfState, p: Populations, shape: tuple[int, ...], what: str) -> FloatArray:
-    """What a user's function gives at one state, of that shape; one number may stand for all."""
-    value = numbers(function(p.time, lent(p.x)), what)  # type: ignore[arg-type]
-    if value.shape in (shape, ()):
-        return np.broadcast_to(value, shape)
-    raise InputError(f"{what}: the function returned shape {value.shape}, not {shape}", item=what)
-
-
 class Logistic(GrowthModel):
-    """dx/dt = alpha x - beta x^2 (notes eq. 65).
-
-    Raises
-    ------
-    InputError
-        If alpha or beta is not positive.
-    """
+    """dx/dt = alpha x - beta x^2 (notes eq. 65)."""
 
     def __init__(self, alpha: float = 1.0, beta: float = 0.1) -> None:
         self.alpha, self.beta = positive(alpha, "alpha"), positive(beta, "beta")
@@ -180,13 +150,7 @@ class Logistic(GrowthModel):
         return self.alpha / self.beta
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
-        """x(t) (notes eq. 66), written so that no exponential overflows.
-
-        Raises
-        ------
-        InputError
-            A negative population; times before the one at which one above the plateau came from infinity.
-        """
+        """x(t) (notes eq. 66), written so that no exponential overflows."""
         exponent, x0 = -self.alpha * numbers(t, "t"), finite_number(x0, "x0")
         if x0 < 0:
             raise InputError(f"x0 is {x0:g}; populations are not negative", item="x0")
@@ -206,12 +170,7 @@ class Logistic(GrowthModel):
 class LotkaVolterra(GrowthModel):
     """Prey x_1 and predators x_2 (notes eqs. 69, 70).
 
-        dx_1/dt = x_1 (alpha_1 - beta_1 x_2),     dx_2/dt = -x_2 (beta_2 - alpha_2 x_1)
-
-    Raises
-    ------
-    InputError
-        If a parameter is not positive.
+    dx_1/dt = x_1 (alpha_1 - beta_1 x_2),     dx_2/dt = -x_2 (beta_2 - alpha_2 x_1)
     """
 
     def __init__(self, alpha1: float = 1.0, beta1: float = 1.0, alpha2: float = 1.0, beta2: float = 2.0) -> None:

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import FloatArray, check_call, finite_number, numbers, whole_number
 from kcons.constraints.target import WRONG, contradicted, exact_step
 from kcons.errors import ConstraintError, InputError
-from kcons.models.growth.model import OfState, Populations, evaluate
-from kcons.models.integration import check_derivative, jacobian_by_differences
+from kcons.models.growth.model import OfState, Populations
+from kcons.models.integration import called, check_derivative, jacobian_by_differences
 
 #: Step of differences, in ln x; they serve where half of it changes them by no more than this part.
 STEP, SMOOTH = 0.005, 1e-6
@@ -92,7 +92,7 @@ class HolonomicRow(Row):
 
     def measure(self, p: Populations) -> float:
         """sigma itself."""
-        return float(evaluate(self._function, p, (), self.name))
+        return float(called(self.name, self._function, (), p.time, p.x))
 
     def value(self, p: Populations) -> float:
         if self.target is None:
@@ -104,13 +104,13 @@ class HolonomicRow(Row):
 
     def gradient(self, p: Populations) -> FloatArray:
         if self._gradient is not None:
-            return evaluate(self._gradient, p, p.x.shape, f"gradient of {self.name}")
+            return called(f"gradient of {self.name}", self._gradient, p.x.shape, p.time, p.x, scalar=True)
         return self._by_differences(p, STEP)
 
     def rate(self, p: Populations) -> float:
         if self._time_derivative is None:
             return 0.0
-        return -float(evaluate(self._time_derivative, p, (), f"time derivative of {self.name}"))
+        return -float(called(f"time derivative of {self.name}", self._time_derivative, (), p.time, p.x))
 
     def bind(self, p: Populations) -> Self:
         self.check_derivatives(p)
@@ -128,12 +128,7 @@ class HolonomicRow(Row):
         return by_logarithm / p.x
 
     def check_derivatives(self, p: Populations) -> None:
-        """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign.
-
-        Raises
-        ------
-        InputError
-        """
+        """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign."""
         coarse, fine = (self._by_differences(p, h) * p.x for h in (STEP, STEP / 2))
         given = None if self._gradient is None else self.gradient(p) * p.x
         rounding = 1e-12 * abs(self.measure(p))
@@ -151,18 +146,15 @@ class HolonomicRow(Row):
         with np.errstate(all="ignore"):
             coarse, fine = differences(1e-3), differences(5e-4)
             wrong = bool(contradicted(given, coarse, fine, np.asarray(1e-9 * self._magnitude(p))))
-            for h in (1e-6, 1e-9) if wrong else ():  # what changes faster is seen by these
-                near = differences(h)
-                wrong = wrong and not abs(near - given) <= WRONG * max(abs(near), abs(given))
-        if wrong:
-            said = (
-                "depends on time, but has no time_derivative: give it"
-                if self._time_derivative is None
-                else "changes with time at another rate than differences of it: correct it"
-            )
-            raise InputError(
-                f"{self.name} {said} ({given:.6g}; differences give {float(fine):.6g})", item="time_derivative"
-            )
+            near = [differences(h) for h in (1e-6, 1e-9)] if wrong else []  # these see what changes faster
+        if not wrong or any(abs(v - given) <= WRONG * max(abs(v), abs(given)) for v in near):
+            return
+        said = (
+            "depends on time, but has no time_derivative: give it"
+            if self._time_derivative is None
+            else "changes with time at another rate than differences of it: correct it"
+        )
+        raise InputError(f"{self.name} {said} ({given:.6g}; differences give {fine:.6g})", item="time_derivative")
 
     def _magnitude(self, p: Populations) -> float:
         return abs(self.measure(p))
@@ -176,11 +168,6 @@ class LinearRow(HolonomicRow):
     coefficients : array_like, shape (n,)
     target : float or callable t -> (value, rate), optional
         A moving target returns its value and its time derivative.
-
-    Raises
-    ------
-    InputError
-        Coefficients that are not finite, or all zero.
     """
 
     def __init__(
@@ -258,7 +245,7 @@ class VelocityRow(Row):
 
     def gradient(self, p: Populations) -> FloatArray:
         if callable(self._coefficients):
-            return evaluate(self._coefficients, p, p.x.shape, f"coefficients of {self.name}")
+            return called(f"coefficients of {self.name}", self._coefficients, p.x.shape, p.time, p.x, scalar=True)
         if self._coefficients.shape != p.x.shape:
             raise InputError(
                 f"{self.name}: {self._coefficients.shape} coefficients for {len(p.x)} species", item="coefficients"
@@ -266,4 +253,6 @@ class VelocityRow(Row):
         return self._coefficients
 
     def rate(self, p: Populations) -> float:
-        return float(evaluate(self._rate, p, (), f"rate of {self.name}")) if callable(self._rate) else self._rate
+        return (
+            float(called(f"rate of {self.name}", self._rate, (), p.time, p.x)) if callable(self._rate) else self._rate
+        )

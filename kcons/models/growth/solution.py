@@ -230,11 +230,6 @@ def entropy_balance(solution: GrowthSolution, nodes: int = 8) -> EntropyBalance:
         Of a system with an `EntropyRow`, with dense_output=True.
     nodes : int
         Gauss points between two times of the solution.
-
-    Raises
-    ------
-    InputError
-        If the solution has no interpolant, or its system no entropy row.
     """
     system = solution.system
     row = next((r for r in system.rows if isinstance(r, EntropyRow)), None)

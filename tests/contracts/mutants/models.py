@@ -100,9 +100,9 @@ MUTANTS = [
     ),
     (
         "models/flows/mechanics.py",
-        "t + GAUSS_C[k] * dt",
-        "t",
-        "tests/models/flows/test_mechanics.py::test_order_where_the_hamiltonian_depends_on_time",
+        "np.concatenate([slope[self.f :], -slope[: self.f]])",
+        "np.concatenate([slope[self.f :], slope[: self.f]])",
+        "tests/models/flows/test_mechanics.py::test_friction_by_a_hamiltonian_that_depends_on_time",
     ),
     (
         "constraints/projection.py",
@@ -137,7 +137,7 @@ MUTANTS = [
         "tests/models/test_multibody.py::test_a_start_off_the_constraints_is_refused_and_can_be_mended",
     ),
     (
-        "models/multibody_functions.py",
+        "models/multibody.py",
         "self._g(q + s * v, t + s), 0.0",
         "self._g(q + s * v, t), 0.0",
         "tests/models/test_multibody.py::test_constraints_that_move",

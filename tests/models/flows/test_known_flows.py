@@ -53,7 +53,7 @@ def test_three_regimes():
         assert flow.regime == regime
         assert flow.classification().kind is kind
         assert flow.classification().stability is stability
-    assert DampedOscillator(1.0, 2.0).jordan_blocks()[0].sizes == (2,)
+    assert DampedOscillator(1.0, 2.0).jordan_form().blocks[0].sizes == (2,)
 
 
 @pytest.mark.parametrize(
@@ -143,6 +143,16 @@ def test_pendulum_exact_from_any_start(X0):
     found = flow.solve((0.0, 6.0), X0, t_eval=[0.0, 2.0, 6.0], rtol=1e-12, atol=1e-13)
     assert flow.exact(found.t, X0) == pytest.approx(found.y.T, abs=1e-9)
     assert flow.exact(0.0, X0) == pytest.approx(X0, abs=1e-14)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_pendulum_on_its_separatrix(direction):
+    flow, times = Pendulum(1.3), np.array([-1.0, 0.0, 2.5])
+    theta = 2 * np.arctan(np.sinh(1.3 * times * direction))
+    expected = np.stack([theta, 2 * direction / np.cosh(1.3 * times)], axis=-1)
+    assert flow.exact(times, [0.0, 2.0 * direction]) == pytest.approx(expected, abs=1e-13)
+    assert flow.exact(times, [3 * np.pi, 0.0]) == pytest.approx(np.tile([3 * np.pi, 0.0], (3, 1)), abs=1e-13)
+    assert flow.exact(1.0, [direction * np.pi, 0.0]) == pytest.approx([direction * np.pi, 0.0], abs=1e-13)
 
 
 def test_small_swings_are_harmonic():

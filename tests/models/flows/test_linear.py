@@ -18,13 +18,17 @@ from kcons.models.flows import (
     equilibrium_at,
     jordan_block,
     jordan_block_propagator,
-    jordan_blocks,
     jordan_form,
 )
 from kcons.models.flows.linear import LARGEST, on_axis, spectrum
 
 R = np.array([[0.0, 1.0], [-1.0, 0.0]])
 RESONANT = np.block([[R, np.eye(2)], [np.zeros((2, 2)), R]])
+
+
+def blocks_of(matrix, error=0.0):
+    return jordan_form(matrix, error).blocks
+
 
 # -- exp(At) ------------------------------------------------------------------------------------------
 
@@ -40,7 +44,7 @@ def test_reference(name):
     assert flow.classification().kind is kinds[name]
     assert (flow.classification().stability is Stability.ASYMPTOTIC) == (kinds[name] is Kind.NODE)
     if name in ("jordan3", "nilpotent"):
-        assert [b.sizes for b in flow.jordan_blocks()] == [(3,)]
+        assert [b.sizes for b in flow.jordan_form().blocks] == [(3,)]
 
 
 def test_series_and_group_property():
@@ -205,38 +209,36 @@ def test_structures_that_rounding_allows():
     for coupling, sizes, certain in ((1e-6, (2, 1), True), (1e-14, None, False), (0.0, (1, 1, 1), True)):
         N = np.zeros((3, 3))
         N[0, 1] = coupling
-        (found,) = jordan_blocks(X @ (N - np.eye(3)) @ np.linalg.inv(X))
+        (found,) = blocks_of(X @ (N - np.eye(3)) @ np.linalg.inv(X))
         assert found.certain == certain
         assert sizes is None or found.sizes == sizes
     # In a triangular matrix nothing is rounded: the weakest coupling counts.
-    (found,) = jordan_blocks([[-1.0, 1e-30], [0.0, -1.0]])
+    (found,) = blocks_of([[-1.0, 1e-30], [0.0, -1.0]])
     assert (found.sizes, found.certain) == ((2,), True)
     for corner, distance in ((-1e-20, 0.0), (3e-16, 3e-16 / np.sqrt(3))):
         # The nearest defective matrix lacks the corner.
-        (found,) = jordan_blocks([[-1.0, 1.0], [corner, -1.0]])
+        (found,) = blocks_of([[-1.0, 1.0], [corner, -1.0]])
         assert found.sizes == (2,)
         assert found.distance == pytest.approx(distance, rel=0.5, abs=1e-18)
     A = np.array([[1.0, 1.0], [0.0, 1.001]])
-    assert [b.sizes for b in jordan_blocks(A)] == [(1,), (1,)]
-    assert [b.sizes for b in jordan_blocks(A, 1e-5)] == [(2,)]
+    assert [b.sizes for b in blocks_of(A)] == [(1,), (1,)]
+    assert [b.sizes for b in blocks_of(A, 1e-5)] == [(2,)]
 
 
 def test_neighbours_that_rounding_joins_are_told_as_uncertain():
     # A block of size 4 scatters by 1e-4: an eigenvalue 1e-3 away may belong to it, or not.
     A = in_skew_basis(np.random.default_rng(2), [jordan_block(1.0, 4), [[1.0 + 2**-10]]])
-    found = jordan_blocks(A)
+    found = blocks_of(A)
     assert not all(b.certain for b in found)
     assert sum(sum(b.sizes) for b in found) == 5
     # Two blocks so near that their errors overlap, though no matrix within rounding has all four equal.
     for apart in (2.0**-20, 2.0**-21):
-        found = jordan_blocks(
-            in_skew_basis(np.random.default_rng(1), [jordan_block(1.0, 2), jordan_block(1.0 + apart, 2)])
-        )
+        found = blocks_of(in_skew_basis(np.random.default_rng(1), [jordan_block(1.0, 2), jordan_block(1.0 + apart, 2)]))
         assert sum(sum(b.sizes) for b in found) == 4
         assert not any(b.certain for b in found)
     # Both are farther apart than they scatter: nothing is joined.
     near = in_skew_basis(np.random.default_rng(2), [[[1.0]], [[1.0 + 2**-20]]])
-    assert [(b.sizes, b.certain) for b in jordan_blocks(near)] == [((1,), True), ((1,), True)]
+    assert [(b.sizes, b.certain) for b in blocks_of(near)] == [((1,), True), ((1,), True)]
 
 
 # -- names and stability ------------------------------------------------------------------------------
