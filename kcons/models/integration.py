@@ -40,16 +40,10 @@ def projecting(
     project: Callable[[float, FloatArray], FloatArray],
     known: Callable[[float, FloatArray], Motion | None] = lambda t, y: None,
 ) -> type[OdeSolver]:
-    """SciPy's method, with a projection of the end of each step and of the values between.
+    """SciPy's method, with a projection of the end of each step, from which the next one starts, and of values between.
 
-    Parameters
-    ----------
-    method : type
-        One of `METHODS`.
-    project : callable (t, y) -> y
-        Puts a state where it belongs; the next step starts from there.
-    known : callable (t, y) -> callable or None, optional
-        A function of time, once nothing is left to integrate: it is the solution from there on.
+    `known` is asked before each step. Once nothing is left to integrate it gives a function of time, which is the
+    solution from there on.
     """
 
     class Projecting(method):  # type: ignore[misc, valid-type]
@@ -91,14 +85,8 @@ def check_run(
 ) -> tuple[type[OdeSolver], tuple[float, float], FloatArray | None]:
     """The method, the span and the times of a run of `n` variables.
 
-    Raises
-    ------
-    InputError
-        A method that is not known; a span that is no pair of finite numbers; times that are not sorted from the start
-        to the end, or outside; rtol below rounding, atol that is negative or not for `n` numbers, steps that are not
-        positive, NaN: SciPy goes on for ever with some of these, or otherwise than was asked for.
-    UnsupportedError
-        LSODA.
+    Refused is also what SciPy goes on with for ever, or otherwise than was asked for: rtol below rounding, a negative
+    atol, NaN.
     """
     if method == "LSODA":
         raise UnsupportedError(
@@ -181,18 +169,8 @@ def check_derivative(
 ) -> None:
     """Refuse a derivative that differences with a step and with half of it contradict.
 
-    Parameters
-    ----------
-    item, of : str
-        What it is called, and what it is a derivative of.
-    given : ndarray or None
-        None where there are differences alone: these are refused where half the step changes them by more than the
-        part `smooth`.
-    coarse, fine : ndarray
-    rounding : float
-        Of differences.
-    remedy : str
-        What to do beside correcting it.
+    Where none was given, differences alone are refused if half the step changes them by more than the part `smooth`, or
+    by more than their `rounding`.
     """
     size = float(np.max(np.abs(fine), initial=0.0))
     apart = np.abs(fine - coarse)

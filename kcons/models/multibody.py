@@ -50,23 +50,15 @@ _EPS = float(np.finfo(float).eps)
 
 
 class MultibodySolution(NamedTuple):
-    """A motion, on the constraints to rounding.
-
-    Attributes
-    ----------
-    t : ndarray, shape (k,)
-    q, v, accelerations : ndarray, shape (k, n)
-    multipliers : ndarray, shape (k, m)
-        lambda of M q'' = f + G^T lambda.
-    evaluations, steps : int
-        Evaluations of the accelerations, and steps, that were taken to integrate.
-    """
+    """A motion, on the constraints to rounding; q, v and accelerations at k times have shape (k, n)."""
 
     t: FloatArray
     q: FloatArray
     v: FloatArray
     accelerations: FloatArray
+    #: lambda of M q'' = f + G^T lambda, shape (k, m).
     multipliers: FloatArray
+    #: Evaluations of the accelerations, and steps, that were taken to integrate.
     evaluations: int
     steps: int
 
@@ -231,8 +223,6 @@ class Multibody:
 
         Raises
         ------
-        InputError
-            Wrong shapes, numbers that are not finite, a Jacobian that contradicts the constraints.
         ConstraintError
             The start is off the constraints, or its velocities are.
         ConvergenceError
@@ -271,36 +261,32 @@ class Multibody:
                 latest["error"] = error
                 return np.full(2 * n, np.nan)
 
-        def counted(t: float, y: FloatArray) -> FloatArray:
+        def count(t: float, y: FloatArray) -> None:
             latest["steps"] += 1
-            return project(t, y)
 
         start = project(t0, np.concatenate([q, v]))
         self._motion(latest["place"], lent(start[n:]))  # what is wrong at the start is told at once
         latest["steps"] = 0
-        stepper = projecting(solver, counted)
+        stepper = projecting(solver, project, count)
         ode = solve_ivp(slope, (t0, t1), start, stepper, wanted, rtol=rtol, atol=atol, **options)
         if ode.status < 0:
             raise latest["error"] or ConvergenceError(
                 f"the run ended at t = {latest['place'].t:.8g}: {ode.message} Stiff forces: method='Radau'; forces "
                 "that jump: end the run there; or a larger tolerance"
             )
-        states, motions = [], []
-        for t, y in zip(ode.t, np.transpose(ode.y), strict=True):
-            states.append(y)
-            q, v = np.split(lent(y), 2)
-            motions.append(self._motion(self._place(q, t, rank), v))
-        q, v = np.split(np.array(states).reshape(-1, 2 * n), 2, axis=1)
-        a, multipliers = (
-            (np.array(part) for part in zip(*motions, strict=True)) if motions else (q, np.zeros((0, self.m or 0)))
-        )
+        q, v = np.split(np.reshape(ode.y, (2 * n, -1)).T, 2, axis=1)
+        motions = [
+            self._motion(self._place(lent(x), t, rank), lent(w)) for t, x, w in zip(ode.t, q, v, strict=True)
+        ] or [(np.zeros(n), np.zeros(self.m or 0))]
+        a, multipliers = (np.array(part)[: len(q)] for part in zip(*motions, strict=True))
         return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev, latest["steps"])
 
     def _place(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """Factors at `q`, with so many independent rows, by default as many as there are."""
         n = len(q)
         M, G = self._M(q), self._G(q, t)
-        size = _row_lengths(G)
+        size = np.sqrt(np.einsum("ij,ij->i", G, G))
+        size[size == 0] = 1.0
         Q, R, rows = _factors(G / size[:, None])
         left = np.abs(R.diagonal())
         if rank is None or (rank and not left[rank - 1] > DEPENDENT * left[0]):
@@ -388,10 +374,7 @@ class Multibody:
     # -- what the user gave: called, differenced where derivatives are missing, and checked ----------------
 
     def _called(self, name: str, shape: tuple[int, ...] | None, *arguments: Any) -> FloatArray:
-        """What a function of the user returned, of that shape, by default (m,), and finite; a copy.
-
-        Arguments are lent, or nobody else's.
-        """
+        """What a function of the user returned, of that shape, by default (m,), and finite; a copy."""
         array = np.array(numbers(getattr(self, name)(*arguments), name))
         if shape is None:
             array = np.atleast_1d(array)
@@ -420,12 +403,10 @@ class Multibody:
     def _G(self, q: FloatArray, t: float) -> FloatArray:
         if self.m and self.jacobian is not None:
             return self._called("jacobian", (self.m, len(q)), *self._at(q, t))
-        step, axes = 1e-3 * self.length, np.eye(len(q))
-
-        def along(e: FloatArray) -> FloatArray:
-            return first_derivative_4(lambda s: self._g(q + s * e, t), 0.0, step)
-
-        return np.stack([along(e) for e in axes], axis=1)
+        columns = [
+            first_derivative_4(lambda s, e=e: self._g(q + s * e, t), 0.0, 1e-3 * self.length) for e in np.eye(len(q))
+        ]
+        return np.stack(columns, axis=1)
 
     def _c(self, q: FloatArray, t: float) -> FloatArray:
         """What G v must be, shape (m,) or ()."""
@@ -500,13 +481,6 @@ def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     Q = np.zeros((n, n), order="F")
     Q[:, :k] = R[:, :k]
     return lapack.dorgqr(Q, tau)[0], R[:k], order - 1
-
-
-def _row_lengths(G: FloatArray) -> FloatArray:
-    """1 for rows of zeros."""
-    size = np.sqrt(np.einsum("ij,ij->i", G, G))
-    size[size == 0] = 1.0
-    return np.asarray(size)
 
 
 def _check_symmetric(M: FloatArray) -> None:

@@ -18,21 +18,13 @@ SAME = 1e-6
 
 
 class Equilibrium(NamedTuple):
-    """A point where V vanishes.
-
-    Attributes
-    ----------
-    position : ndarray, shape (n,)
-    jacobian : ndarray, shape (n, n)
-    classification : Classification
-        Of the linear flow around it; it decides about stability only where it is `hyperbolic`.
-    residual : float
-        |V| there.
-    """
+    """A point where V vanishes."""
 
     position: FloatArray
     jacobian: FloatArray
+    #: Of the linear flow around it; it decides about stability only where it is `hyperbolic`.
     classification: Classification
+    #: |V| there.
     residual: float
 
 

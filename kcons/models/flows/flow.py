@@ -98,24 +98,16 @@ class Flow:
 
 
 class PhaseVolume(NamedTuple):
-    """How a small volume is carried along.
-
-    Attributes
-    ----------
-    t : ndarray, shape (k,)
-    states : ndarray, shape (k, n)
-    propagators : ndarray, shape (k, n, n)
-        dX_t/dX_0 (notes eq. 34).
-    log_volume : ndarray, shape (k,)
-        ln |det dX_t/dX_0|, from the propagators (notes eq. 33).
-    integrated_divergence : ndarray, shape (k,)
-        The integral of div V along the trajectory; the same number.
-    """
+    """How a small volume is carried along, at k times."""
 
     t: FloatArray
+    #: Shape (k, n).
     states: FloatArray
+    #: dX_t/dX_0, shape (k, n, n) (notes eq. 34).
     propagators: FloatArray
+    #: ln |det dX_t/dX_0|, from the propagators (notes eq. 33).
     log_volume: FloatArray
+    #: The integral of div V along the trajectory; the same number.
     integrated_divergence: FloatArray
 
 

@@ -78,19 +78,14 @@ class DampedOscillator(LinearFlow):
         smooth through a = 0.
         """
         square = 0.25 * (self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)
-        root = np.sqrt(abs(square))
+        root = np.sqrt(complex(square))
         shifted = self.matrix + 0.5 * self.eta * np.eye(2)
-        if square > 0 and root * t > 1.0:
+        if root.real * t > 1.0:
             # e^(-eta t/2) cosh overflows in its second factor: both exponentials together.
-            slow = np.exp(-(self.omega**2) / (0.5 * self.eta + root) * t)
-            fast = np.exp(-(root + 0.5 * self.eta) * t)
-            return np.asarray(0.5 * (slow + fast) * np.eye(2) + 0.5 * (slow - fast) / root * shifted)
-        C = np.cosh(root * t) if square > 0 else np.cos(root * t)
-        z = square * t * t
-        if abs(z) < 1e-4:
-            S = t * (1 + z / 6 * (1 + z / 20 * (1 + z / 42)))
-        else:
-            S = (np.sinh(root * t) if square > 0 else np.sin(root * t)) / root
+            slow = np.exp(-(self.omega**2) / (0.5 * self.eta + root.real) * t)
+            fast = np.exp(-(root.real + 0.5 * self.eta) * t)
+            return np.asarray(0.5 * (slow + fast) * np.eye(2) + 0.5 * (slow - fast) / root.real * shifted)
+        C, S = np.cosh(root * t).real, t * np.sinc(1j * root * t / np.pi).real
         return np.asarray(np.exp(-0.5 * self.eta * t) * (C * np.eye(2) + S * shifted))
 
 
@@ -207,20 +202,12 @@ class ParticleOnSphere(Flow):
 
 
 class Compression(NamedTuple):
-    """Phase volume on the surface of constant K, along a trajectory.
-
-    Attributes
-    ----------
-    t : ndarray, shape (k,)
-    log_volume : ndarray, shape (k,)
-        Measured: ln of the volume spanned by the tangent vectors, carried along by the variational equation.
-    predicted : ndarray, shape (k,)
-        -(g - 1) times the integral of alpha.
-    g : int
-    """
+    """Phase volume on the surface of constant K, along a trajectory, at k times."""
 
     t: FloatArray
+    #: Measured: ln of the volume spanned by the tangent vectors, carried along by the variational equation.
     log_volume: FloatArray
+    #: -(g - 1) times the integral of alpha.
     predicted: FloatArray
     g: int
 

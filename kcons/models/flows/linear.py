@@ -101,14 +101,7 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(matrix: ArrayLike, error: ArrayLike = 0.0) -> Spectrum:
-    """The eigenvalues of a real matrix and what is known about them.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (n, n)
-    error : array_like, shape (n, n) or a number
-        How far the entries may be off, beyond their rounding.
-    """
+    """The eigenvalues of a real matrix and what is known about them; arguments as of `classify`."""
     A, E = _square(matrix), numbers(error, "error")
     if E.ndim and E.shape != A.shape:
         raise InputError(f"errors are a number or of the shape of the matrix, {A.shape}, not {E.shape}", item="error")
@@ -216,41 +209,25 @@ def _clusters(values: ComplexArray, errors: FloatArray) -> list[NDArray[np.intp]
 
 
 class JordanBlocks(NamedTuple):
-    """One eigenvalue and the sizes of its blocks (notes eqs. 11, 12).
+    """One eigenvalue and the sizes of its blocks (notes eqs. 11, 12)."""
 
-    Attributes
-    ----------
-    eigenvalue : complex
-        The mean of those that were taken as one.
-    sizes : tuple of int
-        Largest first; (1, 1) is two blocks of size 1.
-    certain : bool
-        Whether the structure stands out from rounding: no other eigenvalue lies so near that it might belong to these,
-        and no coupling is so weak that it might be none. If not, it is one of several that the matrix may have.
-    distance : float
-        A matrix with this structure exactly lies so near, in parts of the norm of the (balanced) matrix.
-    """
-
+    #: The mean of those that were taken as one.
     eigenvalue: complex
+    #: Largest first; (1, 1) is two blocks of size 1.
     sizes: tuple[int, ...]
+    #: Whether the structure stands out from rounding: no other eigenvalue lies so near that it might belong to these,
+    #: and no coupling is so weak that it might be none. If not, it is one of several that the matrix may have.
     certain: bool = True
+    #: A matrix with this structure exactly lies so near, in parts of the norm of the (balanced) matrix.
     distance: float = 0.0
 
 
 class JordanForm(NamedTuple):
-    """A = T J T^-1 (notes eq. 10).
-
-    Attributes
-    ----------
-    T : ndarray of complex, shape (n, n)
-        Chains of generalized eigenvectors, those of a block side by side.
-    J : ndarray of complex, shape (n, n)
-    blocks : list of JordanBlocks
-        In the order of J.
-    """
+    """A = T J T^-1 (notes eq. 10); T has chains of generalized eigenvectors, those of a block side by side."""
 
     T: ComplexArray
     J: ComplexArray
+    #: In the order of J.
     blocks: list[JordanBlocks]
 
     def propagator(self, t: float) -> ComplexArray:
@@ -275,14 +252,7 @@ def jordan_block_propagator(eigenvalue: complex, size: int, t: float) -> NDArray
 
 
 def jordan_form(matrix: ArrayLike, error: ArrayLike = 0.0) -> JordanForm:
-    """T and J of a real matrix (notes eqs. 10-12).
-
-    Parameters
-    ----------
-    matrix : array_like, shape (n, n)
-    error : array_like, shape (n, n) or a number
-        How far the entries may be off, beyond their rounding.
-    """
+    """T and J of a real matrix (notes eqs. 10-12), largest real parts first; arguments as of `classify`."""
     found = spectrum(matrix, error)
     pieces: list[tuple[JordanBlocks, ComplexArray]] = []
     for members in _clusters(found.values, found.errors):
@@ -407,31 +377,20 @@ class Stability(Enum):
 
 
 class Classification(NamedTuple):
-    """Kind and stability of a linear flow.
-
-    Attributes
-    ----------
-    kind : Kind
-    stability : Stability
-    detail : str
-        'star' or 'improper' for nodes with one eigenvalue only; 'saddle-focus'; otherwise empty.
-    eigenvalues : ndarray of complex, shape (n,)
-        Sorted by real part, largest first.
-    hyperbolic : bool
-        Whether all real parts are known not to vanish. Only then does the linear flow decide about the stability of an
-        equilibrium of a flow that is not linear.
-    errors : ndarray, shape (n,)
-        How far each eigenvalue may be off.
-    conditions : ndarray, shape (n,)
-        The condition number of each eigenvalue, of the balanced matrix; infinite or nearly so for a defective one.
-    """
+    """Kind and stability of a linear flow."""
 
     kind: Kind
     stability: Stability
+    #: 'star' or 'improper' for nodes with one eigenvalue only; 'saddle-focus'; otherwise empty.
     detail: str
+    #: Sorted by real part, largest first.
     eigenvalues: ComplexArray
+    #: Whether all real parts are known not to vanish. Only then does the linear flow decide about the stability of an
+    #: equilibrium of a flow that is not linear.
     hyperbolic: bool
+    #: How far each eigenvalue may be off.
     errors: FloatArray
+    #: The condition number of each eigenvalue, of the balanced matrix; infinite or nearly so for a defective one.
     conditions: FloatArray
 
     def __str__(self) -> str:

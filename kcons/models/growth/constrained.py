@@ -55,35 +55,18 @@ LEAST_LOGARITHM = -1e300
 
 
 class Rates(NamedTuple):
-    """z and how it was found, for m rows and n species.
-
-    Attributes
-    ----------
-    z : ndarray, shape (n,)
-    multipliers : ndarray, shape (m,)
-        z = A^T multipliers; 0 for a dependent row.
-    dependent : ndarray of bool, shape (m,)
-    contradiction : ndarray, shape (m,)
-        For dependent rows what is missing in its right side, in parts of the terms that it is made of.
-    """
+    """z and how it was found, for m rows and n species."""
 
     z: FloatArray
+    #: z = A^T multipliers; 0 for a dependent row.
     multipliers: FloatArray
     dependent: NDArray[np.bool_]
+    #: For dependent rows what is missing in its right side, in parts of the terms that it is made of.
     contradiction: FloatArray
 
 
 def constraint_rates(x: FloatArray, rows: Sequence[FloatArray], right: Sequence[float], drift: FloatArray) -> Rates:
-    """z with A (drift + G z) = right; z lies in the space of the rows (notes eqs. 137, 138).
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-    rows : sequence of m ndarrays, shape (n,)
-    right : sequence of m numbers
-    drift : ndarray, shape (n,)
-        Psi + G phi.
-    """
+    """z with A (drift + G z) = right, drift = Psi + G phi; z lies in the space of the rows (notes eqs. 137, 138)."""
     m = len(rows)
     units, triangle = np.zeros((m, len(x))), np.eye(m)
     asked, along, contradiction = np.zeros(m), np.zeros(m), np.zeros(m)
@@ -149,15 +132,7 @@ class ConstrainedGrowth:
         return self.model.n
 
     def bind(self, p: Populations) -> Self:
-        """The same system with all targets set by the start `p`.
-
-        Raises
-        ------
-        ConstraintError
-            If the start is off a row whose target was given.
-        ContradictionError
-            If the rows contradict each other at the start.
-        """
+        """The same system with all targets set by the start `p`; refused if that is off a row, or rows contradict."""
         if p.x.shape != (self.n,):
             raise InputError(f"the start has populations of shape {p.x.shape}, the model {self.n}", item="x0")
         bound = copy.copy(self)
@@ -179,15 +154,7 @@ class ConstrainedGrowth:
     # -- the constrained equation of motion ----------------------------------------------------------
 
     def held(self, p: Populations, drift: FloatArray | None = None) -> Rates:
-        """z where the rows allow one.
-
-        Raises
-        ------
-        ContradictionError, SingularGeometryError
-            Where the rank is lost and the rows contradict each other, everywhere or at this state.
-        NonFiniteError
-            If a row is not finite.
-        """
+        """z; refused where the rank is lost and the rows contradict each other, or a row is not finite."""
         found = self._rates(p, self.model.drift(p) if drift is None else drift)
         if np.any(found.contradiction > SOLVABILITY_TOLERANCE):
             self._refuse(found, p)
@@ -291,11 +258,6 @@ class ConstrainedGrowth:
         """The state on the holonomic rows, ln x + A^T mu with the least mu; shape (n,).
 
         Newton's iteration in the metric of the theory: x changes by G A^T mu, hence stays positive.
-
-        Raises
-        ------
-        ConvergenceError
-            If the rows cannot be met to round-off from here.
         """
         rows = [row for row in self.rows if row.holonomic]
         best, least = log_x, np.inf

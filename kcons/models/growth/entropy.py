@@ -49,12 +49,7 @@ class EntropyLaw(ABC):
         """b = d(g - g_eq)/dt at a state whose excess is `excess`."""
 
     def check(self, excess0: float, most: float) -> None:
-        """Refuse a law that the start cannot follow; `most` is the largest excess there is.
-
-        Raises
-        ------
-        BudgetError
-        """
+        """Raise `BudgetError` for a law that the start cannot follow; `most` is the largest excess there is."""
 
 
 class Relaxation(EntropyLaw):

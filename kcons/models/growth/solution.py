@@ -41,22 +41,13 @@ class GrowthInterpolant:
 
 
 class GrowthSolution(OptimizeResult):
-    """What `solve` returns: the result of SciPy's ``solve_ivp``, with populations, and more.
+    """What `solve` returns: all that SciPy's ``solve_ivp`` returns, and more.
 
     Attributes
     ----------
-    t : ndarray, shape (k,)
-    y : ndarray, shape (n, k)
-        Populations x; 0 where they are below the smallest number of the machine.
-    log_y : ndarray, shape (n, k)
-        ln x, always finite.
+    y, log_y : ndarray, shape (n, k)
+        Populations x, 0 where they are below the smallest number of the machine, and ln x, always finite.
     sol : GrowthInterpolant or None
-    t_events, y_events : list of ndarray, or None
-    nfev, njev, nlu : int
-    status : int
-        -1 the integration failed, 0 it reached the end, 1 an event ended it.
-    message : str
-    success : bool
     settled_time : float or None
         When nothing but the rows was left to decide about the motion (equilibrium, for a hypercycle that produces
         entropy); from there on the solution comes from the rows alone.
@@ -105,8 +96,6 @@ def solve(
 
     Raises
     ------
-    InputError
-        Populations that are negative, zero or not finite; a method that is not known.
     ConstraintError, BudgetError
         A start off the constraints, or a prescription that cannot be met from it.
     ContradictionError, SingularGeometryError
@@ -198,24 +187,18 @@ def _of_logarithms(events: Event | Sequence[Event] | None) -> list[Event] | None
 
 
 class EntropyBalance(NamedTuple):
-    """Three ways to the entropy, times T, that a solution has produced, and where it went.
+    """Three ways to the entropy, times T, that a solution has produced, and where it went (notes eq. 145).
 
-    Attributes
-    ----------
-    lost : float
-        g(x_0) - g(x(t)), from the two ends alone.
-    integrated : float
-        The integral of -sum mu dx/dt along the solution.
-    prescribed : float
-        What the law says.
-    reactions, exchanged : float
-        The parts of `integrated` (notes eq. 145): of what the model does by itself, Psi + G phi, and of what the
-        constraints add to it, G z. In an open system (eq. 150) these are the entropy produced inside and the one
-        exchanged with the outside; in a closed one (eq. 149) nothing is exchanged, and their sum is produced inside.
+    `reactions` and `exchanged` are the parts of `integrated`: of what the model does by itself, Psi + G phi, and what
+    the constraints add to it, G z. In an open system (eq. 150) these are the entropy produced inside and the one
+    exchanged with the outside; in a closed one (eq. 149) nothing is exchanged, and their sum is produced inside.
     """
 
+    #: g(x_0) - g(x(t)), from the two ends alone.
     lost: float
+    #: The integral of -sum mu dx/dt along the solution.
     integrated: float
+    #: What the law says.
     prescribed: float
     reactions: float
     exchanged: float
