@@ -403,10 +403,12 @@ class Multibody:
     def _G(self, q: FloatArray, t: float) -> FloatArray:
         if self.m and self.jacobian is not None:
             return self._called("jacobian", (self.m, len(q)), *self._at(q, t))
-        columns = [
-            first_derivative_4(lambda s, e=e: self._g(q + s * e, t), 0.0, 1e-3 * self.length) for e in np.eye(len(q))
-        ]
-        return np.stack(columns, axis=1)
+        step = 1e-3 * self.length
+
+        def along(e: FloatArray) -> FloatArray:
+            return first_derivative_4(lambda s: self._g(q + s * e, t), 0.0, step)
+
+        return np.stack([along(e) for e in np.eye(len(q))], axis=1)
 
     def _c(self, q: FloatArray, t: float) -> FloatArray:
         """What G v must be, shape (m,) or ()."""

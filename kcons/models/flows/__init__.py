@@ -1,13 +1,11 @@
 """Dynamical systems as flows (notes sections 1 to 3).
 
 - `flow`: a flow and its phase-space volume
-- `linear`: linear flows: eigenvalues as far as they can be told, Jordan form, stability
-- `equilibria`: where a flow rests
+- `linear`: linear flows: eigenvalues as far as they can be told, Jordan form, stability; where a flow rests
 - `mechanics`: from a Lagrangian to Hamilton's equations
 - `known_flows`: flows with known solutions
 """
 
-from kcons.models.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria
 from kcons.models.flows.flow import Flow, PhaseVolume, phase_volume
 from kcons.models.flows.known_flows import (
     Compression,
@@ -19,12 +17,15 @@ from kcons.models.flows.known_flows import (
 )
 from kcons.models.flows.linear import (
     Classification,
+    Equilibrium,
     JordanBlocks,
     JordanForm,
     Kind,
     LinearFlow,
     Stability,
     classify,
+    equilibrium_at,
+    find_equilibria,
     jordan_block,
     jordan_block_propagator,
     jordan_form,

@@ -1,18 +1,25 @@
 """Populations that grow under constraints (notes sections 3 and 4.3).
 
-- `model`, `mixture`, `hypercycle`: models of growth, and the thermodynamics of their species
-- `rows`, `entropy`: what is held
-- `constrained`: a model with what is held
-- `solution`: trajectories
+- `model`: models of growth, and the thermodynamics of their species
+- `rows`: what is held, a production of entropy among it
+- `constrained`: a model with what is held, and its trajectories
+- `hypercycle`: the hypercycle of Eigen and Schuster
 """
 
-from kcons.models.growth.constrained import ConstrainedGrowth
-from kcons.models.growth.entropy import EntropyRow, NoProduction, PrescribedProduction, Relaxation
+from kcons.models.growth.constrained import ConstrainedGrowth, GrowthSolution, entropy_balance, solve
 from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
-from kcons.models.growth.mixture import Mixture
-from kcons.models.growth.model import GrowthModel, Logistic, LotkaVolterra, Populations
-from kcons.models.growth.rows import HolonomicRow, LinearRow, Row, TotalPopulation, VelocityRow
-from kcons.models.growth.solution import GrowthSolution, entropy_balance, solve
+from kcons.models.growth.model import GrowthModel, Logistic, LotkaVolterra, Mixture, Populations
+from kcons.models.growth.rows import (
+    EntropyRow,
+    HolonomicRow,
+    LinearRow,
+    NoProduction,
+    PrescribedProduction,
+    Relaxation,
+    Row,
+    TotalPopulation,
+    VelocityRow,
+)
 
 __all__ = [
     "ConstrainedGrowth",

@@ -25,10 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import FloatArray, positive, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.growth.constrained import ConstrainedGrowth
-from kcons.models.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation
-from kcons.models.growth.mixture import Mixture
-from kcons.models.growth.model import GrowthModel, Populations
-from kcons.models.growth.rows import TotalPopulation
+from kcons.models.growth.model import GrowthModel, Mixture, Populations
+from kcons.models.growth.rows import EntropyLaw, EntropyRow, NoProduction, Relaxation, TotalPopulation
 
 #: A motion may count as settled where ln(x/x_eq) is this small and the direction turns this slowly, in parts of the
 #: other times; it does within so many times the tolerance, since so far do integrators stray.

@@ -3,22 +3,38 @@
 A row asks  sum_j A_j(x, t) dx_j/dt = b(x, t)  (notes eqs. 127, 128). Holonomic rows come from a function of the
 state that keeps its value, sigma(x, t) = sigma0 (eq. 126), so that A = d sigma/dx and b = -d sigma/dt (eqs. 129, 130);
 because they have a value, the state can be projected back on them to round-off.
+
+Entropy production is a row as well (eqs. 145-150). Closed system: T ds/dt = -sum mu dx/dt >= 0 (corrected: the notes
+drop the sign in the middle of (149)). A law says what has been produced until t, T(s(t) - s_0); with a fixed sum of x
+it is the same as a law for the excess E(t) = g(x) - g_eq, which falls from E_0 = T(s_eq - s_0). The row is
+sum mu dx/dt = dE/dt.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.integrate import quad
 
-from kcons.constraints.arguments import FloatArray, check_call, finite_number, numbers, whole_number
+from kcons.constraints.arguments import (
+    FloatArray,
+    check_call,
+    finite_number,
+    numbers,
+    positive,
+    refuse_other,
+    whole_number,
+)
 from kcons.constraints.target import WRONG, contradicted, exact_step
-from kcons.errors import ConstraintError, InputError
-from kcons.models.growth.model import OfState, Populations
+from kcons.errors import BudgetError, ConstraintError, InputError
+from kcons.models.growth.model import Mixture, OfState, Populations
 from kcons.models.integration import called, check_derivative, jacobian_by_differences
 
 #: Step of differences, in ln x; they serve where half of it changes them by no more than this part.
@@ -147,7 +163,7 @@ class HolonomicRow(Row):
             coarse, fine = differences(1e-3), differences(5e-4)
             wrong = bool(contradicted(given, coarse, fine, np.asarray(1e-9 * self._magnitude(p))))
             near = [differences(h) for h in (1e-6, 1e-9)] if wrong else []  # these see what changes faster
-        if not wrong or any(abs(v - given) <= WRONG * max(abs(v), abs(given)) for v in near):
+        if not wrong or any(abs(v - given) <= WRONG * np.maximum(np.abs(v), abs(given)) for v in near):
             return
         said = (
             "depends on time, but has no time_derivative: give it"
@@ -256,3 +272,245 @@ class VelocityRow(Row):
         return (
             float(called(f"rate of {self.name}", self._rate, (), p.time, p.x)) if callable(self._rate) else self._rate
         )
+
+
+# -- entropy production --------------------------------------------------------------------------------
+
+#: A budget is consistent with the start where it differs by no more than this part.
+BUDGET_TOLERANCE = 1e-9
+#: Excess, as a part of the largest there is, that rounding leaves of none (it is quadratic in x - x_eq).
+AT_EQUILIBRIUM = 1e-29
+#: Slope of the excess, as a part of the excess, below which the populations cannot mend its round-off.
+FADED = 1e-2
+
+
+class EntropyLaw(ABC):
+    """What entropy, times T, has been produced since the start."""
+
+    #: Rate at which a deviation from equilibrium decays, 0 if it stays; None if there is no such rate.
+    relaxation_rate: float | None = None
+
+    @abstractmethod
+    def produced(self, elapsed: float, excess0: float) -> float:
+        """T(s(t) - s_0)."""
+
+    def excess(self, elapsed: float, excess0: float) -> float:
+        """E(t) = E_0 - T(s(t) - s_0); laws that end at E = 0 write it without the difference."""
+        return excess0 - self.produced(elapsed, excess0)
+
+    @abstractmethod
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        """b = d(g - g_eq)/dt at a state whose excess is `excess`."""
+
+    def check(self, excess0: float, most: float) -> None:
+        """Raise `BudgetError` for a law that the start cannot follow; `most` is the largest excess there is."""
+
+
+class Relaxation(EntropyLaw):
+    """s(t) = s_0 + (s_eq - s_0)(1 - exp(-t/tau)) (notes eqs. 148, 149).
+
+    Parameters
+    ----------
+    tau : float
+    budget : float, optional
+        T(s_eq - s_0); left out, it is computed from the start, g(x_0) - g_eq.
+    partial : bool
+        Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
+    """
+
+    def __init__(self, tau: float, budget: float | None = None, *, partial: bool = False) -> None:
+        self.tau = positive(tau, "tau")
+        self.budget = None if budget is None else finite_number(budget, "budget")
+        if self.budget is not None and self.budget < 0:
+            raise InputError(f"the budget T(s_eq - s_0) is not negative, so it cannot be {budget}", item="budget")
+        self.partial = partial
+        self.relaxation_rate = None if partial else 1.0 / (2.0 * self.tau)
+
+    def _budget(self, excess0: float) -> float:
+        # A budget that agrees with the start is the start's.
+        return self.budget if self.partial and self.budget is not None else excess0
+
+    def produced(self, elapsed: float, excess0: float) -> float:
+        return -self._budget(excess0) * math.expm1(-elapsed / self.tau)
+
+    def excess(self, elapsed: float, excess0: float) -> float:
+        budget = self._budget(excess0)
+        return budget * math.exp(-elapsed / self.tau) + (excess0 - budget)
+
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        # Told by the state instead of the time: the same on the constraint, but errors fade instead of piling up.
+        return -(excess - (excess0 - self._budget(excess0))) / self.tau
+
+    def check(self, excess0: float, most: float) -> None:
+        budget = self.budget
+        if excess0 <= AT_EQUILIBRIUM * abs(most):
+            raise BudgetError(
+                "the start is already at equilibrium, where no entropy is left to be produced and the row has no "
+                "direction; start elsewhere, or hold the total population alone (with_fixed_total)",
+                budget=0.0 if budget is None else budget,
+                consistent=0.0,
+                time=0.0,
+            )
+        if budget is None:
+            return
+        share = budget / excess0
+        if share > 1.0 + BUDGET_TOLERANCE:
+            time = -self.tau * math.log1p(-1.0 / share)
+            raise BudgetError(
+                f"T(s_eq - s_0) = {budget:.10g} is more than the start can produce, g(x_0) - g_eq = {excess0:.10g}"
+                f": equilibrium would be reached at t = {time:.6g} with entropy still to be produced. "
+                "Leave the budget out, it is then computed",
+                budget=budget,
+                consistent=excess0,
+                time=time,
+            )
+        if share < 1.0 - BUDGET_TOLERANCE and not self.partial:
+            raise BudgetError(
+                f"T(s_eq - s_0) = {budget:.10g} is less than what lies between the start and equilibrium, "
+                f"g(x_0) - g_eq = {excess0:.10g}: the system would stop producing at an excess of "
+                f"{excess0 - budget:.6g}, and s_eq would not be the entropy at equilibrium. Leave the budget out, "
+                "it is then computed, or say partial=True if this is meant",
+                budget=budget,
+                consistent=excess0,
+                time=np.inf,
+            )
+
+
+class NoProduction(EntropyLaw):
+    """ds = 0 (notes eq. 150)."""
+
+    relaxation_rate = 0.0
+
+    def produced(self, elapsed: float, excess0: float) -> float:
+        return 0.0
+
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        return 0.0
+
+
+class PrescribedProduction(EntropyLaw):
+    """A production of your own.
+
+    Parameters
+    ----------
+    produced : callable, t -> float
+        T(s(t) - s_0), t counted from the start; 0 at t = 0. May fall (entropy taken from outside).
+    rate : callable, t -> float
+        Its time derivative.
+    until : float
+        The time up to which it will be asked for: so far it is checked.
+    """
+
+    #: Times at which a prescription is looked at before a run.
+    LOOKS = 2001
+
+    def __init__(self, produced: Callable[[float], float], rate: Callable[[float], float], *, until: float) -> None:
+        check_call("produced", produced, ("t",))
+        check_call("rate", rate, ("t",))
+        self._produced, self._rate, self.until = produced, rate, positive(until, "until")
+        if abs(produced(0.0)) > 1e-12:
+            raise InputError(f"nothing has been produced at t = 0, not {produced(0.0):.6g}", item="produced")
+        times = np.linspace(0.0, until, 101)
+        integral = np.cumsum([quad(rate, a, b, epsabs=1e-12, epsrel=1e-11)[0] for a, b in pairwise(times)])
+        off = np.abs(integral - [produced(t) for t in times[1:]])
+        if not np.max(off) <= 1e-8 * max(1.0, float(np.max(np.abs(integral)))):
+            k = int(np.argmax(~(off <= 1e-8)))
+            raise InputError(
+                f"the integral of the rate is not what is produced: at t = {times[k + 1]:.6g} they differ by "
+                f"{off[k]:.3g}",
+                item="rate",
+            )
+
+    def _looked_at(self, elapsed: float) -> float:
+        """A time from the start that lies in what was checked."""
+        if max(elapsed - self.until, -elapsed) > 1e-9 * self.until:
+            raise InputError(
+                f"the prescribed production is known from the start until {self.until:g} after it: end the run there, "
+                "or raise `until`",
+                item="until",
+            )
+        return elapsed
+
+    def produced(self, elapsed: float, excess0: float) -> float:
+        return float(self._produced(self._looked_at(elapsed)))
+
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        return -float(self._rate(self._looked_at(elapsed)))
+
+    def check(self, excess0: float, most: float) -> None:
+        times = np.linspace(0.0, self.until, self.LOOKS)
+        left = excess0 - np.array([self.produced(t, excess0) for t in times])
+        for bad, reason in (
+            (left < -1e-12 * excess0, "more than lies between the start and equilibrium"),
+            (left > most, "more entropy taken away than the populations can give up"),
+        ):
+            if np.any(bad):
+                time = float(times[np.argmax(bad)])
+                raise BudgetError(
+                    f"the prescribed production asks for {reason} from t = {time:.6g} on; the start allows "
+                    f"T(s - s_0) between {excess0 - most:.6g} and {excess0:.6g}",
+                    budget=self.produced(time, excess0),
+                    consistent=excess0,
+                    time=time,
+                )
+
+
+class EntropyRow(Row):
+    """The Gibbs energy of a mixture follows an entropy law; to be used together with `TotalPopulation`.
+
+    Its row of A is mu less the mu of the largest population: a constant common to all species drops out where sum x is
+    kept. So the row fades cleanly where the rank is lost: at equilibrium, and where one species is nearly alone.
+    """
+
+    holonomic = True
+    name = "entropy production"
+    #: Of the start.
+    start, total, excess0 = 0.0, math.nan, math.nan
+
+    def __init__(self, mixture: Mixture, law: EntropyLaw) -> None:
+        refuse_other(mixture, Mixture, "mixture", "a kcons.models.growth.Mixture")
+        refuse_other(law, EntropyLaw, "law", "a law such as kcons.models.growth.Relaxation(tau)")
+        self.mixture = mixture
+        self.law = law
+
+    @property
+    def bound(self) -> bool:
+        """Whether there is a start."""
+        return not math.isnan(self.total)
+
+    def law_excess(self, time: float) -> float:
+        """E(t) = g - g_eq as the law has it, for a row that is bound to a start."""
+        return self.law.excess(time - self.start, self.excess0)
+
+    def gradient(self, p: Populations) -> FloatArray:
+        return self.mixture.relative_potentials(p)
+
+    def rate(self, p: Populations) -> float:
+        excess = float(self.mixture.excess(p, self.total if self.bound else float(np.sum(p.x))))
+        return self.law.excess_rate(p.time - self.start, excess, self.excess0 if self.bound else excess)
+
+    def value(self, p: Populations) -> float:
+        return self.mixture.excess_over(p, self.total, self.law_excess(p.time))
+
+    def size(self, p: Populations) -> float:
+        # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
+        error = np.maximum(1.0, np.abs(p.log_x))
+        epsilon = float(np.finfo(np.float64).eps)
+        slope = float(np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * epsilon * error) * error))
+        excess = abs(self.law_excess(p.time))
+        # Where one species is nearly alone, no ln x must be moved to mend what the rounding of sum x does here.
+        slope = excess if slope < FADED * excess else slope
+        # Elsewhere the excess cancels, see Mixture.excess_over; terms of some kT sum x are left.
+        return max(4.0 * min(excess, self.mixture.kT * self.total), slope)
+
+    def bind(self, p: Populations) -> EntropyRow:
+        if self.mixture.n != len(p.x):
+            raise InputError(f"the mixture has {self.mixture.n} species, the start {len(p.x)}", item="mixture")
+        bound = copy.copy(self)
+        bound.start, bound.total = p.time, math.fsum(p.x)
+        # In two steps, the second of which sees what the first rounded off.
+        about = float(self.mixture.excess(p, bound.total))
+        bound.excess0 = about + self.mixture.excess_over(p, bound.total, about)
+        most = self.mixture.largest_gibbs_energy(bound.total) - self.mixture.least_gibbs_energy(bound.total)
+        self.law.check(bound.excess0, most)
+        return bound

@@ -21,7 +21,7 @@ from kcons.models.growth import (
     Populations,
     solve,
 )
-from kcons.models.growth.mixture import entropy_function
+from kcons.models.growth.model import entropy_function
 
 MU0 = np.array([0.15, 0.2, 0.25, 0.3, 0.35])
 
