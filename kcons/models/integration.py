@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Radau
+from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Radau, solve_ivp
 
 from kcons.constraints.arguments import FloatArray, lent, numbers
 from kcons.constraints.target import WRONG
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
 #: What SciPy takes where less is asked for.
@@ -78,6 +78,48 @@ def projecting(
 
     Projecting.__name__ = method.__name__
     return Projecting
+
+
+def integrate(
+    slope: Callable[[float, FloatArray], FloatArray],
+    span: tuple[float, float],
+    start: FloatArray,
+    method: type[OdeSolver],
+    project: Callable[[float, FloatArray], FloatArray] | None,
+    known: Callable[[float, FloatArray], Motion | None] = lambda t, y: None,
+    **options: Any,
+) -> Any:
+    """What SciPy's ``solve_ivp`` gives, with projections as of `projecting`, or without for None.
+
+    A trial step may go too far, to a singular place or to numbers that are not finite, and is then made shorter. What
+    was wrong there is raised if the run ends there.
+    """
+    told: list[Exception] = []
+
+    def tried(t: float, y: FloatArray) -> FloatArray:
+        if np.isfinite(y).all():
+            try:
+                return slope(t, y)
+            except (ContradictionError, NonFiniteError, SingularGeometryError) as error:
+                told[:] = [error]
+        return np.full(len(y), np.nan)
+
+    def placed(t: float, y: FloatArray) -> FloatArray:
+        assert project is not None
+        there = project(t, y)
+        told.clear()
+        return there
+
+    stepper = method if project is None else projecting(method, placed, known)
+    try:
+        found = solve_ivp(tried, span, start, stepper, **options)
+    except ValueError:  # implicit methods: no numbers in their matrix
+        if not told:
+            raise
+    else:
+        if found.status >= 0 or not told:
+            return found
+    raise told[0]
 
 
 def check_run(

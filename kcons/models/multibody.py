@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import solve_ivp
 from scipy.linalg import lapack
 
 from kcons.constraints.arguments import TAKES_TIME, FloatArray, IntArray, check_call, lent, numbers, positive
@@ -35,7 +34,7 @@ from kcons.errors import (
     NonFiniteError,
     SingularGeometryError,
 )
-from kcons.models.integration import check_derivative, check_run, projecting
+from kcons.models.integration import check_derivative, check_run, integrate
 
 #: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
 DEPENDENT = 1e-10
@@ -243,23 +242,14 @@ class Multibody:
 
         def project(t: float, y: FloatArray) -> FloatArray:
             latest["place"] = place = self._placed(lent(y[:n]), t, rank)
-            latest["error"] = None
             return np.concatenate([place.q, self._tangent(place, y[n:])])
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            place = latest["place"]
-            q, v = lent(y[:n]), lent(y[n:])
-            if not np.isfinite(y).all():
-                return np.full(2 * n, np.nan)
-            try:
-                if place.t != t or not np.array_equal(place.q, q):
-                    place = self._place(q, t, rank)
-                f = self._called("force", (n,), q, v, t)
-                return np.concatenate([v, place.solve(f, self._b(q, v, t))])
-            except (NonFiniteError, SingularGeometryError) as error:
-                # A trial step may go too far, and is then made shorter; what is left is told if the run ends here.
-                latest["error"] = error
-                return np.full(2 * n, np.nan)
+            place, q, v = latest["place"], lent(y[:n]), lent(y[n:])
+            if place.t != t or not np.array_equal(place.q, q):
+                place = self._place(q, t, rank)
+            f = self._called("force", (n,), q, v, t)
+            return np.concatenate([v, place.solve(f, self._b(q, v, t))])
 
         def count(t: float, y: FloatArray) -> None:
             latest["steps"] += 1
@@ -267,10 +257,10 @@ class Multibody:
         start = project(t0, np.concatenate([q, v]))
         self._motion(latest["place"], lent(start[n:]))  # what is wrong at the start is told at once
         latest["steps"] = 0
-        stepper = projecting(solver, project, count)
-        ode = solve_ivp(slope, (t0, t1), start, stepper, wanted, rtol=rtol, atol=atol, **options)
+        options |= {"t_eval": wanted, "rtol": rtol, "atol": atol}
+        ode = integrate(slope, (t0, t1), start, solver, project, count, **options)
         if ode.status < 0:
-            raise latest["error"] or ConvergenceError(
+            raise ConvergenceError(
                 f"the run ended at t = {latest['place'].t:.8g}: {ode.message} Stiff forces: method='Radau'; forces "
                 "that jump: end the run there; or a larger tolerance"
             )

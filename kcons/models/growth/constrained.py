@@ -28,7 +28,6 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import solve_ivp
 from scipy.optimize import OptimizeResult
 
 from kcons.constraints import projection
@@ -43,7 +42,7 @@ from kcons.errors import (
 )
 from kcons.models.growth.model import GrowthModel, Populations
 from kcons.models.growth.rows import EntropyRow, Row
-from kcons.models.integration import check_run, projecting
+from kcons.models.integration import check_run, integrate
 
 Event = Callable[[float, FloatArray], float]
 EPSILON = float(np.finfo(np.float64).eps)
@@ -163,23 +162,30 @@ class ConstrainedGrowth:
     # -- the constrained equation of motion ----------------------------------------------------------
 
     def held(self, p: Populations, drift: FloatArray | None = None) -> Rates:
-        """z; refused where the rank is lost and the rows contradict each other, or a row is not finite."""
-        found = self._rates(p, self.model.drift(p) if drift is None else drift)
+        """z; refused where the rank is lost and the rows contradict each other, or a number is not finite."""
+        drift = self.model.drift(p) if drift is None else drift
+        with np.errstate(all="ignore"):
+            rows, right = [row.gradient(p) for row in self.rows], [row.rate(p) for row in self.rows]
+            found = constraint_rates(p.x, rows, right, drift)
         if np.any(found.contradiction > SOLVABILITY_TOLERANCE):
             self._refuse(found, p)
-        for number, row in enumerate(() if np.all(np.isfinite(found.z)) else self.rows):
-            if not (np.all(np.isfinite(row.gradient(p))) and np.isfinite(row.rate(p))):
+        if np.all(np.isfinite(found.z)) and np.all(np.isfinite(drift)):
+            return found
+        bad = self.model.not_finite(p)
+        if bad is not None:
+            raise NonFiniteError(
+                f"the {bad[0]} of species {bad[1]} is not finite at t = {p.time:.8g}, "
+                f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
+                item=f"{bad[0]}s",
+            )
+        for number, (row, b) in enumerate(zip(rows, right, strict=True)):
+            if not (np.all(np.isfinite(row)) and np.isfinite(b)):
                 raise NonFiniteError(
-                    f"row {number} ({row.name}) has a coefficient or a rate that is not finite at t = {p.time:.8g}; "
-                    "mend its functions, or end the run before (an event)",
+                    f"row {number} ({self.rows[number].name}) has a coefficient or a rate that is not finite at "
+                    f"t = {p.time:.8g}; mend its functions, or end the run before (an event)",
                     item="rows",
                 )
         return found
-
-    def _rates(self, p: Populations, drift: FloatArray) -> Rates:
-        """z, which may not be finite, of rows that may contradict each other."""
-        with np.errstate(all="ignore"):
-            return constraint_rates(p.x, [r.gradient(p) for r in self.rows], [r.rate(p) for r in self.rows], drift)
 
     def _refuse(self, found: Rates, p: Populations) -> None:
         """Raise where the rank is lost and the rows ask for the impossible."""
@@ -200,12 +206,13 @@ class ConstrainedGrowth:
         )
 
     def logarithmic_velocity(self, p: Populations) -> FloatArray:
-        """d ln x/dt = phi + z + Psi/x, shape (n,); what `solve` integrates. NaN where rows contradict each other."""
+        """d ln x/dt = phi + z + Psi/x, shape (n,); what `solve` integrates. NaN where x is beyond all numbers."""
+        if not np.all(np.isfinite(p.x)):
+            return np.full(self.n, np.nan)
         phi, psi = self.model.rates(p), self.model.sources(p)
         with np.errstate(all="ignore"):
             drift = p.x * phi if psi is None else p.x * phi + psi
-            found = self._rates(p, drift)
-            slope = phi + np.where(np.any(found.contradiction > SOLVABILITY_TOLERANCE), np.nan, found.z)
+            slope = phi + self.held(p, drift).z
             if psi is not None:
                 slope = slope + psi * np.exp(-p.log_x)
             return np.where(slope < 0, slope * np.maximum(1.0 - p.log_x / LEAST_LOGARITHM, 0.0), slope)
@@ -396,11 +403,7 @@ def solve(
     start, seen = p0.log_x, {"end": p0}
 
     def slope(t: float, y: FloatArray) -> FloatArray:
-        p = Populations.from_logarithms(t, y)
-        found = bound.logarithmic_velocity(p)
-        if not np.all(np.isfinite(found)) and np.all(np.isfinite(y)):
-            seen["not finite"] = p  # a trial step may go too far, and is then rejected; told if the run ends here
-        return found
+        return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
 
     def placed(t: float, y: FloatArray) -> FloatArray:
         p = Populations.from_logarithms(t, bound.past_instant(t, bound.project(t, y)))
@@ -414,12 +417,11 @@ def solve(
             seen["settled"] = Populations.from_logarithms(t, y)
         return motion
 
-    if project:
-        start, solver = placed(span[0], start), projecting(solver, placed, settled)
+    options |= {"t_eval": times, "dense_output": dense_output, "events": _of_logarithms(events)}
     with np.errstate(all="ignore"):  # ln x may be -1e300, and trial steps go too far
-        found = solve_ivp(slope, span, start, solver, times, dense_output, _of_logarithms(events), **options)
-        if found.status < 0 and "not finite" in seen:
-            _refuse_rates(bound, seen["not finite"])
+        if project:
+            start = placed(span[0], start)
+        found = integrate(slope, span, start, solver, placed if project else None, settled, **options)
         for row in bound.rows:  # derivatives of what depends on time may be wrong later only
             row.check_derivatives(seen["end"])
         log_y = np.reshape(found.y, (system.n, -1))  # a list where the run ended before the first time wanted
@@ -433,20 +435,6 @@ def solve(
             "system": bound,
         }
     return GrowthSolution(dict(found) | more)
-
-
-def _refuse_rates(system: ConstrainedGrowth, p: Populations) -> None:
-    """Raise if it is the model, or a row, that is not finite at a finite state."""
-    if not np.all(np.isfinite(p.x)):
-        return
-    bad = system.model.not_finite(p)
-    if bad is not None:
-        raise NonFiniteError(
-            f"the {bad[0]} of species {bad[1]} is not finite at t = {p.time:.8g}, "
-            f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
-            item=f"{bad[0]}s",
-        )
-    system.held(p)
 
 
 def _of_logarithms(events: Event | Sequence[Event] | None) -> list[Event] | None:
