@@ -85,11 +85,11 @@ def integrate(
     span: tuple[float, float],
     start: FloatArray,
     method: type[OdeSolver],
-    project: Callable[[float, FloatArray], FloatArray] | None,
-    known: Callable[[float, FloatArray], Motion | None] = lambda t, y: None,
+    project: Callable[[float, FloatArray], FloatArray],
+    known: Callable[[float, FloatArray], Motion | None],
     **options: Any,
 ) -> Any:
-    """What SciPy's ``solve_ivp`` gives, with projections as of `projecting`, or without for None.
+    """What SciPy's ``solve_ivp`` gives with projections, as of `projecting`.
 
     A trial step may go too far, to a singular place or to numbers that are not finite, and is then made shorter. What
     was wrong there is raised if the run ends there.
@@ -105,14 +105,12 @@ def integrate(
         return np.full(len(y), np.nan)
 
     def placed(t: float, y: FloatArray) -> FloatArray:
-        assert project is not None
         there = project(t, y)
         told.clear()
         return there
 
-    stepper = method if project is None else projecting(method, placed, known)
     try:
-        found = solve_ivp(tried, span, start, stepper, **options)
+        found = solve_ivp(tried, span, start, projecting(method, placed, known), **options)
     except ValueError:  # implicit methods: no numbers in their matrix
         if not told:
             raise

@@ -544,6 +544,8 @@ def find_equilibria(
 ) -> list[Equilibrium]:
     """Search for equilibria within a box, by Powell's method from many starts.
 
+    They come sorted by position. A search can miss one; more starts make that less likely.
+
     Parameters
     ----------
     flow : Flow
@@ -556,11 +558,6 @@ def find_equilibria(
     seed : int
     tolerance : float
         |V| counts as zero below this part of its size in the box.
-
-    Returns
-    -------
-    list of Equilibrium
-        Sorted by position. A search can miss one; more starts make that less likely.
     """
     edges, starts, n = numbers(box, "box"), whole_number(starts, "starts"), flow.n
     if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):

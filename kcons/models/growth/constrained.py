@@ -362,7 +362,6 @@ def solve(
     events: Event | Sequence[Event] | None = None,
     *,
     log_x0: ArrayLike | None = None,
-    project: bool = True,
     **options: Any,
 ) -> GrowthSolution:
     """Integrate a constrained growth model; arguments as in SciPy's ``solve_ivp``.
@@ -379,8 +378,6 @@ def solve(
         As in ``solve_ivp``; events are functions (t, x), with attributes `terminal` and `direction`.
     log_x0 : array_like, shape (n,), optional
         Start as logarithms, in place of x0.
-    project : bool
-        Whether the state is put back on the rows; False shows what that is good for.
     options
         rtol (by default 1e-9) and atol (1e-11) of ln x, so that atol is a relative error of x; max_step, first_step,
         jac and what else the method takes.
@@ -400,7 +397,7 @@ def solve(
     tolerance = max(float(np.min(options["rtol"] + options["atol"])), 1e-13)
     p0 = Populations.start(span[0], system.n, x0, log_x0)
     bound = system.bind(p0)
-    start, seen = p0.log_x, {"end": p0}
+    seen = {"end": p0}
 
     def slope(t: float, y: FloatArray) -> FloatArray:
         return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
@@ -419,9 +416,7 @@ def solve(
 
     options |= {"t_eval": times, "dense_output": dense_output, "events": _of_logarithms(events)}
     with np.errstate(all="ignore"):  # ln x may be -1e300, and trial steps go too far
-        if project:
-            start = placed(span[0], start)
-        found = integrate(slope, span, start, solver, placed if project else None, settled, **options)
+        found = integrate(slope, span, placed(span[0], p0.log_x), solver, placed, settled, **options)
         for row in bound.rows:  # derivatives of what depends on time may be wrong later only
             row.check_derivatives(seen["end"])
         log_y = np.reshape(found.y, (system.n, -1))  # a list where the run ended before the first time wanted

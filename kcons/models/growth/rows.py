@@ -351,29 +351,22 @@ class Relaxation(EntropyLaw):
                 consistent=0.0,
                 time=0.0,
             )
-        if budget is None:
-            return
-        share = budget / excess0
+        share = 1.0 if budget is None else budget / excess0
+        said, time = "", math.inf
         if share > 1.0 + BUDGET_TOLERANCE:
             time = -self.tau * math.log1p(-1.0 / share)
-            raise BudgetError(
-                f"T(s_eq - s_0) = {budget:.10g} is more than the start can produce, g(x_0) - g_eq = {excess0:.10g}"
-                f": equilibrium would be reached at t = {time:.6g} with entropy still to be produced. "
-                "Leave the budget out, it is then computed",
-                budget=budget,
-                consistent=excess0,
-                time=time,
+            said = (
+                f"more than the start can produce, g(x_0) - g_eq = {excess0:.10g}: equilibrium would be reached at "
+                f"t = {time:.6g} with entropy still to be produced. Leave the budget out, it is then computed"
             )
-        if share < 1.0 - BUDGET_TOLERANCE and not self.partial:
-            raise BudgetError(
-                f"T(s_eq - s_0) = {budget:.10g} is less than what lies between the start and equilibrium, "
-                f"g(x_0) - g_eq = {excess0:.10g}: the system would stop producing at an excess of "
-                f"{excess0 - budget:.6g}, and s_eq would not be the entropy at equilibrium. Leave the budget out, "
-                "it is then computed, or say partial=True if this is meant",
-                budget=budget,
-                consistent=excess0,
-                time=np.inf,
+        elif share < 1.0 - BUDGET_TOLERANCE and not self.partial:
+            said = (
+                f"less than what lies between the start and equilibrium, g(x_0) - g_eq = {excess0:.10g}: the system "
+                f"would stop producing at an excess of {excess0 * (1.0 - share):.6g}; s_eq would not be the entropy "
+                "at equilibrium. Leave the budget out, it is then computed, or say partial=True if this is meant"
             )
+        if said and budget is not None:
+            raise BudgetError(f"T(s_eq - s_0) = {budget:.10g} is {said}", budget=budget, consistent=excess0, time=time)
 
 
 class NoProduction(EntropyLaw):

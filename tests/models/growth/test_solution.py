@@ -48,12 +48,6 @@ def test_rows_hold_to_round_off_with_every_method(method):
     assert np.exp(between) == pytest.approx(fine.y, abs=2e-4)
 
 
-def test_without_projection_the_rows_drift():
-    system = Hypercycle().with_entropy_production(5.0)
-    free = solve(system, (0.0, 10.0), X0, "RK45", rtol=1e-4, atol=1e-5, project=False)
-    assert abs(free.residuals()).max() > 1e-7
-
-
 def test_dense_output_at_one_time_and_at_many():
     found = solve(Hypercycle().with_fixed_total(), (0.0, 3.0), X0, dense_output=True)
     assert found.sol(1.5).shape == (5,)
