@@ -18,7 +18,7 @@ for eta in (0.2, 1.0, 2.0, 5.0):
     X = np.array([flow.closed_form(s) @ [1.0, 0.0] for s in t])
     left.plot(t, X[:, 0], label=rf"$\eta = {eta}\,\Omega$, {flow.regime}")
     right.plot(*X.T)
-    blocks = [b.sizes for b in flow.jordan_blocks()]
+    blocks = [b.sizes for b in flow.jordan_form().blocks]
     volume = phase_volume(flow, [1.0, 0.0], [0.0, 3.0]).log_volume[-1]
     print(
         f"eta = {eta}: {flow.regime}, {flow.classification()}, Jordan blocks {blocks}, "

@@ -33,7 +33,7 @@ right.set_xticks(np.pi * np.arange(3, 6), [r"$3\pi$", r"$4\pi$", r"$5\pi$"])
 marks = [
     plt.Line2D([], [], marker=m, color=c, linestyle="", label=name)
     for m, c, name in (
-        ("o", "royalblue", "stable: a centre"),
+        ("o", "royalblue", "stable: a center"),
         ("s", "crimson", "unstable: a saddle"),
         (">", "k", "start (10, 0) of the trajectory"),
     )

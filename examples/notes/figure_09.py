@@ -36,7 +36,7 @@ for point in find_equilibria(flow, [[-1, 5], [-1, 5]]):
     print(f"X_s = {np.round(point.position, 6) + 0.0}: {point.classification}")
 marks = [
     plt.Line2D([], [], marker=m, color=c, linestyle="", label=name)
-    for m, c, name in (("o", "royalblue", "stable: a centre"), ("s", "crimson", "unstable: a saddle"))
+    for m, c, name in (("o", "royalblue", "stable: a center"), ("s", "crimson", "unstable: a saddle"))
 ]
 fig.legend(handles=marks, loc="outside upper center", ncols=2)
 fig.colorbar(arrows, ax=panels, extend="max", label="speed $|V|$ (arbitrary units per a.t.u.)")

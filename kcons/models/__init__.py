@@ -1,7 +1,7 @@
 """The same theory in other fields: multibody systems, flows of dynamical systems, and constrained growth.
 
-- `projected_steps`: integrators with a projection after each step
-- `multibody_functions`, `multibody`: mechanical systems in any coordinates, with a full mass matrix
+- `integration`: SciPy's integrators with a projection after each step
+- `multibody`: mechanical systems in any coordinates, with a full mass matrix
 - `flows`: dynamical systems as flows
 - `growth`: models of growth, and constraints on them
 """

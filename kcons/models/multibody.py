@@ -17,23 +17,24 @@ Bott & Duffin, Trans. AMS 74, 99 (1953). Hairer & Wanner, Solving Ordinary Diffe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import solve_ivp
 from scipy.linalg import lapack
 
-from kcons.constraints.arguments import FloatArray, IntArray, lent
+from kcons.constraints.arguments import TAKES_TIME, FloatArray, IntArray, check_call, lent, numbers, positive
+from kcons.constraints.target import WRONG, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
     ConvergenceError,
+    InputError,
     NonFiniteError,
     SingularGeometryError,
 )
-from kcons.models.multibody_functions import MultibodyFunctions, largest, shown
-from kcons.models.projected_steps import check_sizes, projecting, solver_of, span_of, times_of
+from kcons.models.integration import check_derivative, check_run, integrate
 
 #: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
 DEPENDENT = 1e-10
@@ -48,23 +49,15 @@ _EPS = float(np.finfo(float).eps)
 
 
 class MultibodySolution(NamedTuple):
-    """A motion, on the constraints to rounding.
-
-    Attributes
-    ----------
-    t : ndarray, shape (k,)
-    q, v, accelerations : ndarray, shape (k, n)
-    multipliers : ndarray, shape (k, m)
-        lambda of M q'' = f + G^T lambda.
-    evaluations, steps : int
-        Evaluations of the accelerations, and steps, that were taken to integrate.
-    """
+    """A motion, on the constraints to rounding; q, v and accelerations at k times have shape (k, n)."""
 
     t: FloatArray
     q: FloatArray
     v: FloatArray
     accelerations: FloatArray
+    #: lambda of M q'' = f + G^T lambda, shape (k, m).
     multipliers: FloatArray
+    #: Evaluations of the accelerations, and steps, that were taken to integrate.
     evaluations: int
     steps: int
 
@@ -101,7 +94,7 @@ class _Place(NamedTuple):
         return np.asarray(basis @ np.linalg.solve(triangle.T, self.Q.T @ z))
 
 
-class Multibody(MultibodyFunctions):
+class Multibody:
     """M(q) q'' = f(q, q', t) + G^T lambda, g(q, t) = 0, in any coordinates.
 
     Parameters
@@ -125,11 +118,6 @@ class Multibody(MultibodyFunctions):
     time_step : float
         Step of differences in time: about 1/50 of the time over which g changes.
 
-    Raises
-    ------
-    InputError
-        What is neither array nor function; a mass that is not symmetric or not finite.
-
     Notes
     -----
     Many publish M q'' = f - G^T lambda: their multipliers have the opposite sign.
@@ -147,7 +135,26 @@ class Multibody(MultibodyFunctions):
         length: float = 1.0,
         time_step: float = 0.02,
     ) -> None:
-        super().__init__(mass, force, constraints, jacobian, curvature, time_dependent, length, time_step)
+        self.force, self.constraints, self.jacobian, self.curvature = force, constraints, jacobian, curvature
+        self.time_dependent = bool(time_dependent)
+        self.length, self.time_step = positive(length, "length"), positive(time_step, "time_step")
+        last = ("t",) if time_dependent else ()
+        if force is None:
+            raise InputError("force must be a function, not None", item="force")
+        check_call("force", force, ("q", "v", "t"))
+        for name, taken in (("constraints", ("q",)), ("jacobian", ("q",)), ("curvature", ("q", "v"))):
+            check_call(name, getattr(self, name), (*taken, *last), TAKES_TIME)
+            if constraints is None and getattr(self, name) is not None:
+                raise InputError(f"there is a {name} without constraints; give the function g as well", item=name)
+        #: Number of constraints, None until it is seen.
+        self.m: int | None = 0 if constraints is None else None
+        if callable(mass):
+            check_call("mass", mass, ("q",))
+            self.mass: FloatArray | Callable[..., ArrayLike] = mass
+        else:
+            matrix = np.array(numbers(mass, "mass"))
+            self.mass = np.diag(matrix) if matrix.ndim == 1 else matrix
+            _check_symmetric(self.mass)
 
     def degrees_of_freedom(self, q: ArrayLike, t: float = 0.0) -> int:
         """n - rank G at `q`."""
@@ -215,8 +222,6 @@ class Multibody(MultibodyFunctions):
 
         Raises
         ------
-        InputError
-            Wrong shapes, numbers that are not finite, a Jacobian that contradicts the constraints.
         ConstraintError
             The start is off the constraints, or its velocities are.
         ConvergenceError
@@ -228,64 +233,50 @@ class Multibody(MultibodyFunctions):
         NonFiniteError
             A function gave a NaN or infinity.
         """
-        t0, t1 = span_of(t_span)
-        wanted = None if t_eval is None else times_of(t_eval, t0, t1)
-        solver = solver_of(method)
+        solver, (t0, t1), wanted = check_run(
+            t_span, t_eval, method, options | {"rtol": rtol, "atol": atol}, 2 * np.size(q)
+        )
         q, v = self._state(q, v, t0)
-        check_sizes(options | {"rtol": rtol, "atol": atol}, 2 * len(q))
         n, rank = len(q), len(self._start(q, v, t0).rows)
         latest: dict[str, Any] = {}
 
         def project(t: float, y: FloatArray) -> FloatArray:
             latest["place"] = place = self._placed(lent(y[:n]), t, rank)
-            latest["error"] = None
             return np.concatenate([place.q, self._tangent(place, y[n:])])
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            place = latest["place"]
-            q, v = lent(y[:n]), lent(y[n:])
-            if not np.isfinite(y).all():
-                return np.full(2 * n, np.nan)
-            try:
-                if place.t != t or not np.array_equal(place.q, q):
-                    place = self._place(q, t, rank)
-                f = self._called("force", (n,), q, v, t)
-                return np.concatenate([v, place.solve(f, self._b(q, v, t))])
-            except (NonFiniteError, SingularGeometryError) as error:
-                # A trial step may go too far, and is then made shorter; what is left is told if the run ends here.
-                latest["error"] = error
-                return np.full(2 * n, np.nan)
+            place, q, v = latest["place"], lent(y[:n]), lent(y[n:])
+            if place.t != t or not np.array_equal(place.q, q):
+                place = self._place(q, t, rank)
+            f = self._called("force", (n,), q, v, t)
+            return np.concatenate([v, place.solve(f, self._b(q, v, t))])
 
-        def counted(t: float, y: FloatArray) -> FloatArray:
+        def count(t: float, y: FloatArray) -> None:
             latest["steps"] += 1
-            return project(t, y)
 
         start = project(t0, np.concatenate([q, v]))
         self._motion(latest["place"], lent(start[n:]))  # what is wrong at the start is told at once
         latest["steps"] = 0
-        stepper = projecting(solver, counted)
-        ode = solve_ivp(slope, (t0, t1), start, stepper, wanted, rtol=rtol, atol=atol, **options)
+        options |= {"t_eval": wanted, "rtol": rtol, "atol": atol}
+        ode = integrate(slope, (t0, t1), start, solver, project, count, **options)
         if ode.status < 0:
-            raise latest["error"] or ConvergenceError(
+            raise ConvergenceError(
                 f"the run ended at t = {latest['place'].t:.8g}: {ode.message} Stiff forces: method='Radau'; forces "
                 "that jump: end the run there; or a larger tolerance"
             )
-        states, motions = [], []
-        for t, y in zip(ode.t, np.transpose(ode.y), strict=True):
-            states.append(y if wanted is None else project(t, y))
-            q, v = np.split(lent(states[-1]), 2)
-            motions.append(self._motion(self._place(q, t, rank), v))
-        q, v = np.split(np.array(states).reshape(-1, 2 * n), 2, axis=1)
-        a, multipliers = (
-            (np.array(part) for part in zip(*motions, strict=True)) if motions else (q, np.zeros((0, self.m or 0)))
-        )
+        q, v = np.split(np.reshape(ode.y, (2 * n, -1)).T, 2, axis=1)
+        motions = [
+            self._motion(self._place(lent(x), t, rank), lent(w)) for t, x, w in zip(ode.t, q, v, strict=True)
+        ] or [(np.zeros(n), np.zeros(self.m or 0))]
+        a, multipliers = (np.array(part)[: len(q)] for part in zip(*motions, strict=True))
         return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev, latest["steps"])
 
     def _place(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """Factors at `q`, with so many independent rows, by default as many as there are."""
         n = len(q)
         M, G = self._M(q), self._G(q, t)
-        size = _row_lengths(G)
+        size = np.sqrt(np.einsum("ij,ij->i", G, G))
+        size[size == 0] = 1.0
         Q, R, rows = _factors(G / size[:, None])
         left = np.abs(R.diagonal())
         if rank is None or (rank and not left[rank - 1] > DEPENDENT * left[0]):
@@ -293,7 +284,7 @@ class Multibody(MultibodyFunctions):
             if rank is not None:
                 raise SingularGeometryError(
                     f"at t = {t:.8g} only {found} constraints are independent, and {rank} at the start: a singular "
-                    f"place of the mechanism, q = {shown(q)}. End the run before, or hold it by other constraints"
+                    f"place of the mechanism, q = {_shown(q)}. End the run before, or hold it by other constraints"
                 )
             rank = found
         N = Q[:, rank:]
@@ -301,7 +292,7 @@ class Multibody(MultibodyFunctions):
         W, info = lapack.dpotrf(S) if rank < n else (S, 0)
         if info or (W.diagonal() ** 2 <= MASSLESS * S.diagonal()).any():
             raise SingularGeometryError(
-                f"at t = {t:.8g}, q = {shown(q)} the mass matrix is not positive along what the {rank} independent "
+                f"at t = {t:.8g}, q = {_shown(q)} the mass matrix is not positive along what the {rank} independent "
                 "constraints leave free: give the coordinates that move there a mass, or hold them"
             )
         return _Place(t, q, M, G, size, rows[:rank], Q[:, :rank], R[:rank, :rank], N, W)
@@ -309,10 +300,10 @@ class Multibody(MultibodyFunctions):
     def _start(self, q: FloatArray, v: FloatArray, t: float) -> _Place:
         """The place of a start; refused where that is off the constraints."""
         place, c = self._place(q, t, None), self._c(q, t)
-        gained = np.sqrt(largest(self._motion(place, v)[0]) * self.length)
-        speed = largest(v) + gained + np.abs(c) / place.size
+        gained = np.sqrt(_largest(self._motion(place, v)[0]) * self.length)
+        speed = _largest(v) + gained + np.abs(c) / place.size
         for miss, allowed, what in (
-            (self._g(q, t), max(self.length, largest(q)) + 0 * place.size, "off"),
+            (self._g(q, t), max(self.length, _largest(q)) + 0 * place.size, "off"),
             (place.G @ v - c, speed, "left by the velocities, per unit of time,"),
         ):
             off = np.abs(miss) / place.size
@@ -328,8 +319,8 @@ class Multibody(MultibodyFunctions):
     def _placed(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """The place on the constraints near `q`, by Newton's method down to rounding."""
         place, g = self._place(q, t, rank), self._g(q, t)
-        off = largest(g / place.size)
-        accepted = ACCEPTED * max(self.length, largest(q))
+        off = _largest(g / place.size)
+        accepted = ACCEPTED * max(self.length, _largest(q))
         for _ in range(ITERATIONS):
             if np.all(np.abs(g) <= 2 * _EPS * (np.abs(place.G) @ np.abs(place.q))):
                 break
@@ -337,7 +328,7 @@ class Multibody(MultibodyFunctions):
             for part in PARTS if off > accepted else PARTS[:1]:
                 moved = lent(place.q + part * step)
                 there = self._g(moved, t)
-                left = largest(there / place.size)
+                left = _largest(there / place.size)
                 if left < (1.0 - 0.5 * part) * off:
                     break
             else:
@@ -346,7 +337,7 @@ class Multibody(MultibodyFunctions):
         if not off <= accepted:
             row = int(np.argmax(np.abs(g / place.size)))
             raise ConvergenceError(
-                f"no positions on the constraints were found near q = {shown(q)} at t = {t:.8g}: constraint {row} "
+                f"no positions on the constraints were found near q = {_shown(q)} at t = {t:.8g}: constraint {row} "
                 f"stays off by {off:.3g}. Start nearer, take smaller steps (rtol, max_step), or see whether the "
                 "constraints can be met together",
                 residual=off,
@@ -357,7 +348,7 @@ class Multibody(MultibodyFunctions):
 
     def _tangent(self, place: _Place, v: FloatArray) -> FloatArray:
         """The nearest velocities that stay on the constraints."""
-        c, speed = self._c(place.q, place.t), largest(v)
+        c, speed = self._c(place.q, place.t), _largest(v)
         for _ in range(2):  # the second time for what rounding left
             v = v + place.solve(np.zeros(len(v)), c - place.G @ v)
         off = np.abs(c - place.G @ v) / place.size
@@ -369,6 +360,107 @@ class Multibody(MultibodyFunctions):
                 rows=[row],
             )
         return v
+
+    # -- what the user gave: called, differenced where derivatives are missing, and checked ----------------
+
+    def _called(self, name: str, shape: tuple[int, ...] | None, *arguments: Any) -> FloatArray:
+        """What a function of the user returned, of that shape, by default (m,), and finite; a copy."""
+        array = np.array(numbers(getattr(self, name)(*arguments), name))
+        if shape is None:
+            array = np.atleast_1d(array)
+            shape = (array.size,) if self.m is None else (self.m,)
+        if array.shape != shape:
+            raise InputError(f"{name} returned shape {array.shape}; it must return {shape}", item=name)
+        if not np.isfinite(array).all():
+            entry = np.argwhere(~np.isfinite(array))[0].tolist()
+            raise NonFiniteError(
+                f"{name} is not finite at q = {_shown(arguments[0])}: entry {entry}; mend the function, or keep the "
+                "motion away from there",
+                item=name,
+            )
+        return array
+
+    def _at(self, *arguments: Any) -> tuple[Any, ...]:
+        """What functions of the constraints take; the time, which is last, only where they depend on it."""
+        return arguments if self.time_dependent else arguments[:-1]
+
+    def _M(self, q: FloatArray) -> FloatArray:
+        return self.mass if isinstance(self.mass, np.ndarray) else self._called("mass", (len(q), len(q)), q)
+
+    def _g(self, q: FloatArray, t: float) -> FloatArray:
+        return self._called("constraints", None, *self._at(q, t)) if self.m else np.zeros(0)
+
+    def _G(self, q: FloatArray, t: float) -> FloatArray:
+        if self.m and self.jacobian is not None:
+            return self._called("jacobian", (self.m, len(q)), *self._at(q, t))
+        step = 1e-3 * self.length
+
+        def along(e: FloatArray) -> FloatArray:
+            return first_derivative_4(lambda s: self._g(q + s * e, t), 0.0, step)
+
+        return np.stack([along(e) for e in np.eye(len(q))], axis=1)
+
+    def _c(self, q: FloatArray, t: float) -> FloatArray:
+        """What G v must be, shape (m,) or ()."""
+        if not (self.m and self.time_dependent):
+            return np.zeros(())
+        return -first_derivative(lambda s: self._g(q, s), t, self.time_step)
+
+    def _b(self, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """What G a must be, shape (m,)."""
+        if self.m and self.curvature is not None:
+            return -self._called("curvature", None, *self._at(q, v, t))
+        speed = max(_largest(v) / self.length, 0.02 / self.time_step if self.time_dependent else 0.0)
+        if not self.m or speed == 0.0:
+            return np.zeros(self.m or 0)
+        if self.jacobian is not None and not self.time_dependent:
+            return -first_derivative_4(lambda s: self._G(q + s * v, t) @ v, 0.0, 1e-3 / speed)
+        return -second_derivative(lambda s: self._g(q + s * v, t + s), 0.0, 0.02 / speed)
+
+    def _state(self, q: ArrayLike, v: ArrayLike, t: float) -> tuple[FloatArray, FloatArray]:
+        """A state as arrays, after all functions were seen to fit it."""
+        found = []
+        for item, given in (("q", q), ("v", v)):
+            array = numbers(given, item)
+            n = np.size(q) if callable(self.mass) else len(self.mass)
+            if array.shape != (n,) or n == 0:
+                raise InputError(
+                    f"{item} has shape {array.shape}; give a number for each coordinate, ({n},)", item=item
+                )
+            if not np.isfinite(array).all():
+                raise InputError(f"{item}[{int(np.argmin(np.isfinite(array)))}] is not finite", item=item)
+            found.append(lent(array))
+        self._check_functions(found[0], t)
+        return found[0], found[1]
+
+    def _check_functions(self, q: FloatArray, t: float) -> None:
+        """Count the constraints; refuse derivatives that differences contradict, which would give wrong motion."""
+        if callable(self.mass):
+            _check_symmetric(self._M(q))
+        if self.constraints is None:
+            return
+        self.m = None
+        self.m = len(self._called("constraints", None, *self._at(q, t)))
+        speed = self.length * (0.02 / self.time_step if self.time_dependent else 1.0)
+        along = speed * np.random.default_rng(0).normal(size=len(q))
+        bare = copy(self)
+        bare.jacobian = bare.curvature = None
+        own, found = ((body._G(q, t), -body._b(q, along, t)) for body in (self, bare))
+        slope = _largest(found[0])
+        for name, mine, differences, unit in (
+            ("jacobian", own[0], found[0], 0.0),
+            ("curvature", own[1], found[1], speed**2 / self.length),
+        ):
+            if getattr(self, name) is not None:
+                check_derivative(
+                    name,
+                    "the constraints",
+                    mine,
+                    differences,
+                    differences,
+                    rounding=WRONG * unit * slope,
+                    remedy="or give the length over which they bend (length=...)",
+                )
 
 
 def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -383,8 +475,23 @@ def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     return lapack.dorgqr(Q, tau)[0], R[:k], order - 1
 
 
-def _row_lengths(G: FloatArray) -> FloatArray:
-    """1 for rows of zeros."""
-    size = np.sqrt(np.einsum("ij,ij->i", G, G))
-    size[size == 0] = 1.0
-    return np.asarray(size)
+def _check_symmetric(M: FloatArray) -> None:
+    if M.ndim != 2 or len(M) != M.shape[-1] or len(M) == 0:
+        raise InputError(f"mass has shape {M.shape}; give a diagonal (n,) or a matrix (n, n)", item="mass")
+    if not np.isfinite(M).all():
+        raise InputError(f"mass is not finite in row {int(np.argmin(np.isfinite(M).all(axis=1)))}", item="mass")
+    off = np.abs(M - M.T)
+    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+    if off[i, j] > 1e-10 * np.abs(M).max():
+        raise InputError(
+            f"mass is not symmetric: {M[i, j]:.6g} at [{i}, {j}] and {M[j, i]:.6g} at [{j}, {i}]; both are needed",
+            item="mass",
+        )
+
+
+def _largest(values: FloatArray) -> float:
+    return float(np.max(np.abs(values), initial=0.0))
+
+
+def _shown(q: FloatArray) -> str:
+    return np.array2string(q, precision=6, threshold=8)

@@ -1,30 +1,44 @@
 """Dynamical systems as flows (notes sections 1 to 3).
 
 - `flow`: a flow and its phase-space volume
-- `equilibria`: where it rests
-- `spectrum`, `imaginary_axis`, `jordan`: eigenvalues as far as they can be told
-- `stability`: the classification of equilibria
-- `linear_flow`: linear flows
-- `hamiltonian`, `isokinetic_flow`, `variation`: mechanics as flows
+- `linear`: linear flows: eigenvalues as far as they can be told, Jordan form, stability; where a flow rests
+- `mechanics`: from a Lagrangian to Hamilton's equations
 - `known_flows`: flows with known solutions
 """
 
-from kcons.models.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria
-from kcons.models.flows.flow import Flow, PhaseVolume, jacobian_by_differences, phase_volume
-from kcons.models.flows.hamiltonian import HamiltonianFlow, SymplecticTrajectory
-from kcons.models.flows.isokinetic_flow import Compression, Thermostat
-from kcons.models.flows.jordan import (
+from kcons.models.flows.flow import Flow, PhaseVolume, phase_volume
+from kcons.models.flows.known_flows import (
+    Compression,
+    DampedOscillator,
+    HarmonicOscillator,
+    ParticleOnSphere,
+    Pendulum,
+    Thermostat,
+)
+from kcons.models.flows.linear import (
+    Classification,
+    Equilibrium,
     JordanBlocks,
     JordanForm,
+    Kind,
+    LinearFlow,
+    Stability,
+    classify,
+    equilibrium_at,
+    find_equilibria,
     jordan_block,
     jordan_block_propagator,
-    jordan_blocks,
     jordan_form,
 )
-from kcons.models.flows.known_flows import DampedOscillator, HarmonicOscillator, ParticleOnSphere, Pendulum
-from kcons.models.flows.linear_flow import LinearFlow
-from kcons.models.flows.stability import Classification, Kind, Stability, classify
-from kcons.models.flows.variation import action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
+from kcons.models.flows.mechanics import (
+    HamiltonianFlow,
+    action,
+    hamiltonian,
+    lagrange_residual,
+    momentum,
+    velocity_of_momentum,
+)
+from kcons.models.integration import jacobian_by_differences
 
 __all__ = [
     "Classification",
@@ -42,7 +56,6 @@ __all__ = [
     "Pendulum",
     "PhaseVolume",
     "Stability",
-    "SymplecticTrajectory",
     "Thermostat",
     "action",
     "classify",
@@ -52,7 +65,6 @@ __all__ = [
     "jacobian_by_differences",
     "jordan_block",
     "jordan_block_propagator",
-    "jordan_blocks",
     "jordan_form",
     "lagrange_residual",
     "momentum",

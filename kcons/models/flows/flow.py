@@ -10,18 +10,15 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import check_call, lent, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, check_call, numbers, whole_number
 from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
+from kcons.models.integration import STEP, called, check_derivative, jacobian_by_differences
 
-FloatArray = NDArray[np.float64]
 Field = Callable[[float, FloatArray], ArrayLike]
-
-#: Longest of the steps of `jacobian_by_differences`, in parts of the variable where that is larger than 1.
-STEP = 0.02
 
 
 class Flow:
@@ -35,11 +32,6 @@ class Flow:
         Number of variables.
     jacobian : callable (t, X) -> (n, n), optional
         A_kl = dV_k/dX_l (notes eq. 27); by differences where it is not given.
-
-    Raises
-    ------
-    InputError
-        If n < 1; functions of other arguments.
     """
 
     def __init__(self, velocity: Field, n: int, jacobian: Field | None = None) -> None:
@@ -51,56 +43,31 @@ class Flow:
 
     def velocity(self, t: float, X: ArrayLike) -> FloatArray:
         """V(X, t), shape (n,) (notes eqs. 2, 3)."""
-        X = self._state(X)
-        V = numbers(self._velocity(t, lent(X)), "velocity")
-        if V.shape != (self.n,):
-            raise InputError(f"V has shape {V.shape}, not ({self.n},)", item="velocity")
-        return V
+        return called("velocity", self._velocity, (self.n,), t, self._state(X))
 
     def jacobian(self, t: float, X: ArrayLike) -> FloatArray:
         """A = dV/dX, shape (n, n) (notes eq. 27)."""
         X = self._state(X)
         if self._jacobian is None:
             return jacobian_by_differences(self._velocity, t, X)
-        A = numbers(self._jacobian(t, lent(X)), "jacobian")
-        if A.shape != (self.n, self.n):
-            raise InputError(f"the Jacobian has shape {A.shape}, not ({self.n}, {self.n})", item="jacobian")
-        return A
+        return called("jacobian", self._jacobian, (self.n, self.n), t, X)
 
     def jacobian_error(self, t: float, X: ArrayLike) -> FloatArray:
         """How far `jacobian` may be off, shape (n, n): 0 where it is given, else what half the steps change."""
         if self._jacobian is not None:
             return np.zeros((self.n, self.n))
-        X = self._state(X)
-        whole, half = (jacobian_by_differences(self._velocity, t, X, step) for step in (STEP, STEP / 2))
+        whole, half = self._differences(t, X)
         # Beyond truncation: the rounding of V, which half the steps double.
         return np.asarray(2.0 * np.abs(whole - half) + 1e-12 * np.max(np.abs(whole)))
 
-    def check_jacobian(self, t: float, X: ArrayLike) -> None:
-        """Refuse a Jacobian that differences contradict, and differences that do not serve.
+    def _differences(self, t: float, X: ArrayLike) -> list[FloatArray]:
+        """Jacobians with a step and with half of it."""
+        return [jacobian_by_differences(self._velocity, t, self._state(X), step) for step in (STEP, STEP / 2)]
 
-        Raises
-        ------
-        InputError
-        """
-        X = self._state(X)
-        coarse, fine = (jacobian_by_differences(self._velocity, t, X, step) for step in (STEP, STEP / 2))
-        given, size = self.jacobian(t, X), np.max(np.abs(fine))
-        serves = np.abs(fine - coarse) <= WRONG * size
-        if self._jacobian is None and not serves.all():
-            raise InputError(
-                f"the velocity changes too fast about X = {X} for differences: give its Jacobian, or variables of "
-                "order 1",
-                item="jacobian",
-            )
-        wrong = serves & (np.abs(given - fine) > WRONG * size)
-        if wrong.any():
-            k = tuple(np.argwhere(wrong)[0].tolist())
-            raise InputError(
-                f"jacobian gives {given[k]:.6g} for entry {list(k)} at X = {X}, but differences of the velocity give "
-                f"{fine[k]:.6g}; correct it, or leave it out",
-                item="jacobian",
-            )
+    def check_jacobian(self, t: float, X: ArrayLike) -> None:
+        """Refuse a Jacobian that differences contradict, and differences that do not serve."""
+        given = None if self._jacobian is None else self.jacobian(t, X)
+        check_derivative("jacobian", "the velocity", given, *self._differences(t, X))
 
     def divergence(self, t: float, X: ArrayLike) -> float:
         """div V = tr A (notes eqs. 36, 37)."""
@@ -130,43 +97,17 @@ class Flow:
         return array
 
 
-def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float = STEP) -> FloatArray:
-    """dV/dX by central differences with steps h, h/2, h/4, extrapolated to order six; shape (n, n)."""
-    X = numbers(X, "X")
-    columns = []
-    for k in range(len(X)):
-        h = step * max(1.0, abs(X[k]))
-        slopes = []
-        for part in (h, h / 2, h / 4):
-            e = np.zeros(len(X))
-            e[k] = part
-            up, down = X + e, X - e
-            ends = [numbers(velocity(t, lent(at)), "velocity") for at in (up, down)]
-            slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
-        first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
-        columns.append((16 * second - first) / 15)
-    return np.stack(columns, axis=1)
-
-
 class PhaseVolume(NamedTuple):
-    """How a small volume is carried along.
-
-    Attributes
-    ----------
-    t : ndarray, shape (k,)
-    states : ndarray, shape (k, n)
-    propagators : ndarray, shape (k, n, n)
-        dX_t/dX_0 (notes eq. 34).
-    log_volume : ndarray, shape (k,)
-        ln |det dX_t/dX_0|, from the propagators (notes eq. 33).
-    integrated_divergence : ndarray, shape (k,)
-        The integral of div V along the trajectory; the same number.
-    """
+    """How a small volume is carried along, at k times."""
 
     t: FloatArray
+    #: Shape (k, n).
     states: FloatArray
+    #: dX_t/dX_0, shape (k, n, n) (notes eq. 34).
     propagators: FloatArray
+    #: ln |det dX_t/dX_0|, from the propagators (notes eq. 33).
     log_volume: FloatArray
+    #: The integral of div V along the trajectory; the same number.
     integrated_divergence: FloatArray
 
 
@@ -208,8 +149,7 @@ def phase_volume(
         return np.concatenate([flow.velocity(t, Y[:n]), (A @ Y[n:-1].reshape(n, n)).ravel(), [np.trace(A)]])
 
     for a, b in pairwise(wanted):
-        edges = np.linspace(a, b, pieces + 1)
-        for c, d in pairwise(edges):
+        for c, d in pairwise(np.linspace(a, b, pieces + 1)):
             start = np.concatenate([state, np.eye(n).ravel(), [0.0]])
             found = solve_ivp(together, (c, d), start, "DOP853", rtol=rtol, atol=atol)
             if not found.success:
@@ -221,9 +161,6 @@ def phase_volume(
                     f"from t = {c:.6g} to {d:.6g} the volume changes by exp({integral:.6g}), which its propagator no "
                     "longer resolves: raise `pieces`"
                 )
-            log_volume += change
-            divergence += integral
-            total = J @ total
+            log_volume, divergence, total = log_volume + change, divergence + integral, J @ total
         rows.append((state, total, log_volume, divergence))
-    states, propagators, volumes, divergences = zip(*rows, strict=True)
-    return PhaseVolume(wanted, np.array(states), np.array(propagators), np.array(volumes), np.array(divergences))
+    return PhaseVolume(wanted, *(np.array(column) for column in zip(*rows, strict=True)))

@@ -1,32 +1,36 @@
-"""Flows with known solutions: oscillators, the pendulum, a particle on a sphere (notes examples 1 to 4)."""
+"""Flows with known solutions: oscillators, the pendulum, particle on a sphere, thermostat (notes examples 1 to 5)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
-from kcons.constraints.arguments import finite_number, lent, numbers, positive
+from kcons.constraints.arguments import (
+    FloatArray,
+    check_call,
+    finite_number,
+    numbers,
+    positive,
+    whole_number,
+)
 from kcons.errors import InputError
-from kcons.models.flows.flow import FloatArray, Flow
-from kcons.models.flows.hamiltonian import HamiltonianFlow
-from kcons.models.flows.jordan import JordanBlocks, JordanForm, jordan_block
-from kcons.models.flows.linear_flow import LinearFlow
+from kcons.models.flows.flow import Flow, phase_volume
+from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
+from kcons.models.flows.mechanics import HamiltonianFlow
+from kcons.models.integration import called
 
 #: Part of the energy of the separatrix, within which elliptic functions of double precision lose their digits.
 NEAR_SEPARATRIX = 1e-9
 
 
 class DampedOscillator(LinearFlow):
-    """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22).
-
-    Raises
-    ------
-    InputError
-        If Omega is not positive or eta negative.
-    """
+    """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22)."""
 
     def __init__(self, omega: float = 1.0, eta: float = 0.2) -> None:
         self.omega, self.eta = positive(omega, "omega"), finite_number(eta, "eta")
@@ -59,12 +63,12 @@ class DampedOscillator(LinearFlow):
             return JordanForm(
                 np.array([[-1.0, -1.0 / self.omega], [1.0, 0.0]], dtype=np.complex128),
                 jordan_block(first, 2).astype(np.complex128),
-                [JordanBlocks(first, (2,), True, 0.0)],
+                [JordanBlocks(first, (2,))],
             )
         return JordanForm(
             np.array([[second / self.omega, first / self.omega], [1.0, 1.0]]),
             np.diag([first, second]),
-            [JordanBlocks(first, (1,), True, 0.0), JordanBlocks(second, (1,), True, 0.0)],
+            [JordanBlocks(first, (1,)), JordanBlocks(second, (1,))],
         )
 
     def closed_form(self, t: float) -> FloatArray:
@@ -74,19 +78,14 @@ class DampedOscillator(LinearFlow):
         smooth through a = 0.
         """
         square = 0.25 * (self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)
-        root = np.sqrt(abs(square))
+        root = np.sqrt(complex(square))
         shifted = self.matrix + 0.5 * self.eta * np.eye(2)
-        if square > 0 and root * t > 1.0:
+        if root.real * t > 1.0:
             # e^(-eta t/2) cosh overflows in its second factor: both exponentials together.
-            slow = np.exp(-(self.omega**2) / (0.5 * self.eta + root) * t)
-            fast = np.exp(-(root + 0.5 * self.eta) * t)
-            return np.asarray(0.5 * (slow + fast) * np.eye(2) + 0.5 * (slow - fast) / root * shifted)
-        C = np.cosh(root * t) if square > 0 else np.cos(root * t)
-        z = square * t * t
-        if abs(z) < 1e-4:
-            S = t * (1 + z / 6 * (1 + z / 20 * (1 + z / 42)))
-        else:
-            S = (np.sinh(root * t) if square > 0 else np.sin(root * t)) / root
+            slow = np.exp(-(self.omega**2) / (0.5 * self.eta + root.real) * t)
+            fast = np.exp(-(root.real + 0.5 * self.eta) * t)
+            return np.asarray(0.5 * (slow + fast) * np.eye(2) + 0.5 * (slow - fast) / root.real * shifted)
+        C, S = np.cosh(root * t).real, t * np.sinc(1j * root * t / np.pi).real
         return np.asarray(np.exp(-0.5 * self.eta * t) * (C * np.eye(2) + S * shifted))
 
 
@@ -105,13 +104,7 @@ class HarmonicOscillator(DampedOscillator):
 
 
 class Pendulum(HamiltonianFlow):
-    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57).
-
-    Raises
-    ------
-    InputError
-        If Omega is not positive.
-    """
+    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57)."""
 
     def __init__(self, omega: float = 1.0) -> None:
         self.omega = positive(omega, "omega")
@@ -120,7 +113,6 @@ class Pendulum(HamiltonianFlow):
             1,
             lambda q, p: self.omega * np.sin(q),
             lambda q, p: self.omega * p,
-            separable=True,
         )
         self._jacobian = lambda t, X: np.array([[0.0, self.omega], [-self.omega * np.cos(X[0]), 0.0]])
 
@@ -129,11 +121,6 @@ class Pendulum(HamiltonianFlow):
 
         With k^2 = H/(2 Omega): sin(theta/2) = k sn(Omega t + u_0 | k^2) for k < 1, and theta/2 = am(k Omega t + u_0 |
         1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
-
-        Raises
-        ------
-        InputError
-            A start that is near the separatrix, and not on it.
         """
         theta0, rate0 = self._state(X0)
         times = numbers(t, "t")
@@ -184,11 +171,6 @@ class ParticleOnSphere(Flow):
     radius, mass : float
     force : callable (x) -> (3,), optional
         None for free motion.
-
-    Raises
-    ------
-    InputError
-        If radius or mass is not positive.
     """
 
     def __init__(
@@ -203,18 +185,12 @@ class ParticleOnSphere(Flow):
         x, v = numbers(x, "x"), numbers(v, "v")
         a = -(v @ v) / self.radius**2 * x
         if self.force is not None:
-            f = numbers(self.force(lent(x)), "force") / self.mass
+            f = called("force", self.force, (3,), x) / self.mass
             a = a + f - x * (x @ f) / self.radius**2
         return np.asarray(a)
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
-        """The free motion x(t), shape (3,) or (k, 3).
-
-        Raises
-        ------
-        InputError
-            x0 is off the sphere, or v0 leaves it.
-        """
+        """The free motion x(t), shape (3,) or (k, 3)."""
         x0, v0 = np.split(self._state(np.concatenate([np.ravel(numbers(x0, "x0")), np.ravel(numbers(v0, "v0"))])), 2)
         speed = float(np.linalg.norm(v0))
         if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
@@ -223,3 +199,146 @@ class ParticleOnSphere(Flow):
             raise InputError("v0 leaves the sphere: give its part along it, v - x (x.v)/R^2", item="v0")
         angle = numbers(t, "t")[..., None] * speed / self.radius
         return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))
+
+
+class Compression(NamedTuple):
+    """Phase volume on the surface of constant K, along a trajectory, at k times."""
+
+    t: FloatArray
+    #: Measured: ln of the volume spanned by the tangent vectors, carried along by the variational equation.
+    log_volume: FloatArray
+    #: -(g - 1) times the integral of alpha.
+    predicted: FloatArray
+    g: int
+
+
+class Thermostat(Flow):
+    """Particles at constant kinetic energy; X = (M^1/2 x, M^1/2 v), in which this is a sphere (notes example 5).
+
+        dx/dt = v,   dv/dt = f/m - alpha v,   alpha = v.f/(2K),   2K = v^T M v   (eq. 113)
+
+    On the surface of constant K (and of constant total momentum, where that is zero and conserved) g degrees of freedom
+    move, and the flow compresses phase space at the rate div V = -(g - 1) alpha.
+
+    Parameters
+    ----------
+    masses : array_like, shape (n,)
+        One for each Cartesian component.
+    force : callable (x) -> (n,)
+    momentum_removed : int
+        Number of directions in which the total momentum is zero and stays so (the forces sum to zero there): 0, or the
+        dimension of space, the components running fastest. They do not count as degrees of freedom.
+    """
+
+    def __init__(
+        self, masses: ArrayLike, force: Callable[[FloatArray], ArrayLike], *, momentum_removed: int = 0
+    ) -> None:
+        m = numbers(masses, "masses").copy()
+        if m.ndim != 1 or m.size < 2 or not np.all(np.isfinite(m) & (m > 0)):
+            raise InputError("masses are positive, one for each of at least two Cartesian components", item="masses")
+        check_call("force", force, ("x",))
+        momentum_removed = whole_number(momentum_removed, "momentum_removed", 0)
+        if momentum_removed and (m.size % momentum_removed or m.size == momentum_removed):
+            raise InputError("the components do not divide into particles of this dimension", item="momentum_removed")
+        self.masses, self.root = m, np.sqrt(m)
+        self.force, self.removed = force, momentum_removed
+        super().__init__(self._field, 2 * m.size)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """g, before the thermostat takes its one."""
+        return self.masses.size - self.removed
+
+    def state(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
+        """X of positions and velocities."""
+        x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
+        if x.shape != self.masses.shape or v.shape != self.masses.shape:
+            raise InputError(f"x and v have {self.masses.size} components each, as the masses", item="x")
+        if not v @ (self.masses * v) > 1e-290:
+            raise InputError("an isokinetic thermostat needs non-zero kinetic energy", item="v")
+        if self.removed:
+            total = (self.masses * v).reshape(-1, self.removed).sum(axis=0)
+            if np.max(np.abs(total)) > 1e-12 * np.sum(np.abs(self.masses * v)):
+                raise InputError("the total momentum is not zero: subtract it from the start", item="v")
+            pull = self._force(x).reshape(-1, self.removed)
+            if np.max(np.abs(pull.sum(axis=0))) > 1e-9 * np.sum(np.abs(pull)):
+                raise InputError("the forces do not sum to zero, as momentum_removed has it", item="momentum_removed")
+        return self._state(np.concatenate([self.root * x, self.root * v]))
+
+    def positions(self, X: FloatArray) -> FloatArray:
+        """x, shape (n,)."""
+        return np.asarray(X[: self.masses.size] / self.root)
+
+    def friction(self, X: ArrayLike) -> float:
+        """alpha = v.f/(v^T M v) (notes eq. 113)."""
+        X = numbers(X, "X")
+        w = X[self.masses.size :]
+        return float(w @ (self._force(self.positions(X)) / self.root) / (w @ w))
+
+    def _force(self, x: FloatArray) -> FloatArray:
+        return called("force", self.force, x.shape, x, scalar=True)
+
+    def _field(self, t: float, X: FloatArray) -> FloatArray:
+        w = X[self.masses.size :]
+        return np.concatenate([w, self._force(self.positions(X)) / self.root - self.friction(X) * w])
+
+    def tangents(self, X: FloatArray) -> FloatArray:
+        """Orthonormal vectors along the surface of constant K and momentum, shape (2n, 2g - 1)."""
+        n = self.masses.size
+        fixed = np.zeros((n, 0))
+        if self.removed:
+            fixed = np.stack([self.root * (np.arange(n) % self.removed == k) for k in range(self.removed)], axis=1)
+        places = scipy.linalg.null_space(fixed.T)
+        speeds = scipy.linalg.null_space(np.column_stack([fixed, X[n:]]).T)
+        T = np.zeros((2 * n, places.shape[1] + speeds.shape[1]))
+        T[:n, : places.shape[1]], T[n:, places.shape[1] :] = places, speeds
+        return T
+
+    def surface_divergence(self, X: ArrayLike) -> float:
+        """div V along the surface, tr(T^T dV/dX T); equal to -(g - 1) alpha."""
+        T = self.tangents(self._state(X))
+        return float(np.trace(T.T @ self.jacobian(0.0, X) @ T))
+
+    def compression(self, X0: ArrayLike, times: ArrayLike, pieces: int = 1) -> Compression:
+        """Measure the compression of phase space along a trajectory, and predict it from alpha."""
+        X0 = self._state(X0)
+        extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
+        wanted, pieces = np.atleast_1d(numbers(times, "times")), whole_number(pieces, "pieces")
+        Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
+        for a, b in pairwise(wanted):
+            for c, d in pairwise(np.linspace(a, b, pieces + 1)):
+                # The tangent vectors start anew as orthonormal ones: carried far, they would all turn into one.
+                T = self.tangents(Y[:-1])
+                found = phase_volume(extended, Y, [c, d])
+                carried = found.propagators[-1, :-1, :-1] @ T
+                volume += 0.5 * float(np.linalg.slogdet(carried.T @ carried)[1])
+                Y = found.states[-1]
+            rows.append((volume, float(Y[-1])))
+        volumes, frictions = np.array(rows).T
+        g = self.degrees_of_freedom
+        return Compression(wanted, volumes, -(g - 1) * frictions, g)
+
+    def exact_constant_force(self, t: float, x: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """x(t), v(t) under a force that does not depend on x, in closed form.
+
+        v(t) = (v + s f/m)/s', with s' = cosh(ct) + (a/c) sinh(ct), c^2 = f.M^-1 f/2K, a = v.f/2K. The positions follow
+        from integral s/s' = (ln s' - a I)/c^2, I = integral 1/s'.
+        """
+        x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
+        f = self._force(x)
+        two_K = float(v @ (self.masses * v))
+        a, c = float(v @ f) / two_K, float(np.sqrt(f @ (f / self.masses) / two_K))
+        if c == 0.0:
+            return x + t * v, v
+        # Divided by e^(ct), nothing overflows; 1 + a/c and 1 - a/c as they are.
+        r, decay = a / c, np.exp(-2 * c * t)
+        slope = 0.5 * ((1 + r) + (1 - r) * decay)
+        s = (0.5 * (1 + r) - 0.5 * (1 - r) * decay - r * np.exp(-c * t)) / c
+        velocity = (v * np.exp(-c * t) + s * f / self.masses) / slope
+        log_slope = np.log(slope) + c * t
+        # I = integral of 1/(cosh + r sinh): 2 atan(...) of it, in a form that holds for |r| = 1 as well.
+        half = np.tanh(0.5 * c * t)
+        root = np.sqrt(max(1.0 - r * r, 0.0))
+        angle = 2 * half / (1 + r * half)
+        I = angle / c if root < 1e-8 else 2 * np.arctan(root * half / (1 + r * half)) / (root * c)
+        return x + v * I + (log_slope - a * I) / c**2 * f / self.masses, velocity

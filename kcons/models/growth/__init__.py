@@ -1,25 +1,29 @@
 """Populations that grow under constraints (notes sections 3 and 4.3).
 
-- `model`, `simple_models`, `hypercycle`, `mixture`: models of growth
-- `rows`, `orthogonal_rows`, `entropy`: what is held
-- `constrained`: a model with what is held
-- `compensated_sums`, `integration`, `many_trajectories`: one trajectory, and many
+- `model`: models of growth, and the thermodynamics of their species
+- `rows`: what is held, a production of entropy among it
+- `constrained`: a model with what is held, and its trajectories
+- `hypercycle`: the hypercycle of Eigen and Schuster
 """
 
-from kcons.models.growth.constrained import ConstrainedGrowth
-from kcons.models.growth.entropy import EntropyRow, NoProduction, PrescribedProduction, Relaxation, entropy_balance
+from kcons.models.growth.constrained import ConstrainedGrowth, GrowthSolution, entropy_balance, solve
 from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
-from kcons.models.growth.integration import GrowthSolution, solve
-from kcons.models.growth.many_trajectories import EnsembleSolution, solve_ensemble
-from kcons.models.growth.mixture import Mixture
-from kcons.models.growth.model import GrowthModel, Populations
-from kcons.models.growth.rows import HolonomicRow, LinearRow, Row, TotalPopulation, VelocityRow
-from kcons.models.growth.simple_models import Logistic, LotkaVolterra
+from kcons.models.growth.model import GrowthModel, Logistic, LotkaVolterra, Mixture, Populations
+from kcons.models.growth.rows import (
+    EntropyRow,
+    HolonomicRow,
+    LinearRow,
+    NoProduction,
+    PrescribedProduction,
+    Relaxation,
+    Row,
+    TotalPopulation,
+    VelocityRow,
+)
 
 __all__ = [
     "ConstrainedGrowth",
     "ConstrainedHypercycle",
-    "EnsembleSolution",
     "EntropyRow",
     "GrowthModel",
     "GrowthSolution",
@@ -38,5 +42,4 @@ __all__ = [
     "VelocityRow",
     "entropy_balance",
     "solve",
-    "solve_ensemble",
 ]

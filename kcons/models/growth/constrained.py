@@ -1,9 +1,17 @@
-"""Growth under constraints (notes section 4.3.1).
+"""Growth under constraints, and its trajectories (notes section 4.3.1).
 
     dx/dt = Psi + G (phi + z),   A dx/dt = b,   z = A^T lambda,   (A G A^T) lambda = b - A(Psi + G phi)
 
 (eqs. 124-141). z acts as an additional relative rate, so that positivity is untouched: with Psi = 0,
 d ln x/dt = phi + z.
+
+The rows are made orthogonal in the scalar product <a, a'> = sum_i x_i a_i a'_i, one after another (Gram-Schmidt, each
+row twice). This is a QR factorization of (A G^1/2)^T: it never forms A G A^T, whose condition number is the square.
+For the rows 1 and mu it amounts to the centered moment sum x (mu - M1)^2 = M2 - M1^2, computed without cancellation.
+
+Trajectories are those of SciPy's ``solve_ivp``. The unknown is y = ln x: dy/dt = phi + z + Psi exp(-y). x = exp(y) is
+positive whatever the step; nothing is ever clipped. After each step the state is put back on the holonomic rows to
+round-off, by y + A^T mu with Newton's iteration, and the next step starts from there; so are values between.
 
 References
 ----------
@@ -14,13 +22,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Sequence
-from typing import Self
+from itertools import pairwise
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import OptimizeResult
 
 from kcons.constraints import projection
-from kcons.constraints.arguments import refuse_other
+from kcons.constraints.arguments import FloatArray, check_call, numbers, refuse_other
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
@@ -29,21 +40,63 @@ from kcons.errors import (
     NonFiniteError,
     SingularGeometryError,
 )
-from kcons.models.growth import orthogonal_rows
-from kcons.models.growth.model import FloatArray, GrowthModel, Populations
-from kcons.models.growth.rows import EPSILON, Row
+from kcons.models.growth.model import GrowthModel, Populations
+from kcons.models.growth.rows import EntropyRow, Row
+from kcons.models.integration import check_run, integrate
 
-#: Newton iterations of a projection at most.
-MOST_ITERATIONS = 25
-#: A projection has arrived where what is left is this many times the round-off of the row.
-ROUND_OFF = 1.0
-#: Systems that have arrived part from the others where they are more than this share of them.
-WORTH_PARTING = 0.3
-#: After this many iterations, so many times the round-off are accepted.
-STALLED, ACCEPTED = 4, 50.0
+Event = Callable[[float, FloatArray], float]
+EPSILON = float(np.finfo(np.float64).eps)
+TINY = float(np.finfo(np.float64).tiny)
+#: A row depends on those before it where less than this part of its length is its own: rounding of sums, no rank of a
+#: matrix, whose limit is that of `kcons.solvers.rank_revealing`.
+LOST = 1e-12
+#: A dependent row contradicts the others where its right side is off by more than this part of its terms.
+SOLVABILITY_TOLERANCE = 1e-9
+#: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
+START_TOLERANCE = 1e-10
+#: Newton iterations of a projection at most. It has arrived at the round-off of the rows; after `STALLED` iterations
+#: at `ACCEPTED` times that.
+MOST_ITERATIONS, STALLED, ACCEPTED = 25, 4, 50.0
 #: Least ln x. Where the rows press on a species that is extinct, ln x falls like -e^(lambda t), beyond all numbers of
 #: the machine in finite time; x and x ln x are 0 long before. A fall fades out here; a return starts from here.
 LEAST_LOGARITHM = -1e300
+
+
+class Rates(NamedTuple):
+    """z and how it was found, for m rows and n species."""
+
+    z: FloatArray
+    #: z = A^T multipliers; 0 for a dependent row.
+    multipliers: FloatArray
+    dependent: NDArray[np.bool_]
+    #: For dependent rows what is missing in its right side, in parts of the terms that it is made of.
+    contradiction: FloatArray
+
+
+def constraint_rates(x: FloatArray, rows: Sequence[FloatArray], right: Sequence[float], drift: FloatArray) -> Rates:
+    """z with A (drift + G z) = right, drift = Psi + G phi; z lies in the space of the rows (notes eqs. 137, 138)."""
+    m = len(rows)
+    units, triangle = np.zeros((m, len(x))), np.eye(m)
+    asked, along, contradiction = np.zeros(m), np.zeros(m), np.zeros(m)
+    dependent = np.zeros(m, dtype=bool)
+    for k in range(m):
+        q, mixing = rows[k], np.zeros(k)
+        for _ in range(2 if k else 0):
+            part = units[:k] @ (x * q)
+            q, mixing = q - part @ units[:k], mixing + part
+        triangle[:k, k] = mixing
+        b = right[k] - mixing @ asked[:k]
+        missing, squared = b - q @ drift, float((x * q) @ q)
+        if not np.isfinite(squared):  # a coefficient is not finite; nor is z
+            along[k] = np.nan
+        elif squared > LOST**2 * float((x * rows[k]) @ rows[k]):
+            length = triangle[k, k] = np.sqrt(squared)
+            units[k], asked[k], along[k] = q / length, b / length, missing / length
+        else:
+            dependent[k] = True
+            contradiction[k] = abs(missing) / (float(np.abs(rows[k] * drift).sum()) + abs(right[k]) or 1.0)
+    multipliers = scipy.linalg.solve_triangular(triangle, along, check_finite=False) if m else along
+    return Rates(along @ units, multipliers, dependent, contradiction)
 
 
 class ConstrainedGrowth:
@@ -71,359 +124,381 @@ class ConstrainedGrowth:
 
     def __init__(self, model: GrowthModel, rows: Sequence[Row] | Row = ()) -> None:
         refuse_other(model, GrowthModel, "model", "a kcons.models.growth.GrowthModel")
+        refuse_other(rows, (Row, Iterable), "rows", "rows of kcons.models.growth, or an empty list")
         self.model = model
-        self.rows = _rows_in(rows, model.n)
+        self.rows: tuple[Row, ...] = (rows,) if isinstance(rows, Row) else tuple(rows)
+        for row in self.rows:
+            refuse_other(row, Row, "rows", "rows of kcons.models.growth, such as TotalPopulation(n)")
+        if len(self.rows) > model.n:
+            raise ConstraintError(
+                f"{len(self.rows)} rows for {model.n} species: give at most as many rows as there are species",
+                rows=range(model.n, len(self.rows)),
+            )
 
     @property
     def n(self) -> int:
         return self.model.n
 
-    # -- the start ----------------------------------------------------------------------------------
-
     def bind(self, p: Populations) -> Self:
-        """The same system with all targets set by the start `p`.
-
-        Raises
-        ------
-        ConstraintError
-            If the start is off a row whose target was given.
-        ContradictionError
-            If the rows contradict each other at the start.
-        """
-        if len(p.x) != self.n:
-            raise InputError(f"the start has {len(p.x)} populations, the model {self.n}", item="x0")
-        check_lanes(self, p.x.shape[1:])
+        """The same system with all targets set by the start `p`; refused if that is off a row, or rows contradict."""
+        if p.x.shape != (self.n,):
+            raise InputError(f"the start has populations of shape {p.x.shape}, the model {self.n}", item="x0")
         bound = copy.copy(self)
         bound.rows = tuple(row.bind(p) for row in self.rows)
         for number, row in enumerate(bound.rows):
-            row.check(p, number)
+            off = abs(row.value(p)) / max(row.size(p), TINY) if row.holonomic else 0.0
+            if not off <= START_TOLERANCE:
+                raise ConstraintError(
+                    f"the start is off row {number} ({row.name}): relative deviation {off:.3g}. Start on it, or leave "
+                    "the target out to keep the value found at the start",
+                    rows=[number],
+                )
         bad = bound.model.not_finite(p)
         if bad is not None:
             raise InputError(f"the {bad[0]} of species {bad[1]} at the start is not finite", item="rates")
-        if p.x.ndim == 2:
-            _refuse_mixed(bound, p)
-        bound._held(p)
+        bound.held(p)
         return bound
-
-    def take(self, lanes: NDArray[np.intp]) -> Self:
-        """Some of N systems side by side."""
-        taken = copy.copy(self)
-        taken.model = self.model.take(lanes)
-        taken.rows = tuple(row.take(lanes) for row in self.rows)
-        return taken
 
     # -- the constrained equation of motion ----------------------------------------------------------
 
-    def _solve(self, p: Populations, drift: FloatArray) -> orthogonal_rows.Solution:
-        return orthogonal_rows.solve(
-            p.x, [row.gradient(p) for row in self.rows], [row.rate(p) for row in self.rows], drift
-        )
-
-    def _held(self, p: Populations, drift: FloatArray | None = None) -> orthogonal_rows.Solution:
-        """z where the rows allow one."""
-        found = self._solve(p, self.model.drift(p) if drift is None else drift)
-        _refuse_not_finite(found.z, self.rows, p)
-        self._refuse(found, p)
+    def held(self, p: Populations, drift: FloatArray | None = None) -> Rates:
+        """z; refused where the rank is lost and the rows contradict each other, or a number is not finite."""
+        drift = self.model.drift(p) if drift is None else drift
+        with np.errstate(all="ignore"):
+            rows, right = [row.gradient(p) for row in self.rows], [row.rate(p) for row in self.rows]
+            found = constraint_rates(p.x, rows, right, drift)
+        if np.any(found.contradiction > SOLVABILITY_TOLERANCE):
+            self._refuse(found, p)
+        if np.all(np.isfinite(found.z)) and np.all(np.isfinite(drift)):
+            return found
+        bad = self.model.not_finite(p)
+        if bad is not None:
+            raise NonFiniteError(
+                f"the {bad[0]} of species {bad[1]} is not finite at t = {p.time:.8g}, "
+                f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
+                item=f"{bad[0]}s",
+            )
+        for number, (row, b) in enumerate(zip(rows, right, strict=True)):
+            if not (np.all(np.isfinite(row)) and np.isfinite(b)):
+                raise NonFiniteError(
+                    f"row {number} ({self.rows[number].name}) has a coefficient or a rate that is not finite at "
+                    f"t = {p.time:.8g}; mend its functions, or end the run before (an event)",
+                    item="rows",
+                )
         return found
 
-    def _refuse(self, found: orthogonal_rows.Solution, p: Populations) -> None:
+    def _refuse(self, found: Rates, p: Populations) -> None:
         """Raise where the rank is lost and the rows ask for the impossible."""
-        off = found.contradiction > orthogonal_rows.SOLVABILITY_TOLERANCE
-        if not np.any(off):
-            return
-        index = np.argwhere(off)[0]
-        row = int(index[0])
-        time = float(np.broadcast_to(p.time, p.x.shape[1:])[tuple(index[1:])])
+        row = int(np.argmax(found.contradiction > SOLVABILITY_TOLERANCE))
         message = (
-            f"row {row} ({self.rows[row].name}) depends on the rows before it at t = {time:.8g} and contradicts them: "
-            f"its right side is off by {found.contradiction[tuple(index)]:.3g} of its terms"
+            f"row {row} ({self.rows[row].name}) depends on the rows before it at t = {p.time:.8g} and contradicts "
+            f"them: its right side is off by {found.contradiction[row]:.3g} of its terms"
         )
         # The same rows at a state some way off: dependent everywhere, or only here?
-        lane = index[1:2]
-        here = self.take(lane) if len(lane) else self
-        log_x = p.log_x[:, lane] if len(lane) else p.log_x
-        shift = 0.1 * np.cos(np.arange(1.0, self.n + 1)).reshape(-1, *(1,) * (log_x.ndim - 1))
-        away = Populations.from_logarithms(
-            np.full(len(lane), time) if len(lane) else time, np.maximum(log_x, -30.0) + shift
-        )
-        gradients = np.array([r.gradient(away).reshape(self.n) for r in here.rows])
-        if projection.rank(gradients) < len(self.rows):
+        shift = 0.1 * np.cos(np.arange(1.0, self.n + 1))
+        away = Populations.from_logarithms(p.time, np.maximum(p.log_x, -30.0) + shift)
+        if projection.rank(np.array([r.gradient(away) for r in self.rows])) < len(self.rows):
             raise ContradictionError(message + "; remove one of the rows or change its rate", rows=[row])
         raise SingularGeometryError(
-            message
-            + "; the rows are independent elsewhere: stop before this time (an event), or prescribe a rate that "
-            "fades as the rank does",
+            message + "; the rows are independent elsewhere: stop before this time (an event), or prescribe a rate "
+            "that fades as the rank does",
             rows=[row],
         )
 
     def logarithmic_velocity(self, p: Populations) -> FloatArray:
-        """d ln x/dt = phi + z + Psi/x, shape of p.x; what `solve` integrates. NaN of systems whose rows contradict.
-
-        Raises
-        ------
-        ContradictionError, SingularGeometryError
-            Where the rank is lost and the rows contradict each other, for a single system.
-        """
-        phi = self.model.rates(p)
-        psi = self.model.sources(p)
+        """d ln x/dt = phi + z + Psi/x, shape (n,); what `solve` integrates. NaN where x is beyond all numbers."""
+        if not np.all(np.isfinite(p.x)):
+            return np.full(self.n, np.nan)
+        phi, psi = self.model.rates(p), self.model.sources(p)
         with np.errstate(all="ignore"):
             drift = p.x * phi if psi is None else p.x * phi + psi
-            if not self.rows:
-                slope = np.array(phi)
-            else:
-                found = self._solve(p, drift)
-                if p.x.ndim == 1:
-                    self._refuse(found, p)
-                off = np.any(found.contradiction > orthogonal_rows.SOLVABILITY_TOLERANCE, axis=0)
-                slope = np.where(off, np.nan, phi + found.z)
+            slope = phi + self.held(p, drift).z
             if psi is not None:
                 slope = slope + psi * np.exp(-p.log_x)
-            fallen = (p.log_x < 1e-17 * LEAST_LOGARITHM) & (slope < 0)
-            if fallen.any():
-                slope[fallen] *= np.maximum(1.0 - p.log_x[fallen] / LEAST_LOGARITHM, 0.0)
-        return slope
+            return np.where(slope < 0, slope * np.maximum(1.0 - p.log_x / LEAST_LOGARITHM, 0.0), slope)
 
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:
-        """dx/dt (notes eq. 133), shape of x."""
-        p = Populations.from_values(t, x)
+        """dx/dt (notes eq. 133), shape (n,)."""
+        p = self._at(t, x)
         drift = self.model.drift(p)
-        return drift + p.x * self._held(p, drift).z
+        return drift + p.x * self.held(p, drift).z
 
     def constraint_rates(self, t: float, x: ArrayLike) -> FloatArray:
-        """z, shape of x (notes eqs. 137, 139)."""
-        p = Populations.from_values(t, x)
-        return self._held(p).z
+        """z, shape (n,) (notes eqs. 137, 139)."""
+        return self.held(self._at(t, x)).z
 
     def multipliers(self, t: float, x: ArrayLike) -> FloatArray:
-        """lambda with z = A^T lambda, shape (m,) or (m, N) (notes eq. 138); of least norm where rows depend."""
-        p = Populations.from_values(t, x)
-        found = self._held(p)
-        if p.x.ndim == 1 and np.any(found.dependent):
-            A = np.array([row.gradient(p) for row in self.rows])
-            return np.asarray(projection.pseudo_inverse(A.T).matrix @ found.z)
-        return found.multipliers
+        """lambda with z = A^T lambda, shape (m,) (notes eq. 138); of least norm where rows depend."""
+        found = self.held(self._at(t, x))
+        if not np.any(found.dependent):
+            return found.multipliers
+        return np.asarray(projection.pseudo_inverse(self.rows_and_rates(t, x)[0].T).matrix @ found.z)
 
-    # -- the formulas of the notes, literally and densely, for one system ----------------------------
+    # -- the formulas of the notes, literally and densely ---------------------------------------------
 
     def rows_and_rates(self, t: float, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """A, shape (m, n), and b, shape (m,) (notes eqs. 128-130)."""
-        p = self._one(t, x)
+        p = self._at(t, x)
         A = np.array([row.gradient(p) for row in self.rows]).reshape(-1, self.n)
-        return A, np.array([float(row.rate(p)) for row in self.rows])
+        return A, np.array([row.rate(p) for row in self.rows])
 
     def constrained_inverse(self, t: float, x: ArrayLike) -> FloatArray:
         """G_perp+ = A^T (A G A^T)^-1 A = (P_perp G P_perp)+, shape (n, n) (notes eqs. 140, 141)."""
-        p = self._one(t, x)
         A, _ = self.rows_and_rates(t, x)
-        root = np.sqrt(p.x)
         # (A G A^T)+ = (C+)^T C+ with C = A G^1/2.
-        C_plus = projection.pseudo_inverse(A * root).matrix
+        C_plus = projection.pseudo_inverse(A * np.sqrt(self._at(t, x).x)).matrix
         return np.asarray(A.T @ (C_plus.T @ (C_plus @ A)))
 
     def least_rate(self, t: float, x: ArrayLike) -> FloatArray:
         """h = A+ b - Psi - G phi, shape (n,), so that z = G_perp+ h (notes eqs. 134, 139)."""
-        p = self._one(t, x)
-        A, b = self.rows_and_rates(t, x)
-        return np.asarray(projection.pseudo_inverse(A).matrix @ b - self.model.drift(p))
+        return self.perpendicular_velocity(t, x) - self.model.drift(self._at(t, x))
 
     def perpendicular_velocity(self, t: float, x: ArrayLike) -> FloatArray:
         """A+ b, the part of dx/dt that the rows fix by themselves, shape (n,) (notes eqs. 131, 132)."""
         A, b = self.rows_and_rates(t, x)
         return np.asarray(projection.pseudo_inverse(A).matrix @ b)
 
-    def _one(self, t: float, x: ArrayLike) -> Populations:
+    def _at(self, t: float, x: ArrayLike) -> Populations:
         p = Populations.from_values(t, x)
         if p.x.shape != (self.n,):
-            raise InputError(f"this formula is for one system, shape ({self.n},), not {p.x.shape}", item="x")
+            raise InputError(f"populations have shape ({self.n},), not {p.x.shape}", item="x")
         return p
 
     # -- the holonomic rows as conditions on the state ------------------------------------------------
 
     def residuals(self, p: Populations) -> FloatArray:
-        """sigma - sigma0 of the holonomic rows, shape (m_h,) or (m_h, N)."""
-        values = [np.broadcast_to(row.value(p), p.x.shape[1:]) for row in self.rows if row.holonomic]
-        return np.array(values).reshape(len(values), *p.x.shape[1:])
+        """sigma - sigma0 of the holonomic rows, shape (m_h,)."""
+        return np.array([row.value(p) for row in self.rows if row.holonomic])
 
-    def project(self, time: float | FloatArray, log_x: FloatArray) -> FloatArray:
-        """The state on the holonomic rows, ln x + A^T mu with the least mu; shape of log_x.
+    def project(self, time: float, log_x: FloatArray) -> FloatArray:
+        """The state on the holonomic rows, ln x + A^T mu with the least mu; shape (n,).
 
         Newton's iteration in the metric of the theory: x changes by G A^T mu, hence stays positive.
-
-        Raises
-        ------
-        ConvergenceError
-            If the rows cannot be met to round-off from here, for a single system.
         """
-        projected, left = self.try_project(time, log_x)
-        if np.ndim(left) == 0 and not left <= ACCEPTED:
-            names = ", ".join(row.name for row in self.rows if row.holonomic)
+        rows = [row for row in self.rows if row.holonomic]
+        best, least = log_x, np.inf
+        p = Populations.from_logarithms(time, log_x)
+        for iteration in range(MOST_ITERATIONS + 1 if rows else 0):
+            with np.errstate(all="ignore"):
+                values = [row.value(p) for row in rows]
+                left = max(abs(v) / (EPSILON * max(r.size(p), TINY)) for v, r in zip(values, rows, strict=True))
+                if left < least:
+                    best, least = p.log_x, left
+                if least <= (1.0 if iteration < STALLED else ACCEPTED):
+                    return best
+                change = constraint_rates(p.x, [r.gradient(p) for r in rows], [-v for v in values], 0 * p.x).z
+                # Populations change by no more than a factor e at once: Newton's steps are for small corrections.
+                change = change / max(float(np.max(np.abs(change) * (p.x > 0))), 1.0)
+            p = Populations.from_logarithms(time, p.log_x + np.where(np.isfinite(change), change, 0.0))
+        if rows and not least <= ACCEPTED:
             raise ConvergenceError(
-                f"the state at t = {float(np.max(time)):.8g} cannot be projected on its rows ({names}): "
-                f"what is left is {left:.3g} times their round-off. "
+                f"the state at t = {time:.8g} cannot be projected on its rows ({', '.join(r.name for r in rows)}): "
+                f"what is left is {least:.3g} times their round-off. "
                 "Ask for a smaller rtol, or check that the rows have a solution",
-                residual=float(left) * EPSILON,
+                residual=least * EPSILON,
                 tolerance=ACCEPTED * EPSILON,
                 iterations=MOST_ITERATIONS,
             )
-        return projected
+        return best
 
-    def try_project(self, time: float | FloatArray, log_x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`project` without raising: the state, and what is left in units of the round-off of the rows."""
-        rows = [row for row in self.rows if row.holonomic]
-        lanes = log_x.shape[1:]
-        if not rows:
-            return log_x, np.zeros(lanes)
-        best = np.array(log_x)
-        p = Populations.from_logarithms(time, best)
-        values, best_left = _misses(rows, p, lanes)
-        if not lanes:
-            return self._iterate(p, values, best, best_left)
-        # Most are there at once, or after one step: the others go on by themselves.
-        open_ = np.flatnonzero(~(best_left <= ROUND_OFF))
-        if len(open_):
-            part = self.take(open_)
-            times = np.broadcast_to(np.asarray(time, dtype=np.float64), lanes)[open_]
-            p = Populations.from_logarithms(times, best[:, open_])
-            found, left = part._iterate(p, [np.asarray(v)[open_] for v in values], best[:, open_], best_left[open_])
-            best[:, open_], best_left[open_] = found, left
-        return best, best_left
+    # -- what systems of some kinds know about their motion -------------------------------------------
 
-    def _iterate(
-        self, p: Populations, values: list[FloatArray], best: FloatArray, best_left: FloatArray, iteration: int = 0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Newton's iteration from `p` with the row values `values`; the best state on the way and what is left."""
-        rows = [row for row in self.rows if row.holonomic]
-        lanes = best.shape[1:]
-        while iteration < MOST_ITERATIONS:
-            change = orthogonal_rows.solve(
-                p.x, [r.gradient(p) for r in rows], [-v for v in values], np.zeros_like(p.x)
-            ).z
-            # Populations change by no more than a factor e at once: Newton's steps are for small corrections.
-            with np.errstate(all="ignore"):
-                largest = np.max(np.abs(change) * (p.x > 0), axis=0)
-                change = np.where(np.isfinite(change), change / np.maximum(largest, 1.0), 0.0)
-            p = Populations.from_logarithms(p.time, p.log_x + change)
-            values, left = _misses(rows, p, lanes)
-            better = left < best_left
-            best = np.where(better, p.log_x, best)
-            best_left = np.where(better, left, best_left)
-            there = best_left <= (ROUND_OFF if iteration < STALLED else ACCEPTED)
-            iteration += 1
-            if np.all(there):
-                break
-            if np.count_nonzero(there) > WORTH_PARTING * there.size:
-                late = np.flatnonzero(~there)
-                p = Populations(np.asarray(p.time)[late], p.x[:, late], p.log_x[:, late])
-                best[:, late], best_left[late] = self.take(late)._iterate(
-                    p, [v[late] for v in values], best[:, late], best_left[late], iteration
-                )
-                break
-        return best, best_left
-
-    def past_instants(self, time: float | FloatArray, log_x: FloatArray) -> FloatArray:
+    def past_instant(self, time: float, log_x: FloatArray) -> FloatArray:
         """The state beyond what happens in less time than numbers can tell; the same state where nothing does."""
         return log_x
 
-    def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[FloatArray], FloatArray] | None:
+    def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
         """How the motion goes on without integration, once nothing but the rows decides about it; None before.
 
-        Returns a function of times, shape (k,), to ln x, shape (n, k).
+        Returns ln x, shape (n,), as a function of time.
         """
         return None
 
-    def settled_lanes(self, time: FloatArray, log_x: FloatArray, tolerance: float) -> NDArray[np.bool_]:
-        """Which of N systems have settled, see `settled`; those then go on as `slow_state` says."""
-        return np.zeros(log_x.shape[1:], dtype=bool)
 
-    def arrived_lanes(self, time: FloatArray, log_x: FloatArray) -> NDArray[np.bool_]:
-        """Which of N systems are at rest but for what is beyond round-off; those go on as `rest_state` says."""
-        return np.zeros(log_x.shape[1:], dtype=bool)
-
-    def rest_state(self, time: FloatArray, log_x: FloatArray, later: FloatArray) -> FloatArray:
-        """ln x, shape (n, N), at times `later`, shape (N,), of systems that have arrived in log_x at `time`."""
-        raise NotImplementedError("a system that does not come to rest")
-
-    def slow_state(self, time: ArrayLike, accuracy: float = 0.0) -> FloatArray:
-        """ln x of a settled system, shape (n, k), at times of shape (k,)."""
-        raise NotImplementedError("a system without a slow motion of its own")
+# -- trajectories ------------------------------------------------------------------------------------
 
 
-def _misses(rows: Sequence[Row], p: Populations, lanes: tuple[int, ...]) -> tuple[list[FloatArray], FloatArray]:
-    """Values of the rows, and the largest of them in units of their round-off."""
-    values = [np.broadcast_to(row.value(p), lanes) for row in rows]
-    with np.errstate(all="ignore"):
-        sizes = [np.maximum(row.size(p), np.finfo(np.float64).tiny) for row in rows]
-        left = np.max([np.abs(v) / (EPSILON * s) for v, s in zip(values, sizes, strict=True)], axis=0)
-    return values, np.where(np.isfinite(left), left, np.inf)
+class GrowthInterpolant:
+    """x at any time of a solution; on the constraints everywhere."""
+
+    def __init__(self, logarithms: Callable[[ArrayLike], FloatArray]) -> None:
+        #: ln x, shape (n,) for one time, (n, k) for k.
+        self.logarithms = logarithms
+
+    def __call__(self, t: ArrayLike) -> FloatArray:
+        """x, shape (n,) for one time, (n, k) for k."""
+        with np.errstate(under="ignore"):
+            return np.exp(self.logarithms(t))
 
 
-def check_lanes(system: ConstrainedGrowth, lanes: tuple[int, ...]) -> None:
-    """Refuse parameters that are for another number of systems than there are, () for a single one.
+class GrowthSolution(OptimizeResult):
+    """What `solve` returns: all that SciPy's ``solve_ivp`` returns, and more.
+
+    Attributes
+    ----------
+    y, log_y : ndarray, shape (n, k)
+        Populations x, 0 where they are below the smallest number of the machine, and ln x, always finite.
+    sol : GrowthInterpolant or None
+    settled_time : float or None
+        When nothing but the rows was left to decide about the motion (equilibrium, for a hypercycle that produces
+        entropy); from there on the solution comes from the rows alone.
+    system : ConstrainedGrowth
+        The system with the targets that the start gave.
+    """
+
+    def residuals(self) -> FloatArray:
+        """sigma - sigma0 of the holonomic rows at all times, shape (m_h, k)."""
+        states = [Populations.from_logarithms(float(t), y) for t, y in zip(self.t, self.log_y.T, strict=True)]
+        return np.array([self.system.residuals(p) for p in states]).T
+
+
+def solve(
+    system: ConstrainedGrowth,
+    t_span: Sequence[float],
+    x0: ArrayLike | None = None,
+    method: str = "DOP853",
+    t_eval: ArrayLike | None = None,
+    dense_output: bool = False,
+    events: Event | Sequence[Event] | None = None,
+    *,
+    log_x0: ArrayLike | None = None,
+    **options: Any,
+) -> GrowthSolution:
+    """Integrate a constrained growth model; arguments as in SciPy's ``solve_ivp``.
+
+    Parameters
+    ----------
+    system : ConstrainedGrowth
+    t_span : pair of float
+    x0 : array_like, shape (n,)
+        Start, on the constraints.
+    method : str
+        'RK23', 'RK45', 'DOP853', 'Radau' or 'BDF'.
+    t_eval, dense_output, events
+        As in ``solve_ivp``; events are functions (t, x), with attributes `terminal` and `direction`.
+    log_x0 : array_like, shape (n,), optional
+        Start as logarithms, in place of x0.
+    options
+        rtol (by default 1e-9) and atol (1e-11) of ln x, so that atol is a relative error of x; max_step, first_step,
+        jac and what else the method takes.
 
     Raises
     ------
-    InputError
+    ConstraintError, BudgetError
+        A start off the constraints, or a prescription that cannot be met from it.
+    ContradictionError, SingularGeometryError
+        Rows that contradict each other, at the start or where their rank is lost on the way.
+    NonFiniteError
+        Rates, sources or rows that are not finite where the run has come to.
     """
-    found = [(system.model.lanes, "the model"), *((row.lanes, f"row {row.name}") for row in system.rows)]
-    for own, name in found:
-        if own not in ((), lanes):
-            raise InputError(
-                f"parameters of {name} are for {own[0]} systems side by side, "
-                f"the start is {f'of {lanes[0]}' if lanes else 'a single one'}: give one number for all, or as "
-                "many as there are starts in solve_ensemble",
-                item="x0",
-            )
+    options = {"rtol": 1e-9, "atol": 1e-11} | {name: value for name, value in options.items() if value is not None}
+    solver, span, times = check_run(t_span, t_eval, method, options, system.n)
+    options |= {name: numbers(options[name], name) for name in ("rtol", "atol")}
+    tolerance = max(float(np.min(options["rtol"] + options["atol"])), 1e-13)
+    p0 = Populations.start(span[0], system.n, x0, log_x0)
+    bound = system.bind(p0)
+    seen = {"end": p0}
+
+    def slope(t: float, y: FloatArray) -> FloatArray:
+        return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
+
+    def placed(t: float, y: FloatArray) -> FloatArray:
+        p = Populations.from_logarithms(t, bound.past_instant(t, bound.project(t, y)))
+        if abs(t - span[0]) >= abs(seen["end"].time - span[0]):
+            seen["end"] = p
+        return p.log_x
+
+    def settled(t: float, y: FloatArray) -> Callable[[float], FloatArray] | None:
+        motion = bound.settled(t, y, tolerance)
+        if motion is not None:
+            seen["settled"] = Populations.from_logarithms(t, y)
+        return motion
+
+    options |= {"t_eval": times, "dense_output": dense_output, "events": _of_logarithms(events)}
+    with np.errstate(all="ignore"):  # ln x may be -1e300, and trial steps go too far
+        found = integrate(slope, span, placed(span[0], p0.log_x), solver, placed, settled, **options)
+        for row in bound.rows:  # derivatives of what depends on time may be wrong later only
+            row.check_derivatives(seen["end"])
+        log_y = np.reshape(found.y, (system.n, -1))  # a list where the run ended before the first time wanted
+        more = {
+            "t": np.asarray(found.t),
+            "y": np.exp(log_y),
+            "log_y": log_y,
+            "sol": None if found.sol is None else GrowthInterpolant(found.sol),
+            "y_events": None if found.y_events is None else [np.exp(y) for y in found.y_events],
+            "settled_time": seen["settled"].time if "settled" in seen else None,
+            "system": bound,
+        }
+    return GrowthSolution(dict(found) | more)
 
 
-def _refuse_mixed(system: ConstrainedGrowth, p: Populations) -> None:
-    """Refuse vectorized functions that give another result for the last of N systems when it is alone."""
-    last = np.array([p.x.shape[1] - 1])
-    alone, q = system.take(last), Populations(np.asarray(p.time)[last], p.x[:, last], p.log_x[:, last])
-    pairs = [("the rates", system.model.rates(p), alone.model.rates(q))]
-    if system.model.sources(p) is not None:
-        pairs.append(("the sources", np.asarray(system.model.sources(p)), np.asarray(alone.model.sources(q))))
-    for row, own in zip(system.rows, alone.rows, strict=True):
-        pairs.append((f"the coefficients of {row.name}", row.gradient(p), own.gradient(q)))
-        for what, both in (("rate", (row.rate(p), own.rate(q))), ("value", _values(row, p, own, q))):
-            whole, part = (np.broadcast_to(b, s.x.shape[1:]) for b, s in zip(both, (p, q), strict=True))
-            pairs.append((f"the {what} of {row.name}", whole, part))
-    for what, whole, part in pairs:
-        size = np.max(np.abs(part), initial=np.finfo(np.float64).tiny)
-        if np.any(np.abs(whole[..., -1] - part[..., 0]) > 1e-6 * size):
-            raise InputError(
-                f"{what}: of several systems side by side, the last has another value than alone. A vectorized "
-                "function takes x of shape (n, N): sum over axis 0, and nothing over systems",
-                item="vectorized",
-            )
+def _of_logarithms(events: Event | Sequence[Event] | None) -> list[Event] | None:
+    """The events as functions of ln x, their attributes kept."""
+    if events is None:
+        return None
+    wrapped: list[Event] = []
+    for event in list(events) if isinstance(events, Iterable) else [events]:
+        check_call("event", event, ("t", "x"))
+
+        def of_logarithms(t: float, y: FloatArray, event: Event = event) -> float:
+            value = numbers(event(t, np.exp(y)), "event")
+            if value.size != 1:
+                raise InputError(f"an event returned shape {value.shape}; it must return a number", item="event")
+            return float(value.item())
+
+        for name in ("terminal", "direction"):
+            if hasattr(event, name):
+                setattr(of_logarithms, name, getattr(event, name))
+        wrapped.append(of_logarithms)
+    return wrapped
 
 
-def _values(row: Row, p: Populations, own: Row, q: Populations) -> tuple[FloatArray | float, FloatArray | float]:
-    """Of one row in two ways, plus 1 lest rounding at 0 be compared; the same number where it has none."""
-    return (row.value(p) / row.size(p) + 1.0, own.value(q) / own.size(q) + 1.0) if row.holonomic else (1.0, 1.0)
+class EntropyBalance(NamedTuple):
+    """Three ways to the entropy, times T, that a solution has produced, and where it went (notes eq. 145).
+
+    `reactions` and `exchanged` are the parts of `integrated`: of what the model does by itself, Psi + G phi, and what
+    the constraints add to it, G z. In an open system (eq. 150) these are the entropy produced inside and the one
+    exchanged with the outside; in a closed one (eq. 149) nothing is exchanged, and their sum is produced inside.
+    """
+
+    #: g(x_0) - g(x(t)), from the two ends alone.
+    lost: float
+    #: The integral of -sum mu dx/dt along the solution.
+    integrated: float
+    #: What the law says.
+    prescribed: float
+    reactions: float
+    exchanged: float
 
 
-def _rows_in(given: Sequence[Row] | Row, n: int) -> tuple[Row, ...]:
-    """The rows for n species."""
-    refuse_other(given, (Row, Iterable), "rows", "rows of kcons.models.growth, or an empty list")
-    rows = (given,) if isinstance(given, Row) else tuple(given)
-    for row in rows:
-        refuse_other(row, Row, "rows", "rows of kcons.models.growth, such as TotalPopulation(n)")
-    if len(rows) > n:
-        raise ConstraintError(
-            f"{len(rows)} rows for {n} species: give at most as many rows as there are species",
-            rows=range(n, len(rows)),
+def entropy_balance(solution: GrowthSolution, nodes: int = 8) -> EntropyBalance:
+    """Whether the entropy produced is the integral of its prescribed rate.
+
+    Parameters
+    ----------
+    solution : GrowthSolution
+        Of a system with an `EntropyRow`, with dense_output=True.
+    nodes : int
+        Gauss points between two times of the solution.
+    """
+    system = solution.system
+    row = next((r for r in system.rows if isinstance(r, EntropyRow)), None)
+    if row is None:
+        raise InputError("the system of this solution has no row of entropy production", item="solution")
+    if solution.sol is None:
+        raise InputError(
+            "the integral needs the solution between its times: solve(..., dense_output=True)", item="solution"
         )
-    return rows
-
-
-def _refuse_not_finite(z: FloatArray, rows: Sequence[Row], p: Populations) -> None:
-    """Raise where z is not finite, for the first row of which a number is not."""
-    if np.all(np.isfinite(z)):
-        return
-    for number, row in enumerate(rows):
-        if not (np.all(np.isfinite(row.gradient(p))) and np.all(np.isfinite(row.rate(p)))):
-            raise NonFiniteError(
-                f"row {number} ({row.name}) has a coefficient or a rate that is not finite at "
-                f"t = {float(np.max(p.time)):.8g}; mend its functions, or end the run before (an event)",
-                item="rows",
-            )
+    points, weights = np.polynomial.legendre.leggauss(nodes)
+    integrated = reactions = 0.0
+    for a, b in pairwise(solution.t):
+        times = 0.5 * (a + b) + 0.5 * (b - a) * points
+        for t, weight, log_x in zip(times, weights, solution.sol.logarithms(times).T, strict=True):
+            p = Populations.from_logarithms(float(t), log_x)
+            fall = -0.5 * (b - a) * weight * row.mixture.potentials(p)
+            integrated += float(np.sum(fall * p.x * system.logarithmic_velocity(p)))
+            reactions += float(np.sum(fall * system.model.drift(p)))
+    ends = [Populations.from_logarithms(float(solution.t[k]), solution.log_y[:, k]) for k in (0, -1)]
+    lost = float(row.mixture.excess(ends[0], row.total) - row.mixture.excess(ends[1], row.total))
+    prescribed = row.excess0 - row.law_excess(float(solution.t[-1]))
+    return EntropyBalance(lost, integrated, prescribed, reactions, integrated - reactions)

@@ -1,102 +1,79 @@
-"""Growth models: populations that multiply, and are fed.
+"""Growth models and the thermodynamics of their species (notes section 3, eqs. 146, 147).
 
     dx/dt = Psi(x) + G(x) phi(x),   G = diag(x),   Psi >= 0                          (notes eqs. 62, 124, 125)
 
 phi are the relative rates of growth and Psi the sources. Where Psi = 0 the equation of ln x is d ln x/dt = phi(x):
 it cannot make a population negative, and it goes on where x itself is below the smallest number of the machine.
-For this reason every function here is handed `Populations`, which hold both x and ln x.
+For this reason mixtures and rows are handed `Populations`, which hold both x and ln x.
 """
 
 from __future__ import annotations
 
-import copy
+import math
 from collections.abc import Callable
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.special import log_softmax, logsumexp
 
-from kcons.constraints.arguments import check_call, lent, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, check_call, finite_number, numbers, positive, whole_number
 from kcons.errors import InputError, NonFiniteError
+from kcons.models.integration import called
 
-FloatArray = NDArray[np.float64]
-T = TypeVar("T")
+#: Below this |ln x/x_eq| the excess of a species is summed as a power series.
+NEAR = 0.2
 #: A function of time and populations, arguments in SciPy's order.
 OfState = Callable[[float, FloatArray], ArrayLike]
 
 
 class Populations(NamedTuple):
-    """The state of one system, arrays of shape (n,), or of N systems side by side, (n, N).
+    """A state: time, populations x, shape (n,), and their logarithms; of several states, shape (n, k).
 
-    Attributes
-    ----------
-    time : float or ndarray, shape (N,)
-    x : ndarray
-        Populations; may be 0 where ln x is below -745.
-    log_x : ndarray
-        Their logarithms, always finite.
+    Where ln x is below -745, x is 0; ln x is always finite.
     """
 
-    time: float | FloatArray
+    time: float
     x: FloatArray
     log_x: FloatArray
 
     @classmethod
-    def from_logarithms(cls, time: float | FloatArray, log_x: FloatArray) -> Self:
+    def from_logarithms(cls, time: float, log_x: FloatArray) -> Self:
         # A trial step of an integrator may overflow; it is then rejected.
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             return cls(time, np.exp(log_x), log_x)
 
     @classmethod
-    def from_values(cls, time: float | FloatArray, x: ArrayLike) -> Self:
-        """Populations from x.
+    def from_values(cls, time: float, x: ArrayLike) -> Self:
+        """Populations from x."""
+        array = numbers(x, "x0").copy()
+        if array.ndim not in (1, 2) or array.size == 0:
+            raise InputError(f"populations have shape (n,) or (n, k), not {array.shape}", item="x0")
+        for bad, said in (
+            (~np.isfinite(array), "is not finite: {}"),
+            (array < 0, "is negative: {}. Populations are positive"),
+            (
+                array == 0,
+                "is zero and has no logarithm: leave that species out, start it at a small positive number, or give "
+                "the start as log_x0",
+            ),
+        ):
+            if bad.any():
+                species = int(np.argwhere(bad)[0][0])
+                raise InputError(f"population {species} " + said.format(f"{array[bad][0]:.6g}"), item="x0")
+        return cls(time, array, np.log(array))
 
-        Raises
-        ------
-        InputError
-            If a population is negative, zero or not finite.
-        """
-        x = positive_populations(x)
-        return cls(time, x, np.log(x))
-
-
-def positive_populations(x: ArrayLike) -> FloatArray:
-    """x as an array, refused if a population is negative, zero or not finite."""
-    array = numbers(x, "x0").copy()
-    if array.ndim not in (1, 2) or array.size == 0:
-        raise InputError(f"populations have shape (n,) or (n, N), not {array.shape}", item="x0")
-    if not np.all(np.isfinite(array)):
-        raise InputError(f"population {_first(~np.isfinite(array))} is not finite", item="x0")
-    if np.any(array < 0):
-        raise InputError(
-            f"population {_first(array < 0)} is negative: {array[array < 0][0]:.6g}. Populations are positive",
-            item="x0",
-        )
-    if np.any(array == 0):
-        raise InputError(
-            f"population {_first(array == 0)} is zero and has no logarithm: leave that species out, start it at a "
-            "small positive number, or give the start as log_x0",
-            item="x0",
-        )
-    return array
-
-
-def starting_logarithms(x0: ArrayLike | None, log_x0: ArrayLike | None) -> FloatArray:
-    """ln x of a start that is given as populations or as their logarithms.
-
-    Raises
-    ------
-    InputError
-        Both or none; populations that are negative, zero or not finite; logarithms that are not finite.
-    """
-    if (x0 is None) == (log_x0 is None):
-        raise InputError("give the start either as x0 or as log_x0", item="x0")
-    if x0 is not None:
-        return np.log(positive_populations(x0))
-    start = numbers(log_x0, "log_x0").copy()
-    if not np.all(np.isfinite(start)):
-        raise InputError("log_x0 is not finite", item="log_x0")
-    return start
+    @classmethod
+    def start(cls, time: float, n: int, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
+        """The start of a run with n species, given as populations or as their logarithms."""
+        if (x0 is None) == (log_x0 is None):
+            raise InputError("give the start either as x0 or as log_x0", item="x0")
+        p = cls.from_logarithms(time, numbers(log_x0, "log_x0").copy()) if x0 is None else cls.from_values(time, x0)
+        if p.log_x.shape != (n,):
+            raise InputError(f"the start has shape {p.log_x.shape}, not ({n},)", item="x0")
+        if not np.all(np.isfinite(p.log_x)):
+            raise InputError("log_x0 is not finite", item="log_x0")
+        return p
 
 
 class GrowthModel:
@@ -110,32 +87,21 @@ class GrowthModel:
         Psi >= 0; left out, Psi = 0.
     n : int
         Number of species.
-    vectorized : bool
-        Whether both functions take x of shape (n, N) with times of shape (N,), as in ``solve_ivp``.
-
-    Raises
-    ------
-    InputError
-        `n` is no whole number from 1 on; functions of other arguments.
     """
 
-    #: Shape of parameters that differ from system to system, (N,); () where none do.
-    lanes: tuple[int, ...] = ()
-
-    def __init__(self, rates: OfState, sources: OfState | None = None, *, n: int, vectorized: bool = False) -> None:
+    def __init__(self, rates: OfState, sources: OfState | None = None, *, n: int) -> None:
         self.n = whole_number(n, "n")
         check_call("rates", rates, ("t", "x"))
         check_call("sources", sources, ("t", "x"))
         self._rates = rates
         self._sources = sources
-        self.vectorized = vectorized
 
     def rates(self, p: Populations) -> FloatArray:
-        """phi, shape of p.x (notes eq. 62)."""
-        return evaluate(self._rates, p, self.n, self.vectorized, "the rates")
+        """phi, shape (n,) (notes eq. 62)."""
+        return called("rates", self._rates, (self.n,), p.time, p.x, scalar=True)
 
     def sources(self, p: Populations) -> FloatArray | None:
-        """Psi, shape of p.x, or None where there are none.
+        """Psi, shape (n,), or None where there are none.
 
         Raises
         ------
@@ -144,11 +110,11 @@ class GrowthModel:
         """
         if self._sources is None:
             return None
-        psi = evaluate(self._sources, p, self.n, self.vectorized, "the sources")
+        psi = called("sources", self._sources, (self.n,), p.time, p.x, scalar=True)
         if np.any(psi < 0):
             raise NonFiniteError(
-                f"source {_first(psi < 0)} is negative ({psi[psi < 0][0]:.6g}): write losses as rates, proportional to "
-                "the population that is lost",
+                f"source {int(np.argmax(psi < 0))} is negative ({psi[psi < 0][0]:.6g}): write losses as rates, "
+                "proportional to the population that is lost",
                 item="sources",
             )
         return psi
@@ -157,7 +123,7 @@ class GrowthModel:
         """'rate' or 'source', and the first species of which it is not finite; None if all are."""
         for what, values in (("rate", self.rates(p)), ("source", self.sources(p))):
             if values is not None and not np.all(np.isfinite(values)):
-                return what, int(np.argwhere(~np.isfinite(values))[0][0])
+                return what, int(np.argmin(np.isfinite(values)))
         return None
 
     def drift(self, p: Populations) -> FloatArray:
@@ -167,61 +133,197 @@ class GrowthModel:
         return growth if psi is None else growth + psi
 
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:
-        """dx/dt without constraints, for any x (negative ones included): the field of a phase portrait."""
+        """dx/dt without constraints, for any x (negative ones included), shape (n,) or (n, k): the field of a phase
+        portrait."""
         x = numbers(x, "x")
+        if x.ndim == 2:
+            return np.stack([self.velocity(t, column) for column in x.T], axis=1)
         return self.drift(Populations(t, x, np.full_like(x, np.nan)))
 
-    def take(self, lanes: NDArray[np.intp]) -> GrowthModel:
-        """The model of some of N systems side by side; itself where parameters are common to all."""
-        return self
+
+class Logistic(GrowthModel):
+    """dx/dt = alpha x - beta x^2 (notes eq. 65)."""
+
+    def __init__(self, alpha: float = 1.0, beta: float = 0.1) -> None:
+        self.alpha, self.beta = positive(alpha, "alpha"), positive(beta, "beta")
+        super().__init__(lambda t, x: self.alpha - self.beta * x, n=1)
+
+    @property
+    def plateau(self) -> float:
+        """alpha/beta, the limit of every solution (notes eqs. 67, 68)."""
+        return self.alpha / self.beta
+
+    def exact(self, t: ArrayLike, x0: float) -> FloatArray:
+        """x(t) (notes eq. 66), written so that no exponential overflows."""
+        exponent, x0 = -self.alpha * numbers(t, "t"), finite_number(x0, "x0")
+        if x0 < 0:
+            raise InputError(f"x0 is {x0:g}; populations are not negative", item="x0")
+        if x0 > self.plateau and np.any(exponent >= -np.log1p(-self.plateau / x0)):
+            since = np.log1p(-self.plateau / x0) / self.alpha
+            raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
+        # Either way with exponentials of what is not positive.
+        up, down = np.exp(np.minimum(exponent, 0.0)), np.exp(-np.maximum(exponent, 0.0))
+        fed = self.beta * x0 * np.expm1(-np.abs(exponent))
+        return np.asarray(self.alpha * x0 * down / (self.alpha * up - np.where(exponent > 0, -fed, fed)))
+
+    def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
+        """dV/dx, shape (1, 1)."""
+        return np.asarray([[self.alpha - 2.0 * self.beta * numbers(x, "x")[0]]])
 
 
-def common_lanes(**shapes: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape of parameters side by side, each of which is () or (N,).
+class LotkaVolterra(GrowthModel):
+    """Prey x_1 and predators x_2 (notes eqs. 69, 70).
 
-    Raises
-    ------
-    InputError
-        They are for different numbers of systems.
+    dx_1/dt = x_1 (alpha_1 - beta_1 x_2),     dx_2/dt = -x_2 (beta_2 - alpha_2 x_1)
     """
-    own = {shape for shape in shapes.values() if shape}
-    if len(own) > 1:
-        raise InputError(
-            f"{' and '.join(shapes)} are for different numbers of systems: "
-            f"{', '.join(str(shape[0]) for shape in shapes.values() if shape)}",
-            item=next(iter(shapes)),
+
+    def __init__(self, alpha1: float = 1.0, beta1: float = 1.0, alpha2: float = 1.0, beta2: float = 2.0) -> None:
+        self.alpha1, self.beta1 = positive(alpha1, "alpha1"), positive(beta1, "beta1")
+        self.alpha2, self.beta2 = positive(alpha2, "alpha2"), positive(beta2, "beta2")
+        super().__init__(lambda t, x: [self.alpha1 - self.beta1 * x[1], self.alpha2 * x[0] - self.beta2], n=2)
+
+    @property
+    def equilibrium(self) -> FloatArray:
+        """(beta_2/alpha_2, alpha_1/beta_1) (notes eq. 74)."""
+        return np.array([self.beta2 / self.alpha2, self.alpha1 / self.beta1])
+
+    def invariant(self, x: ArrayLike) -> FloatArray:
+        """G, constant along every solution (notes eq. 73); x of shape (2,) or (2, k)."""
+        x = numbers(x, "x")
+        prey, predators = x[0] / self.equilibrium[0], x[1] / self.equilibrium[1]
+        return np.asarray(self.alpha1 * (predators - np.log(predators)) + self.beta2 * (prey - np.log(prey)))
+
+    def invariant_gradient(self, x: ArrayLike) -> FloatArray:
+        """dG/dx, shape of x."""
+        x = numbers(x, "x")
+        return np.stack([self.alpha2 - self.beta2 / x[0], self.beta1 - self.alpha1 / x[1]])
+
+    def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
+        """dV/dx, shape (2, 2) (notes eq. 75)."""
+        x1, x2 = numbers(x, "x")
+        return np.array(
+            [[self.alpha1 - self.beta1 * x2, -self.beta1 * x1], [self.alpha2 * x2, self.alpha2 * x1 - self.beta2]]
         )
-    return own.pop() if own else ()
+
+    def divergence(self, x: ArrayLike) -> FloatArray:
+        """div V = (alpha_1 - beta_1 x_2) - (beta_2 - alpha_2 x_1) (notes eq. 72)."""
+        x = numbers(x, "x")
+        return np.asarray((self.alpha1 - self.beta1 * x[1]) - (self.beta2 - self.alpha2 * x[0]))
 
 
-def taken(item: T, lanes: NDArray[np.intp], *names: str) -> T:
-    """A copy of which arrays of one entry a system, in their last axis, hold some of the systems only."""
-    part = copy.copy(item)
-    for name in names:
-        values = getattr(item, name)
-        if np.ndim(values):
-            setattr(part, name, np.asarray(values)[..., lanes])
-    return part
+# -- ideal mixtures -----------------------------------------------------------------------------------
 
 
-def evaluate(function: OfState, p: Populations, n: int, vectorized: bool, what: str) -> FloatArray:
-    """A user's function at one state or, column by column, at many."""
-    if p.x.ndim == 1 or vectorized:
-        value = numbers(function(p.time, lent(p.x)), what)  # type: ignore[arg-type]
-    else:
-        times = np.broadcast_to(p.time, p.x.shape[1:])
-        value = np.stack(
-            [numbers(function(float(t), lent(x)), what) for t, x in zip(times, p.x.T, strict=True)], axis=-1
-        )
-    shape = p.x.shape if n else p.x.shape[1:]
-    if value.shape != shape:
-        try:
-            value = np.broadcast_to(value, shape)
-        except ValueError:
-            raise InputError(f"{what}: the function returned shape {value.shape}, not {shape}", item=what) from None
-    return value
+class Mixture:
+    """An ideal mixture of n species.
+
+        mu_i = mu0_i + kT ln(x_i / sum x)   (notes eq. 147),      g = sum_i x_i mu_i,      dg = sum_i mu_i dx_i
+
+    The last equation holds exactly (Gibbs-Duhem). With sum x = c kept, g has its minimum g_eq at
+    x_eq,i = c exp(-mu0_i/kT)/W, W = sum exp(-mu0_i/kT), where all mu are equal. T ds = -dg in a closed system at
+    constant T, so that T(s_eq - s_0) = g(x_0) - g_eq is the only budget of entropy that ends at equilibrium.
+
+    Parameters
+    ----------
+    mu0 : array_like, shape (n,)
+        Standard chemical potentials; a shift common to all of them changes nothing where sum x is kept.
+    kT : float
+    """
+
+    def __init__(self, mu0: ArrayLike, kT: float = 1.0) -> None:
+        self.mu0: FloatArray = numbers(mu0, "mu0").copy()
+        self.kT = positive(kT, "kT")
+        if self.mu0.ndim != 1 or not self.mu0.size or not np.all(np.isfinite(self.mu0)):
+            raise InputError("mu0 has shape (n,) and is finite", item="mu0")
+        #: ln(x_eq/c), and the Gibbs energy at equilibrium over -c kT.
+        self._log_fraction: FloatArray = log_softmax(-self.mu0 / self.kT)
+        self._log_w = float(logsumexp(-self.mu0 / self.kT))
+
+    @property
+    def n(self) -> int:
+        return len(self.mu0)
+
+    def potentials(self, p: Populations) -> FloatArray:
+        """mu, shape of p.x (notes eq. 147); from ln x, hence finite where x underflows."""
+        return (self.mu0 + (self.kT * (p.log_x - np.log(np.sum(p.x, axis=0)))).T).T
+
+    def relative_potentials(self, p: Populations) -> FloatArray:
+        """mu less that of the largest population, shape (n,).
+
+        Exact where differences are all that is left: next to equilibrium, where all mu are equal, and where one species
+        is nearly alone.
+        """
+        u = p.log_x - self._log_fraction
+        return np.asarray(self.kT * (u - u[np.argmax(p.x)]))
+
+    def gibbs_energy(self, p: Populations) -> FloatArray:
+        """g = sum x mu, a number a state."""
+        return np.asarray(np.sum(p.x * self.potentials(p), axis=0))
+
+    def moments(self, p: Populations) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """M_0, M_1, M_2 with M_q = sum mu^q x (notes eq. 152)."""
+        mu = self.potentials(p)
+        return np.asarray(np.sum(p.x, axis=0)), np.sum(p.x * mu, axis=0), np.sum(p.x * mu * mu, axis=0)
+
+    def equilibrium(self, total: float = 1.0) -> FloatArray:
+        """ln x_eq for sum x = total, shape (n,)."""
+        return np.asarray(self._log_fraction + np.log(total))
+
+    def least_gibbs_energy(self, total: float = 1.0) -> float:
+        """g_eq = -c kT ln sum exp(-mu0/kT)."""
+        return -total * self.kT * self._log_w
+
+    def largest_gibbs_energy(self, total: float = 1.0) -> float:
+        """c max mu0: g is convex, so that its largest values are where one species is alone."""
+        return total * float(np.max(self.mu0))
+
+    def excess(self, p: Populations, total: float) -> FloatArray:
+        """g - g_eq as a sum of terms that are never negative, so that nothing cancels near equilibrium; a number a
+        state.
+
+        g_eq is taken at the actual sum X of the populations, near `total`:
+        kT [sum x_eq h(ln x/x_eq) - c h(ln X/c)] with h(u) = u e^u - e^u + 1 and x_eq, c for `total`.
+        """
+        log_eq = self.equilibrium(total)
+        terms = np.exp(log_eq) @ entropy_function((p.log_x.T - log_eq).T)
+        over = np.log1p((np.sum(p.x, axis=0) - total) / total)
+        return np.asarray(self.kT * (terms - total * entropy_function(over)))
+
+    def excess_over(self, p: Populations, total: float, level: float) -> float:
+        """`excess` less `level`, to the round-off of the potentials about their mean.
+
+        Far from equilibrium the excess is many times as large as what the populations differ in, and so is its
+        round-off. The part of each population in `level` is therefore taken from its own term: with a = level/(c kT)
+        kT [sum (x_eq h(ln x/x_eq) - a x) - c h(ln X/c) + a (X - c)],  with ln x/x_eq and X - c to twice the precision.
+        """
+        log_eq = self.equilibrium(total)
+        a = level / (total * self.kT)
+        # A trial step of an integrator may overflow; it is then rejected.
+        with np.errstate(all="ignore"):
+            u = p.log_x - log_eq
+            part = u - p.log_x
+            rest = (p.log_x - (u - part)) - (log_eq + part)  # what rounding took from u (Knuth)
+            terms = p.x * ((u - a) + rest) - (p.x - np.exp(log_eq))
+            near = np.abs(u) < NEAR
+            terms = np.where(near, np.exp(log_eq) * _series(np.where(near, u + rest, 0.0)) - a * p.x, terms)
+            if not (np.all(np.isfinite(terms)) and np.all(np.isfinite(p.x))):
+                return math.nan
+            more = math.fsum([*p.x, -total])
+            over = float(entropy_function(np.log1p(more / total)))
+            return self.kT * math.fsum([*terms, -total * over, a * more])
 
 
-def _first(where: NDArray[np.bool_]) -> str:
-    index = np.argwhere(where)[0]
-    return str(index[0]) if len(index) == 1 else f"{index[0]} of system {index[1]}"
+def entropy_function(u: ArrayLike) -> FloatArray:
+    """h(u) = u e^u - e^u + 1, which is 0 with zero slope at u = 0 and positive elsewhere, to full relative accuracy."""
+    u = np.asarray(u, dtype=np.float64)
+    near = np.abs(u) < NEAR
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        return np.where(near, _series(np.where(near, u, 0.0)), u * np.exp(u) - np.expm1(u))
+
+
+def _series(u: FloatArray) -> FloatArray:
+    """u^2/2 + u^3/3 + u^4/8 + ...: the sum over k >= 2 of (k - 1) u^k/k!."""
+    return np.asarray(np.polyval(_COEFFICIENTS, u) * u * u)
+
+
+_COEFFICIENTS = [(k - 1) / math.factorial(k) for k in range(14, 1, -1)]

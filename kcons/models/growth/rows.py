@@ -3,26 +3,40 @@
 A row asks  sum_j A_j(x, t) dx_j/dt = b(x, t)  (notes eqs. 127, 128). Holonomic rows come from a function of the
 state that keeps its value, sigma(x, t) = sigma0 (eq. 126), so that A = d sigma/dx and b = -d sigma/dt (eqs. 129, 130);
 because they have a value, the state can be projected back on them to round-off.
+
+Entropy production is a row as well (eqs. 145-150). Closed system: T ds/dt = -sum mu dx/dt >= 0 (corrected: the notes
+drop the sign in the middle of (149)). A law says what has been produced until t, T(s(t) - s_0); with a fixed sum of x
+it is the same as a law for the excess E(t) = g(x) - g_eq, which falls from E_0 = T(s_eq - s_0). The row is
+sum mu dx/dt = dE/dt.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.integrate import quad
 
-from kcons.constraints.arguments import check_call, numbers, whole_number
+from kcons.constraints.arguments import (
+    FloatArray,
+    check_call,
+    finite_number,
+    numbers,
+    positive,
+    refuse_other,
+    whole_number,
+)
 from kcons.constraints.target import WRONG, contradicted, exact_step
-from kcons.errors import ConstraintError, InputError
-from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate, taken
+from kcons.errors import BudgetError, ConstraintError, InputError
+from kcons.models.growth.model import Mixture, OfState, Populations
+from kcons.models.integration import called, check_derivative, jacobian_by_differences
 
-#: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
-START_TOLERANCE = 1e-10
-EPSILON = float(np.finfo(np.float64).eps)
 #: Step of differences, in ln x; they serve where half of it changes them by no more than this part.
 STEP, SMOOTH = 0.005, 1e-6
 
@@ -33,22 +47,20 @@ class Row(ABC):
     #: Whether the row has a value that the state is projected on.
     holonomic: bool = False
     name: str = "row"
-    #: Shape of parameters that differ from system to system, (N,); () where none do.
-    lanes: tuple[int, ...] = ()
 
     @abstractmethod
     def gradient(self, p: Populations) -> FloatArray:
-        """The row of A, shape of p.x."""
+        """The row of A, shape (n,)."""
 
     @abstractmethod
-    def rate(self, p: Populations) -> FloatArray | float:
-        """b, a number a system."""
+    def rate(self, p: Populations) -> float:
+        """b."""
 
-    def value(self, p: Populations) -> FloatArray | float:
-        """sigma - sigma0, a number a system; 0 on the constraint."""
+    def value(self, p: Populations) -> float:
+        """sigma - sigma0, 0 on the constraint."""
         raise NotImplementedError(f"{self.name} has no value")
 
-    def size(self, p: Populations) -> FloatArray | float:
+    def size(self, p: Populations) -> float:
         """The size of the terms that `value` is the difference of: its round-off is some 1e-16 of this."""
         raise NotImplementedError(f"{self.name} has no value")
 
@@ -56,30 +68,8 @@ class Row(ABC):
         """The row that holds what it found at the start `p`."""
         return self
 
-    def take(self, lanes: NDArray[np.intp]) -> Row:
-        """The row of some of N systems side by side."""
-        return self
-
     def check_derivatives(self, p: Populations) -> None:
         """Refuse derivatives that differences contradict, if it has any."""
-
-    def check(self, p: Populations, number: int) -> None:
-        """Refuse a start that is off the row.
-
-        Raises
-        ------
-        ConstraintError
-            If the start does not lie on it.
-        """
-        if not self.holonomic:
-            return
-        off = np.max(np.abs(self.value(p)) / np.maximum(self.size(p), np.finfo(np.float64).tiny))
-        if not off <= START_TOLERANCE:
-            raise ConstraintError(
-                f"the start is off row {number} ({self.name}): relative deviation {off:.3g}. Start on it, or leave the "
-                "target out to keep the value found at the start",
-                rows=[number],
-            )
 
 
 class HolonomicRow(Row):
@@ -95,8 +85,6 @@ class HolonomicRow(Row):
         d sigma/dt at fixed x; left out, sigma does not depend on t.
     target : float, optional
         The value to be kept; left out, the one found at the start.
-    vectorized : bool
-        Whether the functions take x of shape (n, N) with times of shape (N,).
     """
 
     holonomic = True
@@ -108,40 +96,37 @@ class HolonomicRow(Row):
         time_derivative: OfState | None = None,
         *,
         target: float | None = None,
-        vectorized: bool = False,
         name: str = "holonomic row",
     ) -> None:
-        check_call(f"{name}: function", function, ("t", "x"))
-        check_call(f"{name}: gradient", gradient, ("t", "x"))
-        check_call(f"{name}: time_derivative", time_derivative, ("t", "x"))
+        for what, given in (("function", function), ("gradient", gradient), ("time_derivative", time_derivative)):
+            check_call(f"{name}: {what}", given, ("t", "x"))
         self._function = function
         self._gradient = gradient
         self._time_derivative = time_derivative
-        self.target: float | FloatArray | None = None if target is None else _number(target, "target")
-        self.vectorized = vectorized
+        self.target = None if target is None else finite_number(target, "target")
         self.name = name
 
-    def measure(self, p: Populations) -> FloatArray:
+    def measure(self, p: Populations) -> float:
         """sigma itself."""
-        return evaluate(self._function, p, 0, self.vectorized, self.name)
+        return float(called(self.name, self._function, (), p.time, p.x))
 
-    def value(self, p: Populations) -> FloatArray:
+    def value(self, p: Populations) -> float:
         if self.target is None:
             raise ConstraintError(f"{self.name} has no target yet: it is set by the start, see bind()")
         return self.measure(p) - self.target
 
-    def size(self, p: Populations) -> FloatArray:
-        return np.sum(np.abs(self.gradient(p)) * p.x, axis=0) + np.abs(self.target if self.target is not None else 0.0)
+    def size(self, p: Populations) -> float:
+        return float(np.sum(np.abs(self.gradient(p)) * p.x)) + abs(self.target or 0.0)
 
     def gradient(self, p: Populations) -> FloatArray:
         if self._gradient is not None:
-            return evaluate(self._gradient, p, len(p.x), self.vectorized, f"gradient of {self.name}")
-        return relative_differences(self.measure, p)
+            return called(f"gradient of {self.name}", self._gradient, p.x.shape, p.time, p.x, scalar=True)
+        return self._by_differences(p, STEP)
 
-    def rate(self, p: Populations) -> FloatArray | float:
+    def rate(self, p: Populations) -> float:
         if self._time_derivative is None:
             return 0.0
-        return -evaluate(self._time_derivative, p, 0, self.vectorized, f"time derivative of {self.name}")
+        return -float(called(f"time derivative of {self.name}", self._time_derivative, (), p.time, p.x))
 
     def bind(self, p: Populations) -> Self:
         self.check_derivatives(p)
@@ -151,67 +136,44 @@ class HolonomicRow(Row):
         bound.target = self.measure(p)
         return bound
 
+    def _by_differences(self, p: Populations, step: float) -> FloatArray:
+        """d sigma/dx from differences in ln x."""
+        by_logarithm = jacobian_by_differences(
+            lambda t, y: self.measure(Populations.from_logarithms(t, y)), p.time, p.log_x, np.full(len(p.x), step)
+        )
+        return by_logarithm / p.x
+
     def check_derivatives(self, p: Populations) -> None:
-        """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign.
+        """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign."""
+        coarse, fine = (self._by_differences(p, h) * p.x for h in (STEP, STEP / 2))
+        given = None if self._gradient is None else self.gradient(p) * p.x
+        rounding = 1e-12 * abs(self.measure(p))
+        check_derivative("gradient", f"{self.name}, times x,", given, coarse, fine, rounding=rounding, smooth=SMOOTH)
+        self._check_rate(p, -self.rate(p))
 
-        Raises
-        ------
-        InputError
-        """
-        coarse, found = (relative_differences(self.measure, p, h) * p.x for h in (STEP, STEP / 2))
-        size = np.abs(found).sum(axis=0)
-        if self._gradient is not None:
-            given = self.gradient(p) * p.x
-            wrong = (np.abs(given - found) > WRONG * size) & (np.abs(found - coarse) <= WRONG * size)
-            if wrong.any():
-                k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
-                raise InputError(
-                    f"gradient of {self.name}: {(given / p.x)[k]:.6g} for species {k[0]}, but differences of the "
-                    f"function give {(found / p.x)[k]:.6g}; correct it, or leave it out",
-                    item="gradient",
-                )
-        else:
-            rough = np.abs(found - coarse) > SMOOTH * size + 1e-12 * self._magnitude(p)
-            if rough.any():
-                k = np.unravel_index(int(np.argmax(rough)), rough.shape)
-                raise InputError(
-                    f"{self.name} changes too fast with species {k[0]} for differences: give its gradient",
-                    item="gradient",
-                )
-        if self._time_derivative is None:
-            self._compare_rates(p, 0.0, "depends on time, but has no time_derivative: give it")
-        else:
-            self._compare_rates(p, -self.rate(p), "has another time_derivative than its differences: correct it")
+    def _check_rate(self, p: Populations, given: float) -> None:
+        """Compare the derivative in time with differences, where these are smooth."""
 
-    def _compare_rates(self, p: Populations, given: FloatArray | float, said: str) -> None:
-        """Compare a derivative in time at the state `p` with differences, where these are smooth."""
-        coarse, fine = (self._rate_by_differences(p, h) for h in (1e-3, 5e-4))
-        wrong = contradicted(given, coarse, fine, 1e-9 * self._magnitude(p))
-        for h in (1e-6, 1e-9) if np.any(wrong) else ():  # what changes faster is seen by these
-            near = self._rate_by_differences(p, h)
-            wrong &= ~(np.abs(near - given) <= WRONG * np.maximum(np.abs(near), np.abs(given)))
-        if np.any(wrong):
-            k = int(np.argmax(wrong))
-            values = [float(np.broadcast_to(v, np.shape(wrong)).ravel()[k]) for v in (given, fine)]
-            raise InputError(
-                f"{self.name} {said} ({values[0]:.6g}; differences give {values[1]:.6g})", item="time_derivative"
-            )
+        def differences(h: float) -> FloatArray:
+            h = exact_step(h, p.time)
+            ends = [self.measure(Populations.from_logarithms(p.time + dt, p.log_x)) for dt in (h, -h)]
+            return np.asarray(ends[0] - ends[1]) / (2 * h)
 
-    def _rate_by_differences(self, p: Populations, h: float) -> FloatArray:
-        h = exact_step(h, p.time)
-        later, earlier = (self._at_time(Populations.from_logarithms(p.time + dt, p.log_x)) for dt in (h, -h))
         with np.errstate(all="ignore"):
-            return (later - earlier) / (2 * h)
+            coarse, fine = differences(1e-3), differences(5e-4)
+            wrong = bool(contradicted(given, coarse, fine, np.asarray(1e-9 * self._magnitude(p))))
+            near = [differences(h) for h in (1e-6, 1e-9)] if wrong else []  # these see what changes faster
+        if not wrong or any(abs(v - given) <= WRONG * np.maximum(np.abs(v), abs(given)) for v in near):
+            return
+        said = (
+            "depends on time, but has no time_derivative: give it"
+            if self._time_derivative is None
+            else "changes with time at another rate than differences of it: correct it"
+        )
+        raise InputError(f"{self.name} {said} ({given:.6g}; differences give {fine:.6g})", item="time_derivative")
 
-    def _at_time(self, p: Populations) -> FloatArray:
-        """What changes with time at fixed x."""
-        return self.measure(p)
-
-    def _magnitude(self, p: Populations) -> FloatArray:
-        return np.abs(self.measure(p))
-
-    def take(self, lanes: NDArray[np.intp]) -> Self:
-        return taken(self, lanes, "target")
+    def _magnitude(self, p: Populations) -> float:
+        return abs(self.measure(p))
 
 
 class LinearRow(HolonomicRow):
@@ -222,11 +184,6 @@ class LinearRow(HolonomicRow):
     coefficients : array_like, shape (n,)
     target : float or callable t -> (value, rate), optional
         A moving target returns its value and its time derivative.
-
-    Raises
-    ------
-    InputError
-        Coefficients that are not finite, or all zero.
     """
 
     def __init__(
@@ -237,36 +194,21 @@ class LinearRow(HolonomicRow):
         name: str = "linear row",
     ) -> None:
         c = numbers(coefficients, "coefficients").copy()
-        if callable(target):
-            check_call(f"{name}: target", target, ("t",))
         if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
             raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
         self.coefficients: FloatArray = c
-        self.vectorized = True
-        self.name = name
-        self.moving = target if callable(target) else None
-        self.target = None if target is None or callable(target) else _number(target, "target")
-
-    def _columns(self, p: Populations) -> FloatArray:
-        if len(p.x) != len(self.coefficients):
-            raise InputError(
-                f"{self.name} has {len(self.coefficients)} coefficients, there are {len(p.x)} species",
-                item="coefficients",
+        if callable(target):
+            check_call(f"{name}: target", target, ("t",))
+            self.moving = target
+            super().__init__(
+                lambda t, x: c @ x - self._moved(t)[0], None, lambda t, x: -self._moved(t)[1], target=0.0, name=name
             )
-        return self.coefficients.reshape(-1, *(1,) * (p.x.ndim - 1))
+        else:
+            super().__init__(lambda t, x: c @ x, target=target, name=name)
 
-    def measure(self, p: Populations) -> FloatArray:
-        return np.asarray(np.sum(self._columns(p) * p.x, axis=0))
-
-    def gradient(self, p: Populations) -> FloatArray:
-        return np.broadcast_to(self._columns(p), p.x.shape)
-
-    def _moved(self, p: Populations, item: int) -> FloatArray:
-        moving = self.moving
-        assert moving is not None
-        return np.asarray(np.vectorize(lambda t: self._pair(moving(t), t)[item], otypes=[np.float64])(p.time))
-
-    def _pair(self, given: tuple[float, float], t: float) -> FloatArray:
+    def _moved(self, t: float) -> FloatArray:
+        """Target and rate."""
+        given = self.moving(t)
         pair = numbers(given, "target")
         if pair.shape != (2,):
             raise InputError(
@@ -274,24 +216,19 @@ class LinearRow(HolonomicRow):
             )
         return pair
 
-    def value(self, p: Populations) -> FloatArray:
-        return self.measure(p) - self._moved(p, 0) if self.moving else super().value(p)
-
-    def rate(self, p: Populations) -> FloatArray | float:
-        return self._moved(p, 1) if self.moving else 0.0
-
-    def bind(self, p: Populations) -> Self:
-        if not self.moving:
-            return super().bind(p)
-        self.check_derivatives(p)
-        return self
+    def gradient(self, p: Populations) -> FloatArray:
+        if len(p.x) != len(self.coefficients):
+            raise InputError(
+                f"{self.name} has {len(self.coefficients)} coefficients, there are {len(p.x)} species",
+                item="coefficients",
+            )
+        return self.coefficients
 
     def check_derivatives(self, p: Populations) -> None:
-        if self.moving:
-            self._compare_rates(p, self.rate(p), "has another rate of its target than differences of it: correct it")
+        self._check_rate(p, -self.rate(p))
 
-    def _at_time(self, p: Populations) -> FloatArray:
-        return self._moved(p, 0)
+    def _magnitude(self, p: Populations) -> float:
+        return self.size(p)
 
 
 class TotalPopulation(LinearRow):
@@ -310,65 +247,263 @@ class VelocityRow(Row):
         A.
     rate : callable (t, x) -> float, or float
         b.
-    vectorized : bool
-        Whether the functions take x of shape (n, N) with times of shape (N,).
     """
 
     def __init__(
-        self,
-        coefficients: OfState | ArrayLike,
-        rate: OfState | float = 0.0,
-        *,
-        vectorized: bool = False,
-        name: str = "velocity row",
+        self, coefficients: OfState | ArrayLike, rate: OfState | float = 0.0, *, name: str = "velocity row"
     ) -> None:
         for what, given in (("coefficients", coefficients), ("rate", rate)):
             if callable(given):
                 check_call(f"{name}: {what}", given, ("t", "x"))
         self._coefficients = coefficients if callable(coefficients) else numbers(coefficients, "coefficients").copy()
-        self._rate = rate if callable(rate) else _number(rate, "rate")
-        self.vectorized = vectorized
+        self._rate = rate if callable(rate) else finite_number(rate, "rate")
         self.name = name
 
     def gradient(self, p: Populations) -> FloatArray:
         if callable(self._coefficients):
-            return evaluate(self._coefficients, p, len(p.x), self.vectorized, f"coefficients of {self.name}")
-        c = self._coefficients
-        if c.shape != (len(p.x),):
-            raise InputError(f"{self.name}: {c.shape} coefficients for {len(p.x)} species", item="coefficients")
-        return np.broadcast_to(c.reshape(-1, *(1,) * (p.x.ndim - 1)), p.x.shape)
+            return called(f"coefficients of {self.name}", self._coefficients, p.x.shape, p.time, p.x, scalar=True)
+        if self._coefficients.shape != p.x.shape:
+            raise InputError(
+                f"{self.name}: {self._coefficients.shape} coefficients for {len(p.x)} species", item="coefficients"
+            )
+        return self._coefficients
 
-    def rate(self, p: Populations) -> FloatArray | float:
-        if callable(self._rate):
-            return evaluate(self._rate, p, 0, self.vectorized, f"rate of {self.name}")
-        return self._rate
-
-
-def relative_differences(
-    measure: Callable[[Populations], FloatArray], p: Populations, step: float = STEP
-) -> FloatArray:
-    """d measure/dx by central differences in ln x, extrapolated to order six (steps h, h/2, h/4)."""
-    gradient = np.empty_like(p.x)
-    for i in range(len(p.x)):
-        slopes = []
-        for h in (step, step / 2, step / 4):
-            ends = []
-            for sign in (1.0, -1.0):
-                log_x = p.log_x.copy()
-                log_x[i] += sign * h
-                ends.append(measure(Populations.from_logarithms(p.time, log_x)))
-            # d/dx of a function that is linear in x comes out exactly.
-            slopes.append((ends[0] - ends[1]) / (2.0 * np.sinh(h) * p.x[i]))
-        first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
-        gradient[i] = (16 * second - first) / 15
-    return gradient
+    def rate(self, p: Populations) -> float:
+        return (
+            float(called(f"rate of {self.name}", self._rate, (), p.time, p.x)) if callable(self._rate) else self._rate
+        )
 
 
-def _number(value: float, item: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{item} is a number, not {value!r}", item=item) from None
-    if not np.isfinite(number):
-        raise InputError(f"{item} is not finite", item=item)
-    return number
+# -- entropy production --------------------------------------------------------------------------------
+
+#: A budget is consistent with the start where it differs by no more than this part.
+BUDGET_TOLERANCE = 1e-9
+#: Excess, as a part of the largest there is, that rounding leaves of none (it is quadratic in x - x_eq).
+AT_EQUILIBRIUM = 1e-29
+#: Slope of the excess, as a part of the excess, below which the populations cannot mend its round-off.
+FADED = 1e-2
+
+
+class EntropyLaw(ABC):
+    """What entropy, times T, has been produced since the start."""
+
+    #: Rate at which a deviation from equilibrium decays, 0 if it stays; None if there is no such rate.
+    relaxation_rate: float | None = None
+
+    @abstractmethod
+    def produced(self, elapsed: float, excess0: float) -> float:
+        """T(s(t) - s_0)."""
+
+    def excess(self, elapsed: float, excess0: float) -> float:
+        """E(t) = E_0 - T(s(t) - s_0); laws that end at E = 0 write it without the difference."""
+        return excess0 - self.produced(elapsed, excess0)
+
+    @abstractmethod
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        """b = d(g - g_eq)/dt at a state whose excess is `excess`."""
+
+    def check(self, excess0: float, most: float) -> None:
+        """Raise `BudgetError` for a law that the start cannot follow; `most` is the largest excess there is."""
+
+
+class Relaxation(EntropyLaw):
+    """s(t) = s_0 + (s_eq - s_0)(1 - exp(-t/tau)) (notes eqs. 148, 149).
+
+    Parameters
+    ----------
+    tau : float
+    budget : float, optional
+        T(s_eq - s_0); left out, it is computed from the start, g(x_0) - g_eq.
+    partial : bool
+        Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
+    """
+
+    def __init__(self, tau: float, budget: float | None = None, *, partial: bool = False) -> None:
+        self.tau = positive(tau, "tau")
+        self.budget = None if budget is None else finite_number(budget, "budget")
+        if self.budget is not None and self.budget < 0:
+            raise InputError(f"the budget T(s_eq - s_0) is not negative, so it cannot be {budget}", item="budget")
+        self.partial = partial
+        self.relaxation_rate = None if partial else 1.0 / (2.0 * self.tau)
+
+    def _budget(self, excess0: float) -> float:
+        # A budget that agrees with the start is the start's.
+        return self.budget if self.partial and self.budget is not None else excess0
+
+    def produced(self, elapsed: float, excess0: float) -> float:
+        return -self._budget(excess0) * math.expm1(-elapsed / self.tau)
+
+    def excess(self, elapsed: float, excess0: float) -> float:
+        budget = self._budget(excess0)
+        return budget * math.exp(-elapsed / self.tau) + (excess0 - budget)
+
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        # Told by the state instead of the time: the same on the constraint, but errors fade instead of piling up.
+        return -(excess - (excess0 - self._budget(excess0))) / self.tau
+
+    def check(self, excess0: float, most: float) -> None:
+        budget = self.budget
+        if excess0 <= AT_EQUILIBRIUM * abs(most):
+            raise BudgetError(
+                "the start is already at equilibrium, where no entropy is left to be produced and the row has no "
+                "direction; start elsewhere, or hold the total population alone (with_fixed_total)",
+                budget=0.0 if budget is None else budget,
+                consistent=0.0,
+                time=0.0,
+            )
+        share = 1.0 if budget is None else budget / excess0
+        said, time = "", math.inf
+        if share > 1.0 + BUDGET_TOLERANCE:
+            time = -self.tau * math.log1p(-1.0 / share)
+            said = (
+                f"more than the start can produce, g(x_0) - g_eq = {excess0:.10g}: equilibrium would be reached at "
+                f"t = {time:.6g} with entropy still to be produced. Leave the budget out, it is then computed"
+            )
+        elif share < 1.0 - BUDGET_TOLERANCE and not self.partial:
+            said = (
+                f"less than what lies between the start and equilibrium, g(x_0) - g_eq = {excess0:.10g}: the system "
+                f"would stop producing at an excess of {excess0 * (1.0 - share):.6g}; s_eq would not be the entropy "
+                "at equilibrium. Leave the budget out, it is then computed, or say partial=True if this is meant"
+            )
+        if said and budget is not None:
+            raise BudgetError(f"T(s_eq - s_0) = {budget:.10g} is {said}", budget=budget, consistent=excess0, time=time)
+
+
+class NoProduction(EntropyLaw):
+    """ds = 0 (notes eq. 150)."""
+
+    relaxation_rate = 0.0
+
+    def produced(self, elapsed: float, excess0: float) -> float:
+        return 0.0
+
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        return 0.0
+
+
+class PrescribedProduction(EntropyLaw):
+    """A production of your own.
+
+    Parameters
+    ----------
+    produced : callable, t -> float
+        T(s(t) - s_0), t counted from the start; 0 at t = 0. May fall (entropy taken from outside).
+    rate : callable, t -> float
+        Its time derivative.
+    until : float
+        The time up to which it will be asked for: so far it is checked.
+    """
+
+    #: Times at which a prescription is looked at before a run.
+    LOOKS = 2001
+
+    def __init__(self, produced: Callable[[float], float], rate: Callable[[float], float], *, until: float) -> None:
+        check_call("produced", produced, ("t",))
+        check_call("rate", rate, ("t",))
+        self._produced, self._rate, self.until = produced, rate, positive(until, "until")
+        if abs(produced(0.0)) > 1e-12:
+            raise InputError(f"nothing has been produced at t = 0, not {produced(0.0):.6g}", item="produced")
+        times = np.linspace(0.0, until, 101)
+        integral = np.cumsum([quad(rate, a, b, epsabs=1e-12, epsrel=1e-11)[0] for a, b in pairwise(times)])
+        off = np.abs(integral - [produced(t) for t in times[1:]])
+        if not np.max(off) <= 1e-8 * max(1.0, float(np.max(np.abs(integral)))):
+            k = int(np.argmax(~(off <= 1e-8)))
+            raise InputError(
+                f"the integral of the rate is not what is produced: at t = {times[k + 1]:.6g} they differ by "
+                f"{off[k]:.3g}",
+                item="rate",
+            )
+
+    def _looked_at(self, elapsed: float) -> float:
+        """A time from the start that lies in what was checked."""
+        if max(elapsed - self.until, -elapsed) > 1e-9 * self.until:
+            raise InputError(
+                f"the prescribed production is known from the start until {self.until:g} after it: end the run there, "
+                "or raise `until`",
+                item="until",
+            )
+        return elapsed
+
+    def produced(self, elapsed: float, excess0: float) -> float:
+        return float(self._produced(self._looked_at(elapsed)))
+
+    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
+        return -float(self._rate(self._looked_at(elapsed)))
+
+    def check(self, excess0: float, most: float) -> None:
+        times = np.linspace(0.0, self.until, self.LOOKS)
+        left = excess0 - np.array([self.produced(t, excess0) for t in times])
+        for bad, reason in (
+            (left < -1e-12 * excess0, "more than lies between the start and equilibrium"),
+            (left > most, "more entropy taken away than the populations can give up"),
+        ):
+            if np.any(bad):
+                time = float(times[np.argmax(bad)])
+                raise BudgetError(
+                    f"the prescribed production asks for {reason} from t = {time:.6g} on; the start allows "
+                    f"T(s - s_0) between {excess0 - most:.6g} and {excess0:.6g}",
+                    budget=self.produced(time, excess0),
+                    consistent=excess0,
+                    time=time,
+                )
+
+
+class EntropyRow(Row):
+    """The Gibbs energy of a mixture follows an entropy law; to be used together with `TotalPopulation`.
+
+    Its row of A is mu less the mu of the largest population: a constant common to all species drops out where sum x is
+    kept. So the row fades cleanly where the rank is lost: at equilibrium, and where one species is nearly alone.
+    """
+
+    holonomic = True
+    name = "entropy production"
+    #: Of the start.
+    start, total, excess0 = 0.0, math.nan, math.nan
+
+    def __init__(self, mixture: Mixture, law: EntropyLaw) -> None:
+        refuse_other(mixture, Mixture, "mixture", "a kcons.models.growth.Mixture")
+        refuse_other(law, EntropyLaw, "law", "a law such as kcons.models.growth.Relaxation(tau)")
+        self.mixture = mixture
+        self.law = law
+
+    @property
+    def bound(self) -> bool:
+        """Whether there is a start."""
+        return not math.isnan(self.total)
+
+    def law_excess(self, time: float) -> float:
+        """E(t) = g - g_eq as the law has it, for a row that is bound to a start."""
+        return self.law.excess(time - self.start, self.excess0)
+
+    def gradient(self, p: Populations) -> FloatArray:
+        return self.mixture.relative_potentials(p)
+
+    def rate(self, p: Populations) -> float:
+        excess = float(self.mixture.excess(p, self.total if self.bound else float(np.sum(p.x))))
+        return self.law.excess_rate(p.time - self.start, excess, self.excess0 if self.bound else excess)
+
+    def value(self, p: Populations) -> float:
+        return self.mixture.excess_over(p, self.total, self.law_excess(p.time))
+
+    def size(self, p: Populations) -> float:
+        # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
+        error = np.maximum(1.0, np.abs(p.log_x))
+        epsilon = float(np.finfo(np.float64).eps)
+        slope = float(np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * epsilon * error) * error))
+        excess = abs(self.law_excess(p.time))
+        # Where one species is nearly alone, no ln x must be moved to mend what the rounding of sum x does here.
+        slope = excess if slope < FADED * excess else slope
+        # Elsewhere the excess cancels, see Mixture.excess_over; terms of some kT sum x are left.
+        return max(4.0 * min(excess, self.mixture.kT * self.total), slope)
+
+    def bind(self, p: Populations) -> EntropyRow:
+        if self.mixture.n != len(p.x):
+            raise InputError(f"the mixture has {self.mixture.n} species, the start {len(p.x)}", item="mixture")
+        bound = copy.copy(self)
+        bound.start, bound.total = p.time, math.fsum(p.x)
+        # In two steps, the second of which sees what the first rounded off.
+        about = float(self.mixture.excess(p, bound.total))
+        bound.excess0 = about + self.mixture.excess_over(p, bound.total, about)
+        most = self.mixture.largest_gibbs_energy(bound.total) - self.mixture.least_gibbs_energy(bound.total)
+        self.law.check(bound.excess0, most)
+        return bound

@@ -1,25 +1,40 @@
-"""The hypercycle against its reference solutions, its closed form, and its arrival at equilibrium."""
+"""The hypercycle against reference and closed form; laws of entropy production; arrival, extinction and return."""
 
 import numpy as np
 import pytest
+from exact_mixture import exact_energies
 from growth_reference import case, system
+from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError
-from kcons.models.growth import Hypercycle, Populations, solve, solve_ensemble
+from kcons.models.growth import (
+    EntropyRow,
+    Hypercycle,
+    Mixture,
+    NoProduction,
+    Populations,
+    PrescribedProduction,
+    Relaxation,
+    entropy_balance,
+    solve,
+)
 
 STARTS = ("IC1", "IC2", "IC3sum2")
 CASES = [f"A11_hypercycle_{start}_{letter}" for start in STARTS for letter in "abc"]
 X0 = np.array([0.6, 0.1, 0.1, 0.1, 0.1])
+BUDGET = 0.3344071481541323
+START = Populations.from_values(0.0, X0)
 
 
-@pytest.mark.parametrize("letter", ["a", *(pytest.param(other, marks=pytest.mark.validation) for other in "bc")])
-def test_trajectories_of_the_reference(letter):
-    names = [f"A11_hypercycle_{start}_{letter}" for start in STARTS]
-    x0 = np.array([case(name)["initial"]["x"] for name in names]).T
-    found = solve_ensemble(system(names[0]), case(names[0])["times"], x0, rtol=1e-12, atol=1e-12)
-    for k, name in enumerate(names):
-        assert found.x[:, :, k] == pytest.approx(np.array(case(name)["reference"]["x"]), abs=1e-10)
-    assert abs(found.x.sum(axis=1) - x0.sum(axis=0)).max() < 1e-15 * 3
+@pytest.mark.parametrize(
+    "name", [*CASES[:3], *(pytest.param(name, marks=pytest.mark.validation) for name in CASES[3:])]
+)
+def test_trajectories_of_the_reference(name):
+    given = case(name)
+    x0, times = given["initial"]["x"], given["times"]
+    found = solve(system(name), (0.0, times[-1]), x0, t_eval=times, rtol=1e-12, atol=1e-12)
+    assert pytest.approx(np.array(given["reference"]["x"]), abs=1e-10) == found.y.T
+    assert abs(found.y.sum(axis=0) - sum(x0)).max() < 1e-15 * 3
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -35,16 +50,6 @@ def test_states_of_the_reference(name):
         assert -mu @ bound.velocity(t, x) == pytest.approx(reference["T_sigma"][k], abs=1e-12)
 
 
-def test_near_extinction_and_return():
-    name = "A11_hypercycle_extinction_b"
-    given = case(name)
-    found = solve(system(name), (0.0, 10.0), given["initial"]["x"], t_eval=given["times"], rtol=1e-12, atol=1e-12)
-    # ln x goes down to -2.6e4 on the way.
-    assert pytest.approx(np.array(given["reference"]["ln_x"]), rel=1e-10) == found.log_y.T
-    assert pytest.approx(np.array(given["reference"]["x"]), abs=1e-12) == found.y.T
-    assert found.y[2, 4] == 0.0
-
-
 def test_limit_cycle():
     given = case("A11_hypercycle_limit_cycle")
     start = np.array(given["state_at_section_x1_eq_0.2_upward"])
@@ -57,17 +62,13 @@ def test_limit_cycle():
     found = solve(
         model.with_fixed_total(), (0.0, 20.0), start, events=section, rtol=1e-11, atol=1e-12, dense_output=True
     )
-    late = found.t_events[0][found.t_events[0] > 1.0]
-    assert late[-1] == pytest.approx(given["period"], abs=1e-8)
+    assert found.t_events[0][-1] == pytest.approx(given["period"], abs=1e-8)
     assert found.y_events[0][-1] == pytest.approx(start, abs=1e-8)
     dense = found.sol(np.linspace(0.0, 20.0, 8001))
     assert dense.max() == pytest.approx(given["x_max"], abs=2e-6)
     assert dense.min() == pytest.approx(given["x_min"], abs=2e-6)
     wanted = [complex(*pair) for pair in given["eigenvalues_at_fixed_point_tangent"]]
-
-    def order(c):
-        return round(c.real, 6), c.imag
-
+    order = lambda c: (round(c.real, 6), c.imag)  # noqa: E731
     assert sorted(model.interior_eigenvalues(), key=order) == pytest.approx(sorted(wanted, key=order), abs=1e-14)
 
 
@@ -76,43 +77,67 @@ def test_limit_cycle():
 def test_closed_form_is_the_general_code(n, total):
     model = Hypercycle(n, 1.7, np.linspace(0.1, 0.9, n), 0.6)
     x = total * np.random.default_rng(n).dirichlet(np.ones(n))
-    p = Populations.from_values(0.0, x)
+    excess = float(model.mixture.excess(Populations.from_values(0.0, x), total))
     for constrained, b2 in (
         (model.without_entropy_production(), 0.0),
-        (model.with_entropy_production(4.0), -float(model.mixture.excess(p, total)) / 4.0),
+        (model.with_entropy_production(4.0), -excess / 4.0),
     ):
         assert constrained.constraint_rates(0.0, x) == pytest.approx(model.closed_form_rates(x, b2), rel=1e-10)
         assert constrained.constrained_inverse(0.0, x) == pytest.approx(model.closed_form_inverse(x), rel=1e-8)
 
 
 def test_equation_of_motion():
-    model = Hypercycle(4, 2.0)
-    x = np.array([0.1, 0.2, 0.3, 0.4])
+    model, x = Hypercycle(4, 2.0), np.array([0.1, 0.2, 0.3, 0.4])
     assert model.velocity(0.0, x) == pytest.approx(2.0 * x * x[[1, 2, 3, 0]])
     assert model.mixture.mu0 == pytest.approx([0.15, 0.2, 0.25, 0.3])
 
 
+# -- arrival at equilibrium ---------------------------------------------------------------------------
+
+
+def excesses(model, found, total=1.0):
+    return model.mixture.excess(Populations.from_logarithms(found.t, found.log_y), total)
+
+
 def test_arrives_at_equilibrium():
     # 30 times the relaxation time and far beyond, from a start where direct integration dies at t = 400 to 800.
-    model = Hypercycle()
-    times = np.array([0.0, 300.0, 900.0, 3000.0, 1e5])
+    model, times = Hypercycle(), np.array([0.0, 300.0, 900.0, 3000.0, 1e5])
     found = solve(model.with_entropy_production(30.0), (0.0, 1e5), X0, t_eval=times, rtol=1e-8, atol=1e-8)
     assert found.success
     assert 250.0 < found.settled_time < 500.0
-    excess = model.mixture.excess(Populations.from_logarithms(times, found.log_y), 1.0)
-    assert excess[:3] == pytest.approx(0.3344071481541323 * np.exp(-times[:3] / 30.0), rel=2e-9)
+    assert excesses(model, found)[:3] == pytest.approx(BUDGET * np.exp(-times[:3] / 30.0), rel=2e-9)
     assert found.y[:, -1] == pytest.approx(np.exp(model.mixture.equilibrium(1.0)), rel=1e-15)
 
 
 def test_settled_motion_continues_the_integrated_one():
-    model = Hypercycle(5, 3.0, [0.1, 0.5, 0.2, 0.9, 0.3])
-    system = model.with_entropy_production(1.0)
-    x0 = [0.3, 0.2, 0.1, 0.15, 0.25]
+    system, x0 = Hypercycle(5, 3.0, [0.1, 0.5, 0.2, 0.9, 0.3]).with_entropy_production(1.0), [0.3, 0.2, 0.1, 0.15, 0.25]
     coarse = solve(system, (0.0, 16.0), x0, t_eval=[15.0, 16.0], rtol=1e-6, atol=1e-6)
     fine = solve(system, (0.0, 16.0), x0, t_eval=[15.0, 16.0], rtol=1e-11, atol=1e-12)
     assert coarse.settled_time < 13.0
     assert fine.settled_time is None or fine.settled_time > coarse.settled_time
     assert coarse.y == pytest.approx(fine.y, rel=1e-6)
+
+
+@pytest.mark.parametrize("part", [0.0004, 0.005, 0.05], ids=["at once", "between", "at a time shown"])
+def test_events_are_found_wherever_a_settled_motion_passes_them(part):
+    system = Hypercycle().with_entropy_production(1.0)
+    settled = solve(system, (0.0, 100.0), X0, rtol=1e-4, atol=1e-5).settled_time
+    time = settled + part * (100.0 - settled)
+    passed = lambda t, x: t - time  # noqa: E731
+    passed.terminal = 1
+    found = solve(system, (0.0, 100.0), X0, rtol=1e-4, atol=1e-5, events=passed)
+    assert found.status == 1 and found.settled_time == settled
+    assert found.t_events[0] == pytest.approx([time], rel=1e-12)
+    assert found.t[-1] == found.t_events[0][0]
+
+
+def test_events_of_a_motion_that_has_settled():
+    model = Hypercycle()
+    nearly = lambda t, x: float(model.mixture.excess(Populations.from_values(t, x), 1.0)) * 1e12 - 1.0  # noqa: E731
+    nearly.terminal = True
+    found = solve(model.with_entropy_production(30.0), (0.0, 5000.0), X0, events=nearly, rtol=1e-7, atol=1e-8)
+    assert found.status == 1 and found.settled_time < found.t[-1]
+    assert found.t[-1] == pytest.approx(30.0 * np.log(BUDGET * 1e12), abs=1e-3)
 
 
 def test_start_at_equilibrium():
@@ -126,7 +151,7 @@ def test_start_at_equilibrium():
     assert found.success
     assert found.y == pytest.approx(np.repeat(x_eq[:, None], len(found.t), axis=1), rel=1e-12)
     # A run that has all but arrived can be gone on with.
-    near = solve(model.with_entropy_production(30.0), (0.0, 900.0), [0.6, 0.1, 0.1, 0.1, 0.1]).y[:, -1]
+    near = solve(model.with_entropy_production(30.0), (0.0, 900.0), X0).y[:, -1]
     assert solve(model.with_entropy_production(30.0), (0.0, 50.0), near).success
 
 
@@ -134,18 +159,199 @@ def test_start_at_equilibrium():
 def test_few_species(n):
     # With n = 2 both rows together leave no freedom; the motion follows from them alone.
     model = Hypercycle(n, 1.0, np.zeros(n))
-    x0 = np.array([0.7, 0.3]) if n == 2 else np.array([0.5, 0.3, 0.2])
+    x0 = [0.7, 0.3] if n == 2 else [0.5, 0.3, 0.2]
     found = solve(model.with_entropy_production(2.0), (0.0, 200.0), x0, t_eval=[0.0, 10.0, 200.0])
-    assert found.success
-    excess = model.mixture.excess(Populations.from_logarithms(found.t, found.log_y), 1.0)
+    assert found.success and found.settled_time < 150.0
+    excess = excesses(model, found)
     assert excess[:2] == pytest.approx(excess[0] * np.exp(-found.t[:2] / 2.0), rel=1e-12)
     assert found.y[:, -1] == pytest.approx(np.full(n, 1 / n), rel=1e-12)
 
 
+# -- extinction and return ----------------------------------------------------------------------------
+
+
+def test_near_extinction_and_return():
+    name = "A11_hypercycle_extinction_b"
+    given = case(name)
+    found = solve(system(name), (0.0, 10.0), given["initial"]["x"], t_eval=given["times"], rtol=1e-12, atol=1e-12)
+    # ln x goes down to -2.6e4 on the way.
+    assert pytest.approx(np.array(given["reference"]["ln_x"]), rel=1e-10) == found.log_y.T
+    assert pytest.approx(np.array(given["reference"]["x"]), abs=1e-12) == found.y.T
+    assert found.y[2, 4] == 0.0
+
+
+def test_extinction_beyond_all_numbers_ends_at_the_least_logarithm():
+    # Species 3 to 5 die for good under (c): ln x falls like -e^(lambda t) and would overflow before t = 100.
+    x0 = np.array([0.18899264, 0.01101811, 0.01901061, 0.74291806, 0.03806058])
+    found = solve(Hypercycle().without_entropy_production(), (0.0, 100.0), x0 / x0.sum(), rtol=1e-7, atol=1e-9)
+    assert found.success and np.all(np.isfinite(found.log_y))
+    assert found.log_y.min() == pytest.approx(-1e300, rel=1e-3)
+
+
+def random_system(rng, n, kind):
+    """Parameters over decades, starts down to ln x = -700."""
+    k_h, kT = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-1, 1)
+    model = Hypercycle(n, k_h, rng.normal(size=n) * kT * 10 ** rng.uniform(-1, 0.5), kT)
+    tau, total = 10 ** rng.uniform(-1, 2) / k_h, 10 ** rng.uniform(-0.5, 0.5)
+    log_x = [np.log(rng.dirichlet(np.ones(n))), rng.uniform(-5, 0, n), rng.uniform(-700, 0, n)][rng.integers(3)]
+    held = model.with_entropy_production(tau) if kind == "b" else model.without_entropy_production()
+    return held, log_x + np.log(total) - np.log(np.sum(np.exp(log_x)))
+
+
+@pytest.mark.parametrize("kind", ["b", "c"])
+@pytest.mark.parametrize("n", [2, 3, 5, 8])
+def test_random_systems_run_to_their_end_and_hold_their_rows(n, kind):
+    rng = np.random.default_rng([7, n, ord(kind)])
+    for _ in range(6):
+        held, log_x = random_system(rng, n, kind)
+        k_h, mixture = held.model.k_h, held.model.mixture
+        found = solve(held, (0.0, 10 / k_h), log_x0=log_x, rtol=1e-6, atol=1e-8)
+        assert found.success and np.all(np.isfinite(found.log_y))
+        total0, energy0, least = exact_energies(mixture.mu0, mixture.kT, log_x)
+        total, energy, _ = exact_energies(mixture.mu0, mixture.kT, found.log_y[:, -1])
+        size = max(1.0, abs(float(energy0)))
+        assert abs(float(total - total0)) < 1e-14 * size
+        left = 1.0 if kind == "c" else np.exp(-10 / k_h / found.system.entropy_row.law.tau)
+        excess0, excess = (float(g - X * least) for g, X in ((energy0, total0), (energy, total)))
+        assert abs(excess - left * excess0) < 1e-13 * max(size, excess0)
+
+
+def test_entropy_row_where_the_excess_is_much_larger_than_the_gibbs_energy():
+    # g_0 is -1.08, a sum of terms of 70, and lies 165 above equilibrium.
+    mu0, kT = [-56.5140392407906, 41.8127322553325, 13.366563603233304], 8.60383824140328
+    start = np.array([0.06724395465832678, 0.6105286479569814, -3.357717120539264])
+    model = Hypercycle(3, 1.383051805375621, mu0, kT)
+    times = np.linspace(0.1, 1.0, 10) * 10.0 / model.k_h
+    found = solve(
+        model.without_entropy_production(), (0.0, times[-1]), log_x0=start, t_eval=times, rtol=1e-6, atol=1e-8
+    )
+    total0, energy0, least = exact_energies(mu0, kT, start)
+    size = max(1.0, abs(float(energy0)))
+    for log_x in found.log_y.T:
+        total, energy, _ = exact_energies(mu0, kT, log_x)
+        assert abs(float(total - total0)) < 2e-15 * size
+        assert abs(float(energy - energy0)) < 1e-13 * size
+        assert abs(float(energy - total * least - energy0 + total0 * least)) < 1e-13 * size
+
+
+# -- laws of entropy production -----------------------------------------------------------------------
+
+
+def test_production_law_of_the_notes():
+    law = Relaxation(30.0)
+    for t in (0.0, 15.0, 300.0):
+        assert law.produced(t, 0.5) == pytest.approx(0.5 * (1 - np.exp(-t / 30.0)), rel=1e-14)
+        assert NoProduction().produced(t, 0.5) == 0.0
+    assert law.excess_rate(0.0, 0.5, 0.5) == pytest.approx(-0.5 / 30.0)
+
+
+def test_budget_is_computed_from_the_start():
+    row = Hypercycle().with_entropy_production(30.0).bind(START).entropy_row
+    assert row.excess0 == pytest.approx(BUDGET, rel=1e-14)
+    assert row.law_excess(60.0) == pytest.approx(BUDGET * np.exp(-2.0), rel=1e-14)
+    # One that agrees with the start is taken as such.
+    same = Hypercycle().with_entropy_production(30.0, BUDGET * (1 + 1e-12)).bind(START).entropy_row
+    assert same.law_excess(1e4) == pytest.approx(BUDGET * np.exp(-1e4 / 30), rel=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "time"), [(1.1, 71.94), (1.5, 32.96)])
+def test_too_large_a_budget_is_refused_with_its_time(factor, time):
+    with pytest.raises(BudgetError, match=r"more than the start can produce") as caught:
+        solve(Hypercycle().with_entropy_production(30.0, factor * BUDGET), (0.0, 1.0), X0)
+    assert caught.value.time == pytest.approx(time, abs=0.005)
+    assert f"t = {caught.value.time:.6g}" in str(caught.value)
+    assert caught.value.consistent == pytest.approx(BUDGET)
+
+
+def test_too_small_a_budget_must_be_meant():
+    with pytest.raises(BudgetError, match="partial=True") as caught:
+        Hypercycle().with_entropy_production(30.0, 0.5 * BUDGET).bind(START)
+    assert caught.value.time == np.inf
+    system = Hypercycle().with_entropy_production(2.0, 0.5 * BUDGET, partial=True)
+    found = solve(system, (0.0, 60.0), X0, t_eval=[0.0, 4.0, 60.0])
+    assert excesses(system.model, found) == pytest.approx(BUDGET * (0.5 + 0.5 * np.exp(-found.t / 2.0)), abs=1e-14)
+
+
+OWN = PrescribedProduction(lambda t: 0.1 * np.sin(t) ** 2, lambda t: 0.1 * np.sin(2 * t), until=4.0)
+
+
 @pytest.mark.parametrize(
-    "arguments",
-    [(1,), (2.5,), (0,), (5, 0.0), (5, -1.0), (5, np.nan), (5, 1.0, [0.1, 0.2]), (5, 1.0, [0.1, 0.2, np.nan, 0, 0])],
+    ("law", "wanted"),
+    [
+        (Relaxation(3.0), BUDGET * -np.expm1(-4.0 / 3.0)),
+        (NoProduction(), 0.0),
+        (OWN, 0.1 * np.sin(4.0) ** 2),
+    ],
+    ids=["relaxation", "none", "own"],
 )
-def test_bad_hypercycles_are_refused(arguments):
-    with pytest.raises(InputError):
-        Hypercycle(*arguments)
+def test_entropy_produced_is_the_integral_of_its_rate(law, wanted):
+    found = solve(Hypercycle().with_law(law), (0.0, 4.0), X0, dense_output=True)
+    balance = entropy_balance(found, nodes=5)
+    assert balance.prescribed == pytest.approx(wanted, abs=1e-14)
+    assert balance.lost == pytest.approx(wanted, abs=1e-13)
+    assert balance.integrated == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize("law", [Relaxation(3.0), NoProduction()], ids=["closed", "open"])
+def test_entropy_produced_inside_and_exchanged(law):
+    system = Hypercycle().with_law(law)
+    found = solve(system, (0.0, 4.0), X0, dense_output=True)
+    balance = entropy_balance(found, nodes=5)
+    t = np.linspace(0.0, 4.0, 1001)
+    x = found.sol(t)
+    mu = (0.1 + 0.05 * np.arange(1, 6))[:, None] + np.log(x / x.sum(axis=0))
+    inside = -np.sum(mu * 3.0 * x * np.roll(x, -1, axis=0), axis=0)
+    z = np.stack([system.constraint_rates(s, v) for s, v in zip(t, x.T, strict=True)]).T
+    assert balance.reactions == pytest.approx(simpson(inside, x=t), abs=1e-7)
+    assert balance.exchanged == pytest.approx(simpson(-np.sum(mu * x * z, axis=0), x=t), abs=1e-7)
+    assert abs(balance.exchanged) > 0.1
+    # What an open system produces it gives away; what a closed one produces is the sum.
+    total = BUDGET * -np.expm1(-4.0 / 3.0) if isinstance(law, Relaxation) else 0.0
+    assert balance.reactions + balance.exchanged == pytest.approx(total, abs=1e-9)
+
+
+def test_prescriptions_are_checked_before_the_run():
+    steady = PrescribedProduction(lambda t: 0.1 * t, lambda t: 0.1, until=10.0)
+    with pytest.raises(BudgetError, match="equilibrium") as caught:
+        solve(Hypercycle().with_law(steady), (0.0, 1.0), X0)
+    assert caught.value.time == pytest.approx(BUDGET / 0.1, abs=0.01)
+    fed = PrescribedProduction(lambda t: -0.1 * t, lambda t: -0.1, until=100.0)
+    with pytest.raises(BudgetError, match="give up") as caught:
+        solve(Hypercycle().with_law(fed), (0.0, 1.0), X0)
+    # g is largest with the last species alone: 0.35.
+    assert caught.value.time == pytest.approx((0.35 + 1.0275294114572127) / 0.1, abs=0.1)
+
+
+@pytest.mark.parametrize("span", [(0.0, 3.0), (1.0, 0.0)], ids=["beyond", "before"])
+def test_a_prescribed_production_is_held_where_it_was_checked(span):
+    law = PrescribedProduction(lambda t: 0.01 * t, lambda t: 0.01, until=1.0)
+    with pytest.raises(InputError, match="known from the start until 1 after it"):
+        solve(Hypercycle(3).with_law(law), span, [0.2, 0.3, 0.5])
+    assert solve(Hypercycle(3).with_law(law), (1e6, 1e6 + 1), [0.2, 0.3, 0.5]).success
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Relaxation(0.0), "tau is 0"),
+        (lambda: Relaxation(np.nan), "tau is nan"),
+        (lambda: Relaxation(1.0, -0.1), "budget .* not negative"),
+        (lambda: Relaxation(3.0, "all"), "budget is 'all'"),
+        (lambda: PrescribedProduction(lambda t: t, lambda t: 2.0, until=1.0), "integral of the rate"),
+        (lambda: PrescribedProduction(lambda t: 1.0 + t, lambda t: 1.0, until=1.0), "nothing .* at t = 0"),
+        (lambda: PrescribedProduction(lambda t: t, lambda t: 1.0, until=0.0), "until is 0"),
+        (lambda: PrescribedProduction(1.0, lambda t: 1.0, until=1.0), "produced is 1.0"),
+        (lambda: PrescribedProduction(lambda t: t, lambda: 1.0, until=1.0), "rate takes"),
+        (lambda: EntropyRow(3, Relaxation(1.0)), "mixture is 3"),
+        (lambda: EntropyRow(Mixture([0.1, 0.2]), 3.0), "law is 3.0"),
+        (lambda: EntropyRow(Mixture([0.1, 0.2]), Relaxation(1.0)).bind(START), "the mixture has 2 species"),
+        (
+            lambda: entropy_balance(solve(Hypercycle().with_fixed_total(), (0.0, 0.1), X0, dense_output=True)),
+            "no row",
+        ),
+        (lambda: entropy_balance(solve(Hypercycle().without_entropy_production(), (0.0, 0.1), X0)), "dense_output"),
+    ],
+)
+def test_bad_laws_and_balances_are_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()

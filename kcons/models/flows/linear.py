@@ -1,0 +1,616 @@
+"""Linear flows: exp(At), Jordan form, stability as far as double precision tells; equilibria (notes sections 1.2, 1.3).
+
+**Eigenvalues** are judged at their own scale. Variables that act on each other in one direction only make the matrix
+block triangular: its eigenvalues are those of the blocks, and small ones do not feel how large the others are. Each
+block is balanced (Parlett and Reinsch) and brought to Schur form; how far an eigenvalue may be off follows from the
+backward error of that, which is of the size of the rounding of its entries.
+
+**Jordan blocks** are not continuous in the matrix: next to any matrix lie others whose eigenvalues are all different.
+What numbers of finite precision can say is that a matrix lies within its rounding of one with the structure found.
+Eigenvalues that rounding may make equal are taken together, brought to the top of the Schur form, and what is left
+there after their mean is a nilpotent matrix up to rounding, whose null spaces, one after the other, give the sizes
+(Kublanovskaya's staircase) and chains of generalized eigenvectors.
+
+**Stability.** The notes' criterion Re lambda <= 0 (eq. 14) is completed: where Re lambda = 0, the Jordan blocks must be
+1 x 1, or the solution grows like a power of t. A real part within its error is zero only if the matrix as it is written
+says so exactly, which is decided in integers; else stability cannot be told.
+
+References
+----------
+Golub and Van Loan, Matrix Computations, section 7.2. Demmel, Applied Numerical Linear Algebra, section 4.3. Golub and
+Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw. 6, 398 (1980).
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from fractions import Fraction
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import root
+from scipy.sparse.csgraph import connected_components
+
+from kcons.constraints.arguments import FloatArray, numbers, whole_number
+from kcons.errors import InputError
+from kcons.models.flows.flow import Flow
+
+ComplexArray: TypeAlias = NDArray[np.complex128]
+EPSILON = float(np.finfo(np.float64).eps)
+#: Singular values below this many times the noise of a block count as zero.
+NULL = 100.0
+#: Structures stand out where the least singular value that counts is so many times the largest that does not.
+STANDS_OUT = 10.0
+#: Eigenvalues that have no common structure are tried again as if known this many times better.
+CLOSER = 8.0
+#: Variables up to which it is decided in integers whether eigenvalues lie on the imaginary axis.
+LARGEST = 24
+#: Equilibria closer than this, in parts of the size of the box, are one.
+SAME = 1e-6
+
+
+class LinearFlow(Flow):
+    """dX/dt = A X (notes eq. 7).
+
+    exp(At) is computed by scaling and squaring of a Pade approximant, not from eigenvectors: defective matrices, whose
+    eigenvectors do not span, need no special treatment, nor do those that are nearly so.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (n, n)
+    """
+
+    def __init__(self, matrix: ArrayLike) -> None:
+        self.matrix: FloatArray = _square(matrix).copy()
+        super().__init__(lambda t, X: self.matrix @ X, len(self.matrix), lambda t, X: self.matrix)
+
+    def propagator(self, t: float) -> FloatArray:
+        """exp(At), shape (n, n) (notes eq. 9)."""
+        return np.asarray(scipy.linalg.expm(self.matrix * t))
+
+    def exact(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
+        """X(t) = exp(At) X(0), shape (n,) or (k, n) (notes eq. 8)."""
+        return np.asarray(scipy.linalg.expm(self.matrix * numbers(t, "t")[..., None, None]) @ self._state(X0))
+
+    def jordan_form(self) -> JordanForm:
+        """T and J with A = T J T^-1, as far as double precision allows (notes eqs. 10-13)."""
+        return jordan_form(self.matrix)
+
+    def classification(self) -> Classification:
+        """Kind and stability (notes eq. 14, completed)."""
+        return classify(self.matrix)
+
+
+# -- eigenvalues --------------------------------------------------------------------------------------
+
+
+class Spectrum(NamedTuple):
+    """A = S T S^-1 with T upper triangular; eigenvalues in the order of its diagonal."""
+
+    values: ComplexArray
+    #: How far each may be off, for all changes of the entries by their rounding and by the errors given.
+    errors: FloatArray
+    #: 1/|y^H x| of the left and right eigenvectors of unit length of the balanced matrix: what multiplies its changes.
+    conditions: FloatArray
+    #: Norm of the change of its own block that was allowed for; 0 for an entry that is an eigenvalue as it stands.
+    noise: FloatArray
+    triangular: ComplexArray
+    #: S: a permutation, a scaling by powers of two, a unitary matrix.
+    basis: ComplexArray
+
+
+def spectrum(matrix: ArrayLike, error: ArrayLike = 0.0) -> Spectrum:
+    """The eigenvalues of a real matrix and what is known about them; arguments as of `classify`."""
+    A, E = _square(matrix), numbers(error, "error")
+    if E.ndim and E.shape != A.shape:
+        raise InputError(f"errors are a number or of the shape of the matrix, {A.shape}, not {E.shape}", item="error")
+    if not np.all(np.isfinite(E) & (E >= 0)):
+        raise InputError("errors of entries are finite and not negative", item="error")
+    E, n = np.broadcast_to(E, A.shape), len(A)
+    order, blocks = _blocks((A != 0) | (E > 0))
+    A, E = A[np.ix_(order, order)], E[np.ix_(order, order)]
+    scaling, unitary = np.ones(n), np.eye(n, dtype=np.complex128)
+    diagonal, errors, noise = np.zeros((n, n), dtype=np.complex128), np.zeros(n), np.zeros(n)
+    for at in blocks:
+        size = at.stop - at.start
+        if size == 1:
+            diagonal[at, at], noise[at] = A[at, at], E[at, at][0]
+            errors[at] = EPSILON * np.abs(A[at, at][0]) + noise[at]
+            continue
+        # In parts of a power of two, lest norms leave the numbers.
+        unit = np.exp2(np.frexp(np.max(np.abs(A[at, at]) + E[at, at]))[1] - 1.0)
+        block, doubt = A[at, at] / unit, E[at, at] / unit
+        _, (scaling[at], _) = scipy.linalg.matrix_balance(np.abs(block) + doubt, permute=False, separate=True)
+        ratio = scaling[at] / scaling[at][:, None]
+        triangular, unitary[at, at] = _schur(block * ratio)
+        moved = size * EPSILON * np.linalg.norm(block * ratio) + np.linalg.norm(doubt * ratio)
+        own, bounds = np.diag(triangular), _bounds(triangular, float(moved))
+        # Conjugates are known equally well.
+        errors[at] = unit * np.max(np.where(own[:, None].conj() == own, bounds, 0.0), axis=1)
+        diagonal[at, at], noise[at] = unit * triangular, unit * moved
+    T = unitary.conj().T @ (A * (scaling / scaling[:, None])) @ unitary
+    for at in blocks:
+        T[at.start :, at] = 0.0
+        T[at, at] = diagonal[at, at]
+    S = np.zeros((n, n), dtype=np.complex128)
+    S[order] = scaling[:, None] * unitary
+    return Spectrum(np.diag(T).copy(), errors, _conditions(T), noise, T, S)
+
+
+def _square(matrix: ArrayLike) -> FloatArray:
+    A = numbers(matrix, "matrix")
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
+        raise InputError(f"the matrix of a linear flow is square, not of shape {A.shape}", item="matrix")
+    if not np.all(np.isfinite(A)):
+        raise InputError("the matrix is not finite", item="matrix")
+    return A
+
+
+def _blocks(acts: NDArray[np.bool_]) -> tuple[NDArray[np.intp], list[slice]]:
+    """An order of the variables in which the matrix is block upper triangular, and its blocks.
+
+    Variables that act on each other, by whatever way round, make one block.
+    """
+    _, label = connected_components(acts, directed=True, connection="strong")
+    reach = acts | np.eye(len(acts), dtype=bool)
+    for _ in range(len(acts).bit_length()):
+        reach = (reach.astype(np.float64) @ reach) > 0
+    # Who is acted on from outside the block reaches fewer than who acts on it; members of one block reach the same.
+    order = np.lexsort((np.arange(len(acts)), label, -reach.sum(axis=1)))
+    edges = [0, *(np.flatnonzero(np.diff(label[order])) + 1).tolist(), len(acts)]
+    return order, [slice(a, b) for a, b in pairwise(edges)]
+
+
+def _schur(block: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """T and the unitary matrix of the complex Schur form, with eigenvalues in exactly conjugate pairs."""
+    R, Q = scipy.linalg.schur(block, output="real")
+    T, U = R.astype(np.complex128), Q.astype(np.complex128)
+    for k in np.flatnonzero(np.diag(R, -1)):
+        # [[a, b], [c, a]] with b and c of opposite signs: a +- iw, w^2 = -bc, and (b, iw) is an eigenvector.
+        b, c = np.sqrt(abs(R[k, k + 1])), np.copysign(np.sqrt(abs(R[k + 1, k])), R[k, k + 1])
+        turn = np.array([[b, 1j * c], [1j * c, b]]) / np.hypot(b, c)
+        two = slice(k, k + 2)
+        T[:, two], U[:, two] = T[:, two] @ turn, U[:, two] @ turn
+        T[two] = turn.conj().T @ T[two]
+        T[k + 1, k] = 0.0
+        T[k, k], T[k + 1, k + 1] = R[k, k] + 1j * b * abs(c), R[k, k] - 1j * b * abs(c)
+    return T, U
+
+
+def _bounds(T: ComplexArray, noise: float) -> FloatArray:
+    """How far the eigenvalues of a triangular matrix move when it is changed by no more than `noise`.
+
+    The smaller of two bounds: n cond_k noise (Demmel, theorem 4.5), and the one of Golub and Van Loan, theorem 7.2.3,
+    which goes with a root of the noise and holds for defective matrices as well.
+    """
+    n, size = len(T), max(float(np.linalg.norm(T)), noise)
+    departure = float(np.linalg.norm(np.triu(T, 1))) / size
+    with np.errstate(over="ignore", invalid="ignore"):
+        theta = noise / size * float(np.sum(departure ** np.arange(n)))
+        return np.minimum(n * _conditions(T) * noise, size * max(theta, theta ** (1.0 / n)))
+
+
+def _conditions(T: ComplexArray) -> FloatArray:
+    """1/|y^H x| of each eigenvalue of a triangular matrix, in the order of its diagonal."""
+    _, left, right = scipy.linalg.eig(T, left=True, right=True)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.maximum(1.0, 1.0 / np.abs(np.einsum("ij,ij->j", left.conj(), right))))
+
+
+def _clusters(values: ComplexArray, errors: FloatArray) -> list[NDArray[np.intp]]:
+    """Groups of eigenvalues whose discs overlap, one with another."""
+    near = np.abs(values[:, None] - values) <= errors[:, None] + errors
+    count, label = connected_components(near, directed=False)
+    return [np.flatnonzero(label == k) for k in range(count)]
+
+
+# -- the Jordan form ----------------------------------------------------------------------------------
+
+
+class JordanBlocks(NamedTuple):
+    """One eigenvalue and the sizes of its blocks (notes eqs. 11, 12)."""
+
+    #: The mean of those that were taken as one.
+    eigenvalue: complex
+    #: Largest first; (1, 1) is two blocks of size 1.
+    sizes: tuple[int, ...]
+    #: Whether the structure stands out from rounding: no other eigenvalue lies so near that it might belong to these,
+    #: and no coupling is so weak that it might be none. If not, it is one of several that the matrix may have.
+    certain: bool = True
+    #: A matrix with this structure exactly lies so near, in parts of the norm of the (balanced) matrix.
+    distance: float = 0.0
+
+
+class JordanForm(NamedTuple):
+    """A = T J T^-1 (notes eq. 10); T has chains of generalized eigenvectors, those of a block side by side."""
+
+    T: ComplexArray
+    J: ComplexArray
+    #: In the order of J.
+    blocks: list[JordanBlocks]
+
+    def propagator(self, t: float) -> ComplexArray:
+        """T exp(Jt) T^-1, block by block, shape (n, n) (notes eq. 13).
+
+        Off exp(At) by the rounding times the condition number of T, which is large for matrices that are nearly
+        defective; `LinearFlow.propagator` has no such error.
+        """
+        parts = [jordan_block_propagator(b.eigenvalue, size, t) for b in self.blocks for size in b.sizes]
+        return np.asarray(np.linalg.solve(self.T.T, (self.T @ scipy.linalg.block_diag(*parts)).T).T)
+
+
+def jordan_block(eigenvalue: complex, size: int) -> NDArray[np.inexact]:
+    """lambda on the diagonal, ones above it, shape (size, size) (notes eq. 12)."""
+    return np.asarray(eigenvalue * np.eye(size) + np.eye(size, k=1))
+
+
+def jordan_block_propagator(eigenvalue: complex, size: int, t: float) -> NDArray[np.inexact]:
+    """exp(J t) of one block in closed form: e^(lambda t) t^k/k! on the k-th diagonal, shape (size, size)."""
+    terms = np.cumprod(np.concatenate([[1.0], t / np.arange(1.0, size)]))
+    return np.asarray(np.exp(eigenvalue * t) * scipy.linalg.toeplitz(np.eye(size)[0], terms))
+
+
+def jordan_form(matrix: ArrayLike, error: ArrayLike = 0.0) -> JordanForm:
+    """T and J of a real matrix (notes eqs. 10-12), largest real parts first; arguments as of `classify`."""
+    found = spectrum(matrix, error)
+    pieces: list[tuple[JordanBlocks, ComplexArray]] = []
+    for members in _clusters(found.values, found.errors):
+        mean = _mean(found.values[members])
+        if mean.imag < 0:
+            continue  # comes with its conjugate
+        for blocks, chains in _structures(found, members):
+            pieces.append((blocks, chains))
+            if mean.imag > 0:
+                pieces.append((blocks._replace(eigenvalue=blocks.eigenvalue.conjugate()), chains.conj()))
+    pieces.sort(key=lambda piece: (-piece[0].eigenvalue.real, -piece[0].eigenvalue.imag))
+    J = scipy.linalg.block_diag(*[jordan_block(b.eigenvalue, size) for b, _ in pieces for size in b.sizes])
+    return JordanForm(np.concatenate([c for _, c in pieces], axis=1), J.astype(np.complex128), [b for b, _ in pieces])
+
+
+def _mean(values: ComplexArray) -> complex:
+    """The mean of some eigenvalues: exactly real where they come in conjugate pairs, exact where all are equal."""
+    if np.all(values == values[0]):
+        return complex(values[0])
+    return complex(np.mean(values.real), 0.0 if abs(np.sum(values.imag)) == 0.0 else np.mean(values.imag))
+
+
+def _structures(
+    found: Spectrum, members: NDArray[np.intp], closer: float = 1.0
+) -> list[tuple[JordanBlocks, ComplexArray]]:
+    """Blocks and chains of eigenvalues that may be one; of parts of them where they have no common structure."""
+    values, m = found.values[members], len(members)
+    mean = _mean(values)
+    chosen = np.isin(np.arange(len(found.values)), members).astype(np.int32)
+    T, Q, *_ = scipy.linalg.lapack.ztrsen(chosen, found.triangular, np.eye(len(chosen), dtype=np.complex128), job="N")
+    top, basis = T[:m, :m], found.basis @ Q[:, :m]
+    if m == 1:
+        return [(JordanBlocks(mean, (1,), closer == 1.0), _of_unit_length(basis))]
+    # What the entries of `top` may be off by: from the Schur form, from the exchanges, and from the mean.
+    noise = m * EPSILON * float(scipy.linalg.norm(np.triu(top, 1)))
+    noise += max(float(found.noise[k]) or abs(found.values[k] - mean) for k in members)
+    stairs = _staircase(top - mean * np.eye(m), NULL * noise)
+    if stairs is None:
+        parts = _clusters(values, found.errors[members] / (CLOSER * closer))
+        return [piece for part in parts for piece in _structures(found, members[part], CLOSER * closer)]
+    widths, W, V, neglected, kept = stairs
+    sizes = tuple(sum(w > k for w in widths) for k in range(widths[0]))
+    certain = closer == 1.0 and kept > STANDS_OUT * NULL * noise
+    distance = neglected / (float(scipy.linalg.norm(found.triangular)) or 1.0)
+    chains = np.split(basis @ V @ _chains(W, widths), np.cumsum(sizes)[:-1], axis=1)
+    return [(JordanBlocks(mean, sizes, certain, distance), np.hstack([_of_unit_length(c) for c in chains]))]
+
+
+def _of_unit_length(chain: ComplexArray) -> ComplexArray:
+    """A chain of which the largest number is real."""
+    largest = chain.ravel()[np.argmax(np.abs(chain))]
+    return np.asarray(chain * (abs(largest) / largest) / scipy.linalg.norm(chain))
+
+
+def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, ComplexArray, float, float] | None:
+    """Null spaces of a nilpotent matrix and of what is left of it, one after the other.
+
+    Returns the dimensions of them, which never grow, as singular values interlace; W, strictly upper triangular by
+    blocks of these sizes, and the unitary V with V W V^H = N but for what was neglected; the norm of that; and the
+    least singular value that was not taken as zero. None if N is not nilpotent to this accuracy.
+    """
+    W, V = N.copy(), np.eye(len(N), dtype=np.complex128)
+    widths: list[int] = []
+    start, neglected, kept = 0, 0.0, np.inf
+    while start < len(N):
+        _, singular, vh = np.linalg.svd(W[start:, start:])
+        null = int(np.sum(singular <= zero))
+        if null == 0:
+            return None
+        kept = min([kept, *singular[:-null]])
+        neglected = math.hypot(neglected, *singular[-null:])
+        turn = np.roll(vh, null, axis=0).conj().T
+        W[:, start:], V[:, start:] = W[:, start:] @ turn, V[:, start:] @ turn
+        W[start:, :] = turn.conj().T @ W[start:, :]
+        W[start:, : start + null] = 0.0
+        widths.append(null)
+        start += null
+    return widths, W, V, neglected, kept
+
+
+def _chains(W: ComplexArray, widths: list[int]) -> ComplexArray:
+    """C with W C = C J for a nilpotent W in staircase form; longest chains first."""
+    edges = np.concatenate([[0], np.cumsum(widths)])
+    chains: list[list[ComplexArray]] = []
+    for level in reversed(range(len(widths))):
+        for chain in chains:
+            chain.insert(0, W @ chain[0])
+        here = slice(edges[level], edges[level + 1])
+        # What the chains that came down leave free at this level: ends of new chains.
+        free = np.eye(widths[level])
+        if chains:
+            taken = np.stack([chain[0][here] for chain in chains], axis=1)
+            free = np.linalg.qr(taken, mode="complete")[0][:, len(chains) :]
+        for column in free.T:
+            end = np.zeros(len(W), dtype=np.complex128)
+            end[here] = column
+            chains.append([end])
+    return np.stack([vector for chain in chains for vector in chain], axis=1)
+
+
+# -- stability ----------------------------------------------------------------------------------------
+
+
+class Kind(Enum):
+    """What the flow looks like around an equilibrium; a real part within its error counts as zero."""
+
+    NODE = "node"
+    FOCUS = "focus"
+    SADDLE = "saddle"
+    CENTER = "center"
+    DEGENERATE = "degenerate"
+
+
+class Stability(Enum):
+    """What becomes of a small deviation."""
+
+    ASYMPTOTIC = "asymptotically stable"
+    STABLE = "stable"
+    UNSTABLE = "unstable"
+    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it.
+    UNKNOWN = "cannot be told"
+
+
+class Classification(NamedTuple):
+    """Kind and stability of a linear flow."""
+
+    kind: Kind
+    stability: Stability
+    #: 'star' or 'improper' for nodes with one eigenvalue only; 'saddle-focus'; otherwise empty.
+    detail: str
+    #: Sorted by real part, largest first.
+    eigenvalues: ComplexArray
+    #: Whether all real parts are known not to vanish. Only then does the linear flow decide about the stability of an
+    #: equilibrium of a flow that is not linear.
+    hyperbolic: bool
+    #: How far each eigenvalue may be off.
+    errors: FloatArray
+    #: The condition number of each eigenvalue, of the balanced matrix; infinite or nearly so for a defective one.
+    conditions: FloatArray
+
+    def __str__(self) -> str:
+        name = self.detail if self.detail == "saddle-focus" else f"{self.detail} {self.kind.value}".strip()
+        if self.stability is Stability.UNKNOWN:
+            return f"{name} whose stability cannot be told"
+        return f"{self.stability.value} {name}"
+
+
+def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
+    """Name the flow dX/dt = A X (notes eq. 14, completed).
+
+    Node: all eigenvalues real and of one sign; focus: real parts of one sign, some eigenvalues complex; saddle: real
+    parts of both signs; center: all purely imaginary; degenerate: an eigenvalue 0, or zero real parts among others.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (n, n)
+    error : array_like, shape (n, n) or a number
+        How far the entries may be off, beyond their rounding: of a Jacobian by differences, for example. Without any,
+        real parts of exactly zero are found, for up to 24 variables.
+    """
+    A, found = _square(matrix), spectrum(matrix, error)
+    groups = _clusters(found.values, found.errors)
+    signs = np.zeros(len(A), dtype=int)
+    zero = turning = False
+    for g in groups:
+        real, mean, off = found.values[g].real, complex(np.mean(found.values[g])), found.errors[g]
+        signs[g] = 1 if np.all(real > off) else -1 if np.all(real < -off) else 0
+        zero, turning = zero or abs(mean) <= max(off), turning or abs(mean.imag) > max(off)
+    present, detail = set(signs.tolist()), ""
+    if zero or (0 in present and len(present) == 2):
+        kind = Kind.DEGENERATE
+    elif len(present) > 1:
+        kind, detail = Kind.SADDLE, "saddle-focus" if turning and 0 not in present else ""
+    else:
+        kind = Kind.CENTER if present == {0} else Kind.FOCUS if turning else Kind.NODE
+    if kind is Kind.NODE and len(groups) == 1 and len(A) > 1:
+        blocks = jordan_form(A, error).blocks
+        if len(blocks) == 1:
+            detail = "star" if blocks[0].sizes[0] == 1 else "improper"
+    stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN
+    axis = on_axis(A) if stability is Stability.UNKNOWN and not np.any(error) else None
+    if axis is not None and axis[0] == np.sum(signs == 0):
+        stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
+    order = np.lexsort((-found.values.imag, -found.values.real))
+    return Classification(
+        kind,
+        stability,
+        detail,
+        found.values[order],
+        0 not in present,
+        found.errors[order],
+        found.conditions[order],
+    )
+
+
+#: Coefficients, that of the highest power first; none for the polynomial 0.
+Polynomial: TypeAlias = list[Fraction]
+
+
+def on_axis(matrix: FloatArray) -> tuple[int, bool] | None:
+    """How many eigenvalues lie on the imaginary axis exactly, and whether all their Jordan blocks have size 1.
+
+    A real part of zero is no matter of accuracy: the least change of an entry makes it positive or negative. Only a
+    matrix whose numbers are meant as they stand has one, and there it can be decided, since doubles are integers times
+    a power of two. Eigenvalues on the axis are common roots of the characteristic polynomials of A and -A. None where
+    common roots lie off the axis, or of a matrix with more than `LARGEST` variables.
+    """
+    n = len(matrix)
+    if n > LARGEST:
+        return None
+    entries = [[Fraction(float(v)) for v in row] for row in matrix]
+    unit = max(v.denominator for row in entries for v in row)
+    A = np.array([[int(v * unit) for v in row] for row in entries], dtype=object)
+    p, M = [Fraction(1)], 0 * A
+    for k in range(1, n + 1):  # Faddeev and Leverrier: det(l - A)
+        M = A @ M
+        M[np.diag_indices(n)] += int(p[-1])
+        p.append(Fraction(-int(np.trace(A @ M)), k))
+    common = _common(p, [c * (-1) ** k for k, c in enumerate(p)])
+    once = _divided(common, _common(common, _derivative(common)))[0]  # each of the common roots once
+    if not _all_negative(once[::2]):
+        return None
+    # The least polynomial of A has simple roots on the axis if this one vanishes at A.
+    least = len(once) == len(common) or not np.any(_at(_divided(p, common)[0], A) @ _at(once, A))
+    return len(common) - 1, least
+
+
+def _at(p: Polynomial, A: NDArray[np.object_]) -> NDArray[np.object_]:
+    """A multiple of p(A), in integers."""
+    value, scale = 0 * A, math.lcm(*(c.denominator for c in p))
+    for c in p:
+        value = value @ A
+        value[np.diag_indices(len(A))] += int(c * scale)
+    return value
+
+
+def _divided(a: Polynomial, b: Polynomial) -> tuple[Polynomial, Polynomial]:
+    """Quotient and remainder."""
+    quotient, rest = [], list(a)
+    while len(rest) >= len(b):
+        factor = rest[0] / b[0]
+        quotient.append(factor)
+        rest = [r - factor * (b[k] if k < len(b) else 0) for k, r in enumerate(rest)][1:]
+    return quotient, rest[next((k for k, c in enumerate(rest) if c), len(rest)) :]
+
+
+def _common(a: Polynomial, b: Polynomial) -> Polynomial:
+    """The greatest common divisor, its leading coefficient 1."""
+    while b:
+        a, b = b, _divided(a, b)[1]
+        b = [c / abs(b[0]) for c in b]
+    return [c / a[0] for c in a]
+
+
+def _derivative(p: Polynomial) -> Polynomial:
+    return [c * (len(p) - 1 - k) for k, c in enumerate(p[:-1])]
+
+
+def _all_negative(p: Polynomial) -> bool:
+    """Whether all roots of a polynomial without double roots, and not 0 at 0, are real and negative (Sturm)."""
+    chain = [p, _derivative(p)]
+    while len(chain[-1]) > 1:
+        rest = [-c for c in _divided(chain[-2], chain[-1])[1]]
+        chain.append([c / abs(rest[0]) for c in rest])
+    far, near = [q[0] * (-1) ** (len(q) - 1) for q in chain if q], [q[-1] for q in chain if q]
+    changes = [sum((a > 0) != (b > 0) for a, b in pairwise([v for v in values if v])) for values in (far, near)]
+    return changes[0] - changes[1] == len(p) - 1
+
+
+# -- equilibria ---------------------------------------------------------------------------------------
+
+
+class Equilibrium(NamedTuple):
+    """A point where V vanishes."""
+
+    position: FloatArray
+    jacobian: FloatArray
+    #: Of the linear flow around it; it decides about stability only where it is `hyperbolic`.
+    classification: Classification
+    #: |V| there.
+    residual: float
+
+
+def find_equilibria(
+    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, seed: int = 0, tolerance: float = 1e-10
+) -> list[Equilibrium]:
+    """Search for equilibria within a box, by Powell's method from many starts.
+
+    They come sorted by position. A search can miss one; more starts make that less likely.
+
+    Parameters
+    ----------
+    flow : Flow
+    box : array_like, shape (n, 2)
+        Least and largest value of each variable.
+    starts : int
+        Starts: the corners and the middle of the box, the rest spread at random.
+    time : float
+        V is taken at this time.
+    seed : int
+    tolerance : float
+        |V| counts as zero below this part of its size in the box.
+    """
+    edges, starts, n = numbers(box, "box"), whole_number(starts, "starts"), flow.n
+    if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
+        raise InputError(f"the box has shape ({n}, 2), its lower edges first", item="box")
+    low, width = edges[:, 0], edges[:, 1] - edges[:, 0]
+    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * n), axis=-1).reshape(-1, n) if n <= 6 else np.zeros((0, n))
+    fixed = np.vstack([np.full((1, n), 0.5), corners])
+    spread = np.random.default_rng(seed).random((max(starts - len(fixed), 0), n))
+    points = low + width * np.vstack([fixed, spread])[:starts]
+    found: list[FloatArray] = []
+    with np.errstate(all="ignore"):
+        speeds = [float(np.linalg.norm(flow.velocity(time, p))) for p in points]
+        size = float(np.median([s for s in speeds if np.isfinite(s)] or [1.0])) or 1.0
+        for point in points:
+            try:
+                result = root(
+                    lambda X: flow.velocity(time, X),
+                    point,
+                    jac=lambda X: flow.jacobian(time, X),
+                    options={"xtol": 1e-13},
+                )
+                X = _polished(flow, time, np.asarray(result.x))
+                place, left = (X - low) / width, float(np.linalg.norm(flow.velocity(time, X)))
+            except InputError:  # the search has left all numbers
+                continue
+            inside = np.min(place) >= -SAME and np.max(place) <= 1 + SAME and left <= tolerance * size
+            if inside and all(np.max(np.abs(X - other) / width) > SAME for other in found):
+                found.append(X)
+    found.sort(key=lambda X: [round(float(value), 9) for value in X])
+    return [equilibrium_at(flow, X, time) for X in found]
+
+
+def equilibrium_at(flow: Flow, position: ArrayLike, time: float = 0.0) -> Equilibrium:
+    """What the flow does around a point where it vanishes.
+
+    The Jacobian counts as known to the accuracy of its differences and of the point. So a center of a flow that is
+    given without its Jacobian is a center whose stability cannot be told.
+    """
+    X = numbers(position, "position")
+    A, V = flow.jacobian(time, X), flow.velocity(time, X)
+    # One more Newton step says how far the point may be off, and that what the Jacobian would be there; at a root of
+    # order k it goes only a k-th part of the way.
+    there = X - np.linalg.lstsq(A, V, rcond=1e-10)[0]
+    moved = 4.0 * np.abs(flow.jacobian(time, there) - A) if np.all(np.isfinite(there)) else np.zeros_like(A)
+    return Equilibrium(X, A, classify(A, moved + flow.jacobian_error(time, X)), float(np.linalg.norm(V)))
+
+
+def _polished(flow: Flow, time: float, X: FloatArray) -> FloatArray:
+    """Two Newton steps of least norm, kept where they help."""
+    for _ in range(2):
+        V = flow.velocity(time, X)
+        trial = X - np.linalg.lstsq(flow.jacobian(time, X), V, rcond=1e-10)[0]
+        if not np.all(np.isfinite(trial)) or np.linalg.norm(flow.velocity(time, trial)) >= np.linalg.norm(V):
+            return X
+        X = trial
+    return X

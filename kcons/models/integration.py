@@ -1,0 +1,230 @@
+"""What the models share: SciPy's integrators with a projection after each step, and differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Radau, solve_ivp
+
+from kcons.constraints.arguments import FloatArray, lent, numbers
+from kcons.constraints.target import WRONG
+from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+
+METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
+#: What SciPy takes where less is asked for.
+LEAST_RTOL = 100 * float(np.finfo(float).eps)
+#: Longest of the steps of `jacobian_by_differences`, in parts of the variable where that is larger than 1.
+STEP = 0.02
+#: Parts of the time left in which a motion that is known is looked at for events.
+PARTS = 100
+
+Motion = Callable[[float], FloatArray]
+
+
+class _Along(DenseOutput):
+    """A solution between two times, by a function of time."""
+
+    def __init__(self, t_old: float, t: float, at: Motion) -> None:
+        super().__init__(t_old, t)
+        self._at = at
+
+    def _call_impl(self, t: Any) -> FloatArray:
+        return np.asarray(self._at(t) if t.ndim == 0 else np.stack([self._at(s) for s in t], axis=1))
+
+
+def projecting(
+    method: type[OdeSolver],
+    project: Callable[[float, FloatArray], FloatArray],
+    known: Callable[[float, FloatArray], Motion | None] = lambda t, y: None,
+) -> type[OdeSolver]:
+    """SciPy's method, with a projection of the end of each step, from which the next one starts, and of values between.
+
+    `known` is asked before each step. Once nothing is left to integrate it gives a function of time, which is the
+    solution from there on.
+    """
+
+    class Projecting(method):  # type: ignore[misc, valid-type]
+        t: float
+        y: FloatArray
+        motion: Motion | None = None
+        pace = 0.0
+
+        def _step_impl(self) -> tuple[bool, str | None]:
+            if self.motion is None:
+                self.motion, self.pace = known(self.t, self.y), (self.t_bound - self.t) / PARTS
+            if self.motion is not None:
+                ahead = self.t_bound - self.t
+                self.t = self.t + self.pace if abs(ahead) > 1.5 * abs(self.pace) else self.t_bound
+                self.y = self.motion(self.t)
+                return True, None
+            success, message = super()._step_impl()
+            if success:
+                y = project(self.t, self.y)
+                if isinstance(self, BDF):
+                    self.D[0] += y - self.y
+                else:
+                    self.f = self.fun(self.t, y)
+                self.y = y
+            return success, message
+
+        def _dense_output_impl(self) -> DenseOutput:
+            if self.motion is not None:
+                return _Along(self.t_old, self.t, self.motion)
+            between = super()._dense_output_impl()
+            return _Along(self.t_old, self.t, lambda t: project(t, between(t)))
+
+    Projecting.__name__ = method.__name__
+    return Projecting
+
+
+def integrate(
+    slope: Callable[[float, FloatArray], FloatArray],
+    span: tuple[float, float],
+    start: FloatArray,
+    method: type[OdeSolver],
+    project: Callable[[float, FloatArray], FloatArray],
+    known: Callable[[float, FloatArray], Motion | None],
+    **options: Any,
+) -> Any:
+    """What SciPy's ``solve_ivp`` gives with projections, as of `projecting`.
+
+    A trial step may go too far, to a singular place or to numbers that are not finite, and is then made shorter. What
+    was wrong there is raised if the run ends there.
+    """
+    told: list[Exception] = []
+
+    def tried(t: float, y: FloatArray) -> FloatArray:
+        if np.isfinite(y).all():
+            try:
+                return slope(t, y)
+            except (ContradictionError, NonFiniteError, SingularGeometryError) as error:
+                told[:] = [error]
+        return np.full(len(y), np.nan)
+
+    def placed(t: float, y: FloatArray) -> FloatArray:
+        there = project(t, y)
+        told.clear()
+        return there
+
+    try:
+        found = solve_ivp(tried, span, start, projecting(method, placed, known), **options)
+    except ValueError:  # implicit methods: no numbers in their matrix
+        if not told:
+            raise
+    else:
+        if found.status >= 0 or not told:
+            return found
+    raise told[0]
+
+
+def check_run(
+    t_span: Sequence[float], t_eval: ArrayLike | None, method: str, sizes: dict[str, Any], n: int
+) -> tuple[type[OdeSolver], tuple[float, float], FloatArray | None]:
+    """The method, the span and the times of a run of `n` variables.
+
+    Refused is also what SciPy goes on with for ever, or otherwise than was asked for: rtol below rounding, a negative
+    atol, NaN.
+    """
+    if method == "LSODA":
+        raise UnsupportedError(
+            "LSODA keeps its own copy of the state, which cannot be put back on the constraints; "
+            "use 'Radau' or 'BDF' for stiff systems"
+        )
+    if not isinstance(method, str) or method not in METHODS:
+        raise InputError(f"there is no method {method!r}; choose from {', '.join(METHODS)}", item="method")
+    try:
+        t0, t1 = (float(t) for t in t_span)
+    except (TypeError, ValueError):
+        raise InputError(f"t_span is a pair of times, not {t_span!r}", item="t_span") from None
+    if not (np.isfinite(t0) and np.isfinite(t1)):
+        raise InputError("t_span is not finite", item="t_span")
+    times = None if t_eval is None else numbers(t_eval, "t_eval")
+    if times is not None:
+        if times.ndim != 1 or not np.all((times >= min(t0, t1)) & (times <= max(t0, t1))):
+            raise InputError("t_eval is one-dimensional and within t_span", item="t_eval")
+        if np.any(np.diff(times) * (1 if t1 >= t0 else -1) <= 0):
+            raise InputError("t_eval is not sorted from the start to the end of t_span", item="t_eval")
+    for name, least in (("rtol", LEAST_RTOL), ("atol", 0.0), ("max_step", 0.0), ("first_step", 0.0)):
+        if sizes.get(name) is None:
+            continue
+        given, step = numbers(sizes[name], name), name.endswith("step")
+        if given.shape not in ((), () if step else (n,)) or not np.all(given > least if step else given >= least):
+            raise InputError(
+                f"{name} is {sizes[name]!r:.60}; give a "
+                + ("positive number" if step else f"number of {least:g} or more, or {n} of them"),
+                item=name,
+            )
+    return METHODS[method], (t0, t1), times
+
+
+def called(
+    item: str, function: Callable[..., ArrayLike], shape: tuple[int, ...], *arguments: Any, scalar: bool = False
+) -> FloatArray:
+    """What a function of the user gives, of that shape, or with `scalar` one number for all.
+
+    It can read arrays among its arguments and not change them.
+    """
+    value = numbers(function(*(lent(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
+    if value.shape != shape and not (scalar and value.shape == ()):
+        raise InputError(f"{item} returned shape {value.shape}, not {shape}", item=item)
+    return np.broadcast_to(value, shape)
+
+
+def jacobian_by_differences(
+    velocity: Callable[[float, FloatArray], ArrayLike], t: float, X: ArrayLike, step: float | FloatArray = STEP
+) -> FloatArray:
+    """dV/dX by central differences with steps h, h/2, h/4, extrapolated to order six; shape (m, n).
+
+    h is `step`, times the size of a variable where that is larger than 1; or an array of one h a variable.
+    """
+    X = numbers(X, "X")
+    steps = step if isinstance(step, np.ndarray) else step * np.maximum(1.0, np.abs(X))
+    columns = []
+    for k, h in enumerate(steps):
+        slopes = []
+        for part in (h, h / 2, h / 4):
+            up, down = X.copy(), X.copy()
+            up[k] += part
+            down[k] -= part
+            ends = [numbers(velocity(t, lent(at)), "velocity") for at in (up, down)]
+            slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
+        first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
+        columns.append((16 * second - first) / 15)
+    return np.stack(columns, axis=-1)
+
+
+def check_derivative(
+    item: str,
+    of: str,
+    given: FloatArray | None,
+    coarse: FloatArray,
+    fine: FloatArray,
+    *,
+    rounding: float = 0.0,
+    smooth: float = WRONG,
+    remedy: str = "or leave it out",
+) -> None:
+    """Refuse a derivative that differences with a step and with half of it contradict.
+
+    Where none was given, differences alone are refused if half the step changes them by more than the part `smooth`, or
+    by more than their `rounding`.
+    """
+    size = float(np.max(np.abs(fine), initial=0.0))
+    apart = np.abs(fine - coarse)
+    if given is None:
+        if np.any(apart > smooth * size + rounding):
+            raise InputError(
+                f"{of} changes too fast for differences: give its {item}, or variables of order 1", item=item
+            )
+        return
+    wrong = (np.abs(given - fine) > WRONG * size + rounding) & (apart <= WRONG * size + rounding)
+    if np.any(wrong):
+        k = tuple(np.argwhere(wrong)[0].tolist())
+        raise InputError(
+            f"{item} gives {given[k]:.6g} for entry {list(k)}, but differences of {of} give {fine[k]:.6g}; "
+            f"correct it, {remedy}",
+            item=item,
+        )

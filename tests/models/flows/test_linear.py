@@ -1,0 +1,429 @@
+"""Linear flows: exp(At), eigenvalues with their errors, Jordan structure, and stability that is told, or cannot be."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from exact_counts import in_skew_basis, left_axis_right, unimodular
+from flow_reference import case
+
+from kcons.errors import InputError
+from kcons.models.flows import (
+    Flow,
+    HamiltonianFlow,
+    Kind,
+    LinearFlow,
+    Pendulum,
+    Stability,
+    classify,
+    equilibrium_at,
+    jordan_block,
+    jordan_block_propagator,
+    jordan_form,
+)
+from kcons.models.flows.linear import LARGEST, on_axis, spectrum
+
+R = np.array([[0.0, 1.0], [-1.0, 0.0]])
+RESONANT = np.block([[R, np.eye(2)], [np.zeros((2, 2)), R]])
+
+
+def blocks_of(matrix, error=0.0):
+    return jordan_form(matrix, error).blocks
+
+
+# -- exp(At) ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["generic", "jordan3", "nilpotent", "stiff"])
+def test_reference(name):
+    given = case(f"A12_linear_{name}")
+    flow = LinearFlow(given["A"])
+    wanted = np.array(given["reference"]["x"])
+    off = abs(flow.exact(given["times"], given["initial"]["x"]) - wanted)
+    assert np.all(off < 1e-10 * np.abs(wanted).max(axis=1, keepdims=True))
+    kinds = {"generic": Kind.SADDLE, "jordan3": Kind.NODE, "nilpotent": Kind.DEGENERATE, "stiff": Kind.NODE}
+    assert flow.classification().kind is kinds[name]
+    assert (flow.classification().stability is Stability.ASYMPTOTIC) == (kinds[name] is Kind.NODE)
+    if name in ("jordan3", "nilpotent"):
+        assert [b.sizes for b in flow.jordan_form().blocks] == [(3,)]
+
+
+def test_series_and_group_property():
+    A = np.random.default_rng(2).normal(size=(3, 3))
+    flow, series, term = LinearFlow(A), np.eye(3), np.eye(3)
+    for k in range(1, 40):
+        term = term @ A * 0.7 / k
+        series = series + term
+    assert flow.propagator(0.7) == pytest.approx(series, rel=1e-13)
+    assert flow.propagator(0.3) @ flow.propagator(0.4) == pytest.approx(series, rel=1e-12)
+    J = jordan_block(-0.3, 4)
+    assert LinearFlow(J).propagator(2.5) == pytest.approx(jordan_block_propagator(-0.3, 4, 2.5), rel=1e-13)
+
+
+def test_integration_agrees():
+    flow, X0 = LinearFlow(case("A12_linear_generic")["A"]), np.array(case("A12_linear_generic")["initial"]["x"])
+    assert flow.solve((0.0, 5.0), X0).y[:, -1] == pytest.approx(flow.exact(5.0, X0), rel=1e-8)
+    assert flow.divergence(0.0, X0) == pytest.approx(np.trace(flow.matrix))
+
+
+# -- eigenvalues --------------------------------------------------------------------------------------
+
+
+def off(found, known):
+    """How far each known eigenvalue is from the nearest computed one, and the error given for that."""
+    nearest = [int(np.argmin(abs(found.values - k))) for k in known]
+    return abs(found.values[nearest] - known), found.errors[nearest]
+
+
+@pytest.mark.parametrize("known", [[-1e8, -3.0, 2.0], [-1e5, -1.0, 0.5, 7.0], [-1e10, 1.0], [3.0, -2.0, 5.0, -7.0, 11]])
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_hold_and_are_not_much_too_large(known, seed):
+    # Integer matrices of which every eigenvalue is known exactly.
+    A = in_skew_basis(np.random.default_rng(seed), [np.array([[k]]) for k in known])
+    found, n = spectrum(A), len(known)
+    away, errors = off(found, np.array(known))
+    assert np.all(away <= errors)
+    # n cond n eps |A|: what moves an eigenvalue of a full matrix is of the size of its largest entries, and no more.
+    assert np.all(errors <= 1.01 * n * found.conditions.max() * n * 2.3e-16 * np.linalg.norm(A))
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], [4, 2, 0, 3, 1]])
+def test_one_way_influence_leaves_each_scale_alone(order):
+    # A fast pair drives a slow one; nothing comes back. Whatever the order of the variables.
+    A = scipy.linalg.block_diag(1e12 * np.array([[-1.0, 2.0], [-2.0, -1.0]]), [[-1e-6, 1e-6], [-1e-6, -1e-6]], 3.0)
+    A[2, 0], A[4, 3] = 5e3, 1.0
+    known = np.array([-1e12 + 2e12j, -1e12 - 2e12j, -1e-6 + 1e-6j, -1e-6 - 1e-6j, 3.0])
+    away, errors = off(spectrum(A[np.ix_(order, order)]), known)
+    assert np.all(away <= errors)
+    assert np.all(errors <= 1e-14 * abs(known))
+
+
+def test_units_of_variables_do_not_matter():
+    rng = np.random.default_rng(4)
+    A, units = rng.normal(size=(5, 5)), 2.0 ** rng.integers(-40, 40, 5)
+    plain, scaled = classify(A), classify(A * units / units[:, None])
+    assert scaled.eigenvalues == pytest.approx(plain.eigenvalues, rel=1e-12)
+    # As small errors as the best units allow, within what balancing to powers of two can miss.
+    assert np.all(scaled.errors < 10 * plain.errors)
+    assert np.all(scaled.conditions < 10 * plain.conditions)
+    for scale in (1e-300, 1e-150, 1e150, 1e300):  # near the ends of their range
+        found = classify(scale * np.array([[-1.0, 2.0], [-2.0, -1.0]]))
+        assert sorted(found.eigenvalues.imag / scale) == pytest.approx([-2.0, 2.0], rel=1e-14)
+        assert np.all(found.errors < 1e-13 * scale)
+
+
+def test_schur_form_and_its_basis():
+    rng = np.random.default_rng(5)
+    for n in (1, 2, 3, 6, 10):
+        A = rng.normal(size=(n, n)) * (rng.random((n, n)) < 0.6)
+        found = spectrum(A)
+        assert pytest.approx(found.basis @ found.triangular, abs=1e-13 * n) == A @ found.basis
+        assert np.array_equal(np.tril(found.triangular, -1), np.zeros((n, n)))
+        assert np.array_equal(np.diag(found.triangular), found.values)
+        assert set(found.values) == set(found.values.conj())
+
+
+@pytest.mark.parametrize("size", [2, 3, 5])
+def test_defective_eigenvalues_stay_within_their_errors(size):
+    # Rounding scatters them by a root of itself; the bound goes the same way.
+    for seed in range(10):
+        X, inverse = unimodular(np.random.default_rng(seed), size)
+        A = (X @ (3 * np.eye(size, dtype=int) + np.eye(size, k=1, dtype=int)).astype(object) @ inverse).astype(float)
+        found = spectrum(A)
+        assert np.all(abs(found.values - 3.0) <= found.errors)
+        assert np.all(found.errors < 100 * np.linalg.norm(A) * 2.2e-16 ** (1 / size))
+
+
+def test_given_errors_of_entries_are_allowed_for():
+    A, rng = np.array([[-1.0, 2.0, 0.0], [0.5, -3.0, 0.1], [0.0, 0.0, -0.4]]), np.random.default_rng(6)
+    E = 1e-3 * np.array([[1.0, 0.0, 1.0], [1.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
+    found = spectrum(A, E)
+    for _ in range(100):
+        away, errors = off(found, np.linalg.eigvals(A + E * rng.uniform(-1, 1, (3, 3))))
+        assert np.all(away <= errors)
+    assert np.all((found.errors < 0.05) & (found.errors > spectrum(A).errors))
+
+
+def test_conditions_and_errors_go_with_their_eigenvalues():
+    found = classify([[-1.0, 1e4, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, 5.0]])
+    assert found.eigenvalues.tolist() == [5.0, -1.0, -2.0]
+    assert found.conditions == pytest.approx([1.0, np.hypot(1.0, 1e4), np.hypot(1.0, 1e4)], rel=1e-10)
+    assert found.errors == pytest.approx(2.3e-16 * np.array([5.0, 1.0, 2.0]), rel=0.1)
+    assert classify([[1.0, 1.0], [0.0, 1.0]]).conditions.min() > 1e14
+
+
+# -- Jordan blocks ------------------------------------------------------------------------------------
+
+
+def complex_block(eigenvalue, size):
+    """A block of a conjugate pair, as a real matrix."""
+    pair = np.array([[eigenvalue.real, eigenvalue.imag], [-eigenvalue.imag, eigenvalue.real]])
+    return np.kron(np.eye(size), pair) + np.kron(np.eye(size, k=1), np.eye(2))
+
+
+STRUCTURES = {
+    "4": ([jordan_block(-1.0, 4)], [(4,)]),
+    "8": ([jordan_block(-1.0, 8)], [(8,)]),
+    "4 and 1": ([jordan_block(-1.0, 4), [[-1.0]]], [(4, 1)]),
+    "2 and 2": ([jordan_block(3.0, 2), jordan_block(3.0, 2)], [(2, 2)]),
+    "3, 2, 1 of zero": ([jordan_block(0.0, 3), jordan_block(0.0, 2), [[0.0]]], [(3, 2, 1)]),
+    "two eigenvalues": ([jordan_block(-1.0, 3), jordan_block(2.0, 2), [[2.0]]], [(2, 1), (3,)]),
+    "stiff": ([jordan_block(-4096.0, 2), jordan_block(-1.0, 2), [[1.0]]], [(1,), (2,), (2,)]),
+    "close": ([jordan_block(1.0, 3), [[1.0625]]], [(1,), (3,)]),
+    "pair": ([complex_block(-1 + 2j, 2)], [(2,), (2,)]),
+    "long pair": ([complex_block(1j, 3), [[0.0]]], [(3,), (1,), (3,)]),
+    "ones": ([-np.eye(4)], [(1, 1, 1, 1)]),
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("seed", range(2))
+def test_structure_of_matrices_that_are_exactly_so(name, seed):
+    blocks, wanted = STRUCTURES[name]
+    A = in_skew_basis(np.random.default_rng(seed), blocks)
+    found = jordan_form(A)
+    assert sorted(b.sizes for b in found.blocks) == sorted(wanted)
+    assert all(b.certain and b.distance < 1e-13 for b in found.blocks)
+    exact = scipy.linalg.block_diag(*blocks)
+    assert sum(b.eigenvalue * sum(b.sizes) for b in found.blocks) == pytest.approx(np.trace(exact), abs=1e-10)
+    # A T = T J, T is no smaller than its columns, and J has the form it should have.
+    assert np.linalg.norm(A @ found.T - found.T @ found.J) < 1e-13 * np.linalg.norm(A) * np.linalg.norm(found.T)
+    assert np.linalg.matrix_rank(found.T, tol=1e-12) == len(A)
+    assert np.array_equal(np.triu(np.tril(found.J, 1)), found.J)
+    assert set(np.diag(found.J, 1)) <= {0.0, 1.0}
+
+
+@pytest.mark.parametrize("name", ["4", "two eigenvalues", "pair", "long pair", "3, 2, 1 of zero"])
+def test_exponential_by_blocks(name):
+    A, t = in_skew_basis(np.random.default_rng(1), STRUCTURES[name][0]), 0.4
+    form, wanted = jordan_form(A), LinearFlow(A).propagator(t)
+    allowed = 1e-13 * np.linalg.cond(form.T) * abs(wanted).max()
+    assert abs(form.propagator(t) - wanted).max() < allowed
+    assert np.linalg.cond(form.T) < 1e4
+    # (13): T exp(Jt) T^-1.
+    literal = form.T @ scipy.linalg.expm(form.J * t) @ np.linalg.inv(form.T)
+    assert abs(form.propagator(t) - literal).max() < 10 * allowed
+
+
+def test_structures_that_rounding_allows():
+    X = np.array([[2.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 3.0]])
+    for coupling, sizes, certain in ((1e-6, (2, 1), True), (1e-14, None, False), (0.0, (1, 1, 1), True)):
+        N = np.zeros((3, 3))
+        N[0, 1] = coupling
+        (found,) = blocks_of(X @ (N - np.eye(3)) @ np.linalg.inv(X))
+        assert found.certain == certain
+        assert sizes is None or found.sizes == sizes
+    # In a triangular matrix nothing is rounded: the weakest coupling counts.
+    (found,) = blocks_of([[-1.0, 1e-30], [0.0, -1.0]])
+    assert (found.sizes, found.certain) == ((2,), True)
+    for corner, distance in ((-1e-20, 0.0), (3e-16, 3e-16 / np.sqrt(3))):
+        # The nearest defective matrix lacks the corner.
+        (found,) = blocks_of([[-1.0, 1.0], [corner, -1.0]])
+        assert found.sizes == (2,)
+        assert found.distance == pytest.approx(distance, rel=0.5, abs=1e-18)
+    A = np.array([[1.0, 1.0], [0.0, 1.001]])
+    assert [b.sizes for b in blocks_of(A)] == [(1,), (1,)]
+    assert [b.sizes for b in blocks_of(A, 1e-5)] == [(2,)]
+
+
+def test_neighbours_that_rounding_joins_are_told_as_uncertain():
+    # A block of size 4 scatters by 1e-4: an eigenvalue 1e-3 away may belong to it, or not.
+    A = in_skew_basis(np.random.default_rng(2), [jordan_block(1.0, 4), [[1.0 + 2**-10]]])
+    found = blocks_of(A)
+    assert not all(b.certain for b in found)
+    assert sum(sum(b.sizes) for b in found) == 5
+    # Two blocks so near that their errors overlap, though no matrix within rounding has all four equal.
+    for apart in (2.0**-20, 2.0**-21):
+        found = blocks_of(in_skew_basis(np.random.default_rng(1), [jordan_block(1.0, 2), jordan_block(1.0 + apart, 2)]))
+        assert sum(sum(b.sizes) for b in found) == 4
+        assert not any(b.certain for b in found)
+    # Both are farther apart than they scatter: nothing is joined.
+    near = in_skew_basis(np.random.default_rng(2), [[[1.0]], [[1.0 + 2**-20]]])
+    assert [(b.sizes, b.certain) for b in blocks_of(near)] == [((1,), True), ((1,), True)]
+
+
+# -- names and stability ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("matrix", "name"),
+    [
+        ([[-1.0, 0.0], [0.0, -2.0]], "asymptotically stable node"),
+        ([[1.0, 0.3], [0.0, 2.0]], "unstable node"),
+        ([[-1.0, 0.0], [0.0, -1.0]], "asymptotically stable star node"),
+        (1e-8 * jordan_block(-1.0, 2), "asymptotically stable improper node"),
+        ([[-0.1, 1.0], [-1.0, -0.1]], "asymptotically stable focus"),
+        ([[0.1, 1.0], [-1.0, 0.1]], "unstable focus"),
+        ([[0.0, 1.0], [1.0, 0.0]], "unstable saddle"),
+        (1e8 * R, "stable center"),
+        ([[0.0, 0.0], [0.0, -1.0]], "stable degenerate"),
+        ([[0.0, 0.0], [0.0, 0.0]], "stable degenerate"),
+        ([[0.0, 1.0], [0.0, 0.0]], "unstable degenerate"),
+        ([[-0.1, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, 1.0]], "unstable saddle-focus"),
+        (scipy.linalg.block_diag(R, -1.0), "stable degenerate"),
+        # Each rate counts at its own scale.
+        (np.diag([-1e6, -2.0, 1.0]), "unstable saddle"),
+        (np.diag([-1e10, -1.0]), "asymptotically stable node"),
+        (np.diag([-1e300, 1e-300]), "unstable saddle"),
+        (np.diag([-1e10, -1e-10, 0.0]), "stable degenerate"),
+        # A part of 1e-13 is seen, one of 1e-17 is said neither to be there nor not.
+        (R + 1e-13 * np.eye(2), "unstable focus"),
+        (R - 1e-13 * np.eye(2), "asymptotically stable focus"),
+        (R + 1e-17 * np.eye(2), "center whose stability cannot be told"),
+    ],
+)
+def test_names(matrix, name):
+    found = classify(matrix)
+    assert str(found) == name
+    assert found.hyperbolic == (name.split()[-1] in ("node", "focus", "saddle", "saddle-focus"))
+
+
+def test_purely_imaginary_blocks_that_are_defective_are_unstable():
+    # Two equal oscillators, one driving the other: Re lambda = 0 everywhere, and yet t cos t.
+    assert classify(np.kron(np.eye(2), R)).stability is Stability.STABLE
+    assert classify(RESONANT).stability is Stability.UNSTABLE
+
+
+@pytest.mark.parametrize("rates", [[-1e6, -2.0, 1.0], [-1e6, -2.0, -1.0], [-1e8, 3.0], [-1e8, -3.0]])
+def test_stiff_flows_in_a_skew_basis(rates):
+    for seed in range(4):
+        found = classify(in_skew_basis(np.random.default_rng(seed), [np.array([[k]]) for k in rates]))
+        assert str(found) == ("unstable saddle" if max(rates) > 0 else "asymptotically stable node")
+        assert found.hyperbolic
+
+
+def awkward(rng, kind):
+    n = int(rng.integers(1, 6))
+    if kind == 0:  # small integers: many real parts of exactly zero, many defective ones
+        return rng.integers(-2, 3, (n, n)).astype(float)
+    if kind == 1:  # graded over 24 decades
+        return rng.normal(size=(n, n)) * 10.0 ** rng.integers(-12, 13, (n, n))
+    if kind == 2:  # with a structure of zeros
+        return rng.normal(size=(n, n)) * (rng.random((n, n)) < 0.4) * 10.0 ** rng.integers(-6, 7, (n, 1))
+    if kind == 3:  # blocks near the axis in a skew basis, rounded
+        a, X = rng.choice([0.0, 1e-17, -1e-17, 1e-9, -1e-9]), rng.normal(size=(4, 4))
+        return X @ (RESONANT + np.diag([a, a, -a, -a])) @ np.linalg.inv(X)
+    # a small real part next to fast rates
+    return np.diag([-1e9, 10.0 ** rng.integers(-12, 1) * rng.choice([-1, 1])]) + rng.normal(size=(2, 2)) * 1e-7
+
+
+def test_what_is_said_is_so():
+    """Whatever is told about hundreds of awkward matrices is what integers say of them, entry by entry as written."""
+    told = {s: 0 for s in Stability}
+    for seed in range(750):
+        A = awkward(np.random.default_rng(seed), seed % 5)
+        left, on, right = left_axis_right(A)
+        found = classify(A)
+        told[found.stability] += 1
+        if found.stability is Stability.ASYMPTOTIC:
+            assert (on, right) == (0, 0), A
+        elif found.stability is Stability.STABLE:
+            assert on > 0 and right == 0, A
+        elif found.stability is Stability.UNSTABLE:
+            assert right > 0 or on > 1, A
+        if seed % 5 == 0 and right == 0 < on:
+            # Bounded, or growing like a power of t: small integers make that plain after some time.
+            grown = np.abs(scipy.linalg.expm(A * 1e4)).max() > 1e3
+            assert found.stability is (Stability.UNSTABLE if grown else Stability.STABLE), A
+            assert on_axis(A) is None or on_axis(A)[0] == on
+        if found.hyperbolic:
+            assert on == 0, A
+            assert (np.sum(found.eigenvalues.real < 0), np.sum(found.eigenvalues.real > 0)) == (left, right), A
+    # The test would be empty if all were called unknown: of the rounded blocks all are, 150.
+    assert told[Stability.UNKNOWN] < 250
+    assert min(told.values()) > 20
+
+
+def test_what_cannot_be_told():
+    # An oscillator in a skew basis: rounding has put the eigenvalues off the axis, to one side or the other.
+    X = np.random.default_rng(3).normal(size=(4, 4))
+    A = X @ np.kron(np.diag([1.0, 3.0]), R) @ np.linalg.inv(X)
+    assert left_axis_right(A)[1] < 4
+    assert str(classify(A)) == "center whose stability cannot be told"
+    assert classify(np.kron(np.diag([1.0, 3.0]), R)).stability is Stability.STABLE
+    # A change in the last digit moves the eigenvalues of a block of size 6 by some 1e-2.
+    A = in_skew_basis(np.random.default_rng(0), [jordan_block(-1 / 1024, 6)])
+    assert classify(A).stability is Stability.UNKNOWN
+    assert classify(A - 4 * np.eye(6)).stability is Stability.ASYMPTOTIC
+    assert classify(A + 4 * np.eye(6)).stability is Stability.UNSTABLE
+    # Errors of entries; zeros that may not be zeros.
+    A = np.array([[-0.01, 1.0], [-1.0, -0.02]])
+    assert [classify(A, e).stability for e in (0.0, 1e-4)] == [Stability.ASYMPTOTIC] * 2
+    assert classify(A, 0.05).stability is classify(R, 1e-12).stability is Stability.UNKNOWN
+
+
+def test_jacobians_by_differences_are_known_as_well_as_differences_are():
+    given = equilibrium_at(Pendulum(1.3), [0.0, 0.0]).classification
+    found = equilibrium_at(HamiltonianFlow(Pendulum(1.3).hamiltonian, 1), [0.0, 0.0]).classification
+    assert (str(given), str(found)) == ("stable center", "center whose stability cannot be told")
+    assert np.all(found.errors > given.errors)
+    assert min(abs(found.eigenvalues - 1.3j)) < found.errors[0] < 1e-6
+    # A weak friction that differences do not see, and one that they do.
+    for friction, stability in ((1e-14, Stability.UNKNOWN), (1e-3, Stability.ASYMPTOTIC)):
+        damped = Flow(lambda t, X, c=friction: [X[1], -np.sin(X[0]) - c * X[1]], 2)
+        assert equilibrium_at(damped, [0.0, 0.0]).classification.stability is stability
+    # x' = x^2 has a double root, which a search finds to 1e-6: the slope 2e-6 there is that of the place.
+    for k, at in ((2, 1e-6), (3, 1e-4)):
+        flow = Flow(lambda t, X, k=k: X**k, 1, lambda t, X, k=k: [k * X ** (k - 1)])
+        assert str(equilibrium_at(flow, [at]).classification) == "degenerate whose stability cannot be told"
+
+
+@pytest.mark.parametrize(
+    ("blocks", "wanted"),
+    [
+        ([[[-1.0]]], (0, True)),
+        ([R], (2, True)),
+        ([R, R, 3 * R], (6, True)),
+        ([RESONANT, [[-2.0]]], (4, False)),
+        ([np.zeros((2, 2)), -np.eye(2)], (2, True)),
+        ([[[0.0, 1.0], [0.0, 0.0]], R], (4, False)),
+        ([RESONANT, R, np.zeros((2, 2))], (8, False)),
+        ([R - np.eye(2), [[0.0]]], (1, True)),
+        # Pairs of opposite signs, real or complex, are common roots too, but not on the axis.
+        ([[[2.0]], [[-2.0]], R], None),
+        ([R + np.eye(2), R - np.eye(2), 2 * R], None),
+    ],
+)
+def test_eigenvalues_on_the_axis_are_counted_in_integers(blocks, wanted):
+    assert on_axis(scipy.linalg.block_diag(*blocks)) == wanted
+    assert on_axis(in_skew_basis(np.random.default_rng(0), blocks)) == wanted
+
+
+def test_the_last_digit_decides():
+    assert on_axis(R + np.diag([1e-300, -1e-300])) == (2, True)
+    assert on_axis(R + np.diag([1e-300, 0.0])) == (0, True)
+    third = np.array([[0.0, 1 / 3], [-1 / 3, 0.0]])
+    assert on_axis(np.kron(third, np.array([[1.0, 0.1], [0.1, 2.0]]))) == (4, True)
+    # Numbers from one end of their range to the other.
+    assert on_axis(scipy.linalg.block_diag(1e-300 * R, 1e300 * R)) == (4, True)
+    # x'' = -K x with a symmetric K: all eigenvalues are imaginary, whatever the digits of K.
+    K = np.random.default_rng(0).normal(size=(5, 5))
+    K = K @ K.T
+    assert on_axis(np.block([[np.zeros((5, 5)), np.eye(5)], [-0.5 * (K + K.T), np.zeros((5, 5))]])) == (10, True)
+    assert on_axis(np.zeros((LARGEST + 1, LARGEST + 1))) is None
+
+
+@pytest.mark.parametrize("function", [classify, jordan_form, LinearFlow])
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[1.0, 2.0]],
+        [[np.nan]],
+        [1.0],
+        np.zeros((0, 0)),
+        1j * np.eye(2),
+        np.ma.masked_array(np.eye(2), mask=[[0, 1], [0, 0]]),
+        [["a"]],
+        np.array([[None]]),
+    ],
+)
+def test_bad_matrices_are_refused(function, matrix):
+    with pytest.raises(InputError) as caught:
+        function(matrix)
+    assert caught.value.item == "matrix"
+
+
+@pytest.mark.parametrize("error", [-1e-3, np.nan, np.inf, np.ones(2), np.ones((3, 2)), 1j, "much"])
+def test_bad_errors_are_refused(error):
+    with pytest.raises(InputError) as caught:
+        classify(np.eye(2), error)
+    assert caught.value.item == "error"

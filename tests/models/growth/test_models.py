@@ -1,0 +1,294 @@
+"""Growth models without constraints: equations, closed forms, invariants, and what is refused; ideal mixtures."""
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from exact_mixture import exact_energies
+from growth_reference import case
+from scipy.special import rel_entr
+
+from kcons.errors import InputError, NonFiniteError
+from kcons.models.flows import jacobian_by_differences
+from kcons.models.growth import (
+    ConstrainedGrowth,
+    GrowthModel,
+    HolonomicRow,
+    Hypercycle,
+    Logistic,
+    LotkaVolterra,
+    Mixture,
+    Populations,
+    solve,
+)
+from kcons.models.growth.model import entropy_function
+
+MU0 = np.array([0.15, 0.2, 0.25, 0.3, 0.35])
+
+
+def test_drift_is_the_equation_of_the_notes():
+    model = GrowthModel(lambda t, x: [t, x[0]], lambda t, x: [0.5, 0.0], n=2)
+    assert model.drift(Populations.from_values(3.0, [2.0, 4.0])).tolist() == [0.5 + 2.0 * 3.0, 4.0 * 2.0]
+    assert model.velocity(3.0, [2.0, 4.0]).tolist() == [6.5, 8.0]
+
+
+def test_field_of_a_phase_portrait_includes_negative_populations():
+    model = GrowthModel(lambda t, x: [1.0 - x[1], np.sum(x)], n=2)
+    assert model.velocity(0.0, [-1.0, 3.0]).tolist() == [2.0, 6.0]
+    # State by state, whatever the functions would make of an array of them.
+    assert model.velocity(0.0, [[-1.0, 1.0], [3.0, 1.0]]).tolist() == [[2.0, 0.0], [6.0, 2.0]]
+
+
+def test_formal_solution_keeps_positive():
+    # x(t) = x(0) exp(integral of phi): phi = -1e3 takes x to exp(-1e4), below the numbers of the machine.
+    found = solve(ConstrainedGrowth(GrowthModel(lambda t, x: [-1e3], n=1)), (0.0, 10.0), [1.0])
+    assert found.log_y[0, -1] == pytest.approx(-1e4, rel=1e-12)
+    assert found.y[0, -1] == 0.0
+
+
+def test_sources_lift_tiny_populations():
+    # dx/dt = s - x: x = s + (x0 - s) exp(-t).
+    model = GrowthModel(lambda t, x: [-1.0], lambda t, x: [0.3], n=1)
+    times = np.linspace(0.0, 5.0, 11)
+    found = solve(ConstrainedGrowth(model), (0.0, 5.0), [1e-30], t_eval=times, rtol=1e-12, atol=1e-12)
+    assert found.y[0] == pytest.approx(0.3 * -np.expm1(-times) + 1e-30 * np.exp(-times), rel=1e-10, abs=0)
+
+
+def test_functions_cannot_change_the_populations():
+    def feeding(t, x):
+        x[0] += 1.0
+        return x
+
+    x = np.array([1.0, 2.0])
+    with pytest.raises(ValueError, match="read-only"):
+        GrowthModel(feeding, n=2).velocity(0.0, x)
+    assert x.tolist() == [1.0, 2.0]
+
+
+def test_what_is_not_finite_is_named():
+    model = GrowthModel(lambda t, x: [0.0, t], lambda t, x: [1.0 / x[0], 0.0], n=2)
+    with np.errstate(all="ignore"):
+        assert model.not_finite(Populations.from_values(1.0, [1.0, 1.0])) is None
+        assert model.not_finite(Populations.from_values(np.inf, [1.0, 1.0])) == ("rate", 1)
+        assert model.not_finite(Populations(1.0, np.zeros(2), np.full(2, -800.0))) == ("source", 0)
+
+
+# -- logistic growth, Lotka-Volterra -------------------------------------------------------------------
+
+
+def test_logistic_reference():
+    given = case("A12_logistic")
+    p, times = given["parameters"], np.array(given["times"])
+    model, wanted = Logistic(p["r"], p["r"] / p["K"]), np.array(given["reference"]["x"])[:, 0]
+    assert model.exact(times, 0.01) == pytest.approx(wanted, rel=1e-14)
+    found = solve(ConstrainedGrowth(model), (0.0, 20.0), [0.01], t_eval=times, rtol=1e-12, atol=1e-12)
+    assert found.y[0] == pytest.approx(wanted, rel=1e-10)
+
+
+def test_logistic_plateau_whatever_the_start():
+    model = Logistic(1.0, 0.1)
+    assert [float(model.exact(800.0, x0)) for x0 in (0.01, 5.0, 30.0)] == pytest.approx([10.0] * 3, rel=1e-15)
+    assert model.plateau == 10.0
+    assert model.jacobian(0.0, [model.plateau]).tolist() == [[-1.0]]
+    # Long before and after; before a population above the plateau was infinite there is nothing.
+    np.testing.assert_array_equal(model.exact([-1e4, 1e6], 1.0), [0.0, 10.0])
+    assert model.exact(-2.0, 1.0) == pytest.approx(10.0 / (1 + 9 * np.exp(2.0)), rel=1e-15)
+    assert np.all(model.exact([-0.6, 5.0], 20.0) > model.plateau)
+    with pytest.raises(InputError, match=r"x = 20 at t = 0 came from infinity at t = -0\.693147; give later times"):
+        model.exact([0.0, -1.0], 20.0)
+
+
+def lotka_volterra():
+    p = case("A12_lotka_volterra")["parameters"]
+    return LotkaVolterra(p["a"], p["b"], p["d"], p["c"])
+
+
+def test_lotka_volterra_reference():
+    given = case("A12_lotka_volterra")
+    model, x0 = lotka_volterra(), given["initial"]["x"]
+    found = solve(ConstrainedGrowth(model), (0.0, 100.0), x0, t_eval=given["times"], rtol=1e-13, atol=1e-13)
+    assert pytest.approx(np.array(given["reference"]["x"]), rel=1e-10) == found.y.T
+    assert model.invariant(found.y) == pytest.approx(np.full(6, model.invariant(x0)), rel=1e-11)
+    # The reference writes G without the constants of (73).
+    a, c = model.alpha1, model.beta2
+    constant = a * np.log(model.equilibrium[1]) + c * np.log(model.equilibrium[0])
+    assert model.invariant(x0) - constant == pytest.approx(given["conserved_G"]["value"], rel=1e-12)
+
+
+def test_row_that_is_conserved_anyway_does_nothing():
+    model, x0 = lotka_volterra(), np.array([10.0, 5.0])
+    row = HolonomicRow(lambda t, x: model.invariant(x), lambda t, x: model.invariant_gradient(x), name="G")
+    held = ConstrainedGrowth(model, row)
+    assert abs(held.constraint_rates(0.0, x0)).max() < 1e-12
+    found = solve(held, (0.0, 50.0), x0, rtol=1e-6, atol=1e-6)
+    assert abs(found.residuals()).max() < 1e-13
+    free = solve(ConstrainedGrowth(model), (0.0, 50.0), x0, rtol=1e-6, atol=1e-6)
+    assert np.ptp(model.invariant(free.y)) > 1e-6  # what the row is good for
+
+
+def test_lotka_volterra_with_four_different_parameters():
+    # Each parameter at its own place in (69)-(77), none equal to another.
+    model, x = LotkaVolterra(alpha1=1.1, beta1=0.4, alpha2=0.25, beta2=0.7), np.array([2.0, 3.0])
+    assert model.equilibrium == pytest.approx([0.7 / 0.25, 1.1 / 0.4], rel=1e-15)
+    assert model.velocity(0.0, x) == pytest.approx([2.0 * (1.1 - 0.4 * 3.0), -3.0 * (0.7 - 0.25 * 2.0)], rel=1e-14)
+    assert model.velocity(0.0, model.equilibrium) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert model.jacobian(0.0, x) == pytest.approx(jacobian_by_differences(model.velocity, 0.0, x), abs=1e-11)
+    assert model.divergence(x) == pytest.approx(np.trace(model.jacobian(0.0, x)), rel=1e-14)
+    # (77): the corners of the Jacobian there, and what their product is.
+    center = model.jacobian(0.0, model.equilibrium)
+    assert center == pytest.approx(np.array([[0.0, -0.4 * 0.7 / 0.25], [1.1 * 0.25 / 0.4, 0.0]]), abs=1e-15)
+    assert center[0, 1] * center[1, 0] == pytest.approx(-1.1 * 0.7, rel=1e-14)
+    # (73): G is stationary there, and constant along the flow.
+    assert model.invariant_gradient(model.equilibrium) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert model.invariant_gradient(x) @ model.velocity(0.0, x) == pytest.approx(0.0, abs=1e-14)
+    slopes = jacobian_by_differences(lambda t, x: model.invariant(x), 0.0, x)
+    assert model.invariant_gradient(x) == pytest.approx(slopes, abs=1e-11)
+
+
+# -- mixtures -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", ["IC1", "IC2", "IC3sum2"])
+def test_reference_states(start):
+    given, mixture = case(f"A11_hypercycle_{start}_b"), Mixture(MU0)
+    reference = {key: np.array(value) for key, value in given["reference"].items()}
+    p, total = Populations.from_values(0.0, reference["x"].T), sum(given["initial"]["x"])
+    assert pytest.approx(reference["mu"], rel=1e-12) == mixture.potentials(p).T
+    assert pytest.approx(reference["M0_M1_M2"], rel=1e-12) == np.array(mixture.moments(p)).T
+    assert mixture.gibbs_energy(p) == pytest.approx(reference["gibbs_g"], rel=1e-12)
+    assert mixture.excess(p, total) == pytest.approx(reference["g_minus_geq"], rel=1e-12)
+    assert np.exp(mixture.equilibrium(total)) == pytest.approx(np.array(given["x_eq"]), rel=1e-12)
+    assert mixture.least_gibbs_energy(total) == pytest.approx(given["g_eq"], rel=1e-14)
+    assert mixture.excess(p, total)[0] == pytest.approx(given["T_times_seq_minus_s0"], rel=1e-14)
+
+
+def test_excess_is_accurate_next_to_equilibrium():
+    mixture, u = Mixture(MU0), 1e-9 * np.array([1.0, -2.0, 0.5, 3.0, -1.0])
+    log_eq = mixture.equilibrium(1.0)
+    found = mixture.excess(Populations.from_logarithms(0.0, log_eq + u), 1.0)
+    # Second order in u; a difference of Gibbs energies would be round-off alone.
+    assert found == pytest.approx(0.5 * (np.exp(log_eq) @ u**2 - (np.exp(log_eq) @ u) ** 2), rel=1e-6)
+
+
+def test_excess_off_the_total_is_that_of_the_actual_sum():
+    mixture, x = Mixture(MU0, 0.7), np.array([0.3, 0.2, 0.4, 0.1, 0.05])
+    p = Populations.from_values(0.0, x)
+    plain = mixture.gibbs_energy(p) - mixture.least_gibbs_energy(x.sum())
+    assert mixture.excess(p, 1.0) == pytest.approx(plain, rel=1e-12)
+    assert plain == pytest.approx(0.7 * rel_entr(x, np.exp(mixture.equilibrium(x.sum()))).sum(), rel=1e-12)
+
+
+def test_potentials_are_the_gradient_of_the_excess():
+    mixture, x = Mixture(MU0, 0.7), np.array([0.3, 0.2, 0.4, 0.1, 0.05])
+    p = Populations.from_values(0.0, x)
+    gradient = mixture.potentials(p) - mixture.least_gibbs_energy(1.0)
+    slopes = jacobian_by_differences(
+        lambda t, x: mixture.excess(Populations.from_values(t, x), 1.0), 0.0, x, np.full(5, 1e-3)
+    )
+    assert gradient == pytest.approx(slopes, abs=1e-9)
+    relative = mixture.relative_potentials(p)
+    assert relative == pytest.approx(gradient - gradient[2], abs=1e-14)
+    assert relative[2] == 0.0
+
+
+def test_potentials_of_extinct_species_are_finite():
+    p, mixture = Populations.from_logarithms(0.0, np.array([0.0, -1e4])), Mixture([0.0, 0.0])
+    assert mixture.potentials(p).tolist() == [0.0, -1e4]
+    assert np.isfinite(mixture.gibbs_energy(p))
+
+
+def test_entropy_function_is_accurate_for_all_arguments():
+    for u in (1e-12, -1e-5, 0.1, 0.1999, 0.2001, -0.3, 2.0):
+        terms = [(k - 1) * u**k / np.prod(np.arange(1.0, k + 1)) for k in range(2, 40)]
+        assert entropy_function(u) == pytest.approx(sum(terms), rel=2e-14)
+    assert (entropy_function(-1e5), entropy_function(0.0)) == (1.0, 0.0)
+
+
+def test_excess_over_a_level_has_the_round_off_of_its_terms():
+    rng = np.random.default_rng(5)
+    sharp, plain = [], []
+    for _ in range(200):
+        # The third would be nearly alone at equilibrium, and is rare: the excess is hundreds of the terms of g.
+        mixture = Mixture(rng.normal(size=3) * 30.0 - [0.0, 0.0, 200.0])
+        p = Populations.from_logarithms(0.0, np.log(rng.dirichlet([1.0, 1.0, 1.0])) - [0.0, 0.0, 40.0])
+        total = float(np.sum(p.x))
+        level = float(mixture.excess(p, total))
+        X, g, least = exact_energies(mixture.mu0, 1.0, p.log_x)
+        exact = float(g - X * least - Decimal(level))
+        sharp.append(abs(mixture.excess_over(p, total, level) - exact) / level)
+        plain.append(abs(float(mixture.excess(p, total)) - level - exact) / level)
+    assert max(sharp) < 1e-15
+    assert max(plain) > 1e-14  # what it is for
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.05, 0.3])
+def test_excess_over_a_level_near_equilibrium(size):
+    mixture = Mixture(MU0)
+    log_x = mixture.equilibrium(1.0) + size * np.array([1.0, -2.0, 0.5, 3.0, -1.0])
+    p = Populations.from_logarithms(0.0, log_x - np.log(np.sum(np.exp(log_x))))
+    excess = float(mixture.excess(p, 1.0))
+    assert mixture.excess_over(p, 1.0, 0.75 * excess) == pytest.approx(0.25 * excess, rel=1e-13)
+    assert mixture.excess_over(p, 1.0, 0.0) == pytest.approx(excess, rel=1e-14)
+
+
+# -- refused ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Populations.from_values(0.0, [0.5, -0.1]), "population 1 is negative"),
+        (lambda: Populations.from_values(0.0, [0.5, 0.0]), "population 1 is zero"),
+        (lambda: Populations.from_values(0.0, [0.5, np.nan]), "not finite"),
+        (lambda: Populations.from_values(0.0, [[[1.0]]]), "shape"),
+        (lambda: Populations.from_values(0.0, ["a"]), "array of numbers"),
+        (lambda: Populations.from_values(0.0, [0.5, 0.5 + 1e-3j]), "complex"),
+        (lambda: Populations.from_values(0.0, np.ma.masked_array([0.5, 0.5], mask=[0, 1])), "masked"),
+        (lambda: Populations.start(0.0, 1, None, None), "either as x0 or as log_x0"),
+        (lambda: Populations.start(0.0, 1, [1.0], [0.0]), "either as x0 or as log_x0"),
+        (lambda: Populations.start(0.0, 2, None, [0.0, -np.inf]), "log_x0 is not finite"),
+        (lambda: Populations.start(0.0, 3, [1.0, 1.0], None), r"the start has shape \(2,\), not \(3,\)"),
+        (lambda: GrowthModel(lambda t, x: x, n=0), "n is 0; give a whole number, 1 or more"),
+        (lambda: GrowthModel(lambda t, x: x, n=2.7), "n is 2.7; give a whole number"),
+        (lambda: GrowthModel(lambda x: x, n=2), r"rates takes \(x\), but is called with \(t, x\)"),
+        (lambda: GrowthModel(lambda t, x: [1.0, 2.0, 3.0], n=2).velocity(0.0, [1.0, 1.0]), "shape"),
+        (lambda: GrowthModel(lambda t, x: x * 1j, n=2).velocity(0.0, [1.0, 1.0]), "complex"),
+        (
+            lambda: solve(ConstrainedGrowth(GrowthModel(lambda t, x: [np.nan, 1.0], n=2)), (0.0, 1.0), [1.0, 1.0]),
+            "rate of species 0 at the start is not finite",
+        ),
+        (lambda: Logistic(0.0), "alpha is 0"),
+        (lambda: Logistic("1"), "alpha is '1'"),
+        (lambda: Logistic(1.0, -1.0), "beta is -1"),
+        (lambda: Logistic().exact(1.0, [1.0, 2.0]), "x0 is"),
+        (lambda: Logistic().exact(1.0, -1.0), "x0 is -1"),
+        (lambda: LotkaVolterra(beta2=np.nan), "beta2 is nan"),
+        (lambda: LotkaVolterra([1.0, 2.0]), "alpha1 is"),
+        (lambda: Mixture([np.nan, 0.0]), "mu0 has shape"),
+        (lambda: Mixture([]), "mu0 has shape"),
+        (lambda: Mixture(0.0), "mu0 has shape"),
+        (lambda: Mixture([0.0, 0.0], 0.0), "kT is 0"),
+        (lambda: Mixture([0.1, 0.2], [1.0, 2.0]), "kT is"),
+        (lambda: Hypercycle(1), "n is 1"),
+        (lambda: Hypercycle("5"), "n is '5'"),
+        (lambda: Hypercycle(np.nan), "n is nan"),
+        (lambda: Hypercycle(5, -1.0), "k_h is -1"),
+        (lambda: Hypercycle(3, np.ones(2)), "k_h is"),
+        (lambda: Hypercycle(5, 1.0, [0.1, 0.2]), "2 standard potentials for 5 species"),
+    ],
+)
+def test_bad_input_is_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_negative_sources_are_refused():
+    with pytest.raises(NonFiniteError, match="source 1 is negative"):
+        GrowthModel(lambda t, x: x, lambda t, x: [0.0, -1.0], n=2).velocity(0.0, [1.0, 1.0])
+
+
+def test_a_start_is_kept_as_it_was_given():
+    given = np.array([0.0, -1e6])
+    found = Populations.start(0.0, 2, None, given).log_x
+    assert found.tolist() == given.tolist() and found is not given
+    assert Populations.start(0.0, 2, [1.0, np.e], None).log_x.tolist() == [0.0, 1.0]
