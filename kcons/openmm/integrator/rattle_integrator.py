@@ -9,7 +9,6 @@ half kick are those of the first of the next call: n steps cost n evaluations, i
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
 from typing import Any
 
 import openmm
@@ -55,11 +54,12 @@ class Ends(ProjectedIntegrator):
     _check_every = 1000
     _own_step = staticmethod(_step_or_end)
     #: The integrator that the Context has.
-    owner: Callable[[], openmm.CompoundIntegrator | None] = lambda self: None
+    owner: weakref.ReferenceType[openmm.CompoundIntegrator] | None = None
 
     @property
     def _holder(self) -> openmm.Integrator:
-        return self.owner() or self
+        owner = None if self.owner is None else self.owner()
+        return self if owner is None else owner
 
     def execute(self, end: float) -> None:
         """Begin or end leapfrog steps; OpenMM takes that for a step, and moves its clock."""
@@ -112,7 +112,7 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         self._ends = Ends(dt, "rattle", tolerance=tolerance, check_every=check_every)
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
         self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())
-        self._ends.owner = weakref.ref(self)  # type: ignore[method-assign]
+        self._ends.owner = weakref.ref(self)
         # The first is the one that answers what OpenMM asks: its velocities belong to x.
         super().addIntegrator(self._ends)
         super().addIntegrator(self._verlet)
