@@ -24,7 +24,7 @@ from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.steps import ConstantEnergy, Ensemble, Step
+from kcons.openmm.integrator.steps import ConstantEnergy, Step
 from kcons.openmm.integrator.system_checks import forces_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.steppers import State
@@ -54,7 +54,7 @@ from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
 
 
-class ReversedDrifts(Ensemble):
+class ReversedDrifts(ConstantEnergy):
     """Constant energy, with the way back of each drift: see `HamiltonianMonteCarlo.reversing_integrator`.
 
     A kick undoes itself when velocities are turned round, but for what it does across the constraints; only drifts can
@@ -438,7 +438,7 @@ def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:
         )
     if integrator.scheme is None or not (integrator.scheme.reversible and integrator.scheme.symplectic):
         raise UnsupportedError(f"{integrator!r} makes no reversible steps; use 'rattle' or 'blanes-moan4'")
-    if not isinstance(integrator.ensemble, ConstantEnergy | ReversedDrifts):
+    if not isinstance(integrator.ensemble, ConstantEnergy):
         raise UnsupportedError(f"{integrator.ensemble!r} has no energy to accept or reject by; leave out ensemble")
     moving = [part for part in integrator.parts if part.driven]
     if moving:

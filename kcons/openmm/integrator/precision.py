@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import openmm
 
+#: The tolerance of the System's constraints unless another is asked for, by precision. In single precision velocities
+#: cannot be brought closer than to some 1e-6: OpenMM's solver would go on to its last iteration.
+TOLERANCES = {"double": 1e-10, "mixed": 1e-8, "single": 1e-5}
 #: Unit roundoff of single numbers.
 SINGLE = 2.0**-24
 
@@ -42,12 +45,8 @@ class Precision:
 
     @property
     def tolerance(self) -> float:
-        """The tolerance of the System's constraints unless another is asked for.
-
-        In single precision velocities cannot be brought closer than to some 1e-6: OpenMM's solver would go on to its
-        last iteration.
-        """
-        return {"double": 1e-10, "mixed": 1e-8, "single": 1e-5}[self.name]
+        """The tolerance of the System's constraints unless another is asked for."""
+        return TOLERANCES[self.name]
 
     @property
     def place(self) -> float:
@@ -78,7 +77,3 @@ class Precision:
     def seen(self) -> float:
         """Unit roundoff of a coordinate as Forces see it."""
         return 2.0**-53 if self.name == "double" else SINGLE
-
-
-#: What integrators go by until they know their Context.
-DOUBLE = Precision("", "double")

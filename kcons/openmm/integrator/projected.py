@@ -19,7 +19,7 @@ from kcons.errors import InputError, KconsError, MissingSettingError, Unsupporte
 from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
 from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.precision import DOUBLE, Precision
+from kcons.openmm.integrator.precision import TOLERANCES, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
 from kcons.openmm.integrator.steps import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step, write_step
@@ -133,7 +133,7 @@ class ProjectedIntegrator(Integrator):
     ) -> None:
         super().__init__(picoseconds(timestep))
         self.asked_tolerance = None if tolerance is None else relative_tolerance(tolerance)
-        openmm.CustomIntegrator.setConstraintTolerance(self, self.asked_tolerance or DOUBLE.tolerance)
+        openmm.CustomIntegrator.setConstraintTolerance(self, self.asked_tolerance or TOLERANCES["double"])
         if check_every is not None:
             self.check_every = check_every
         self.scheme = to_scheme(scheme)
@@ -585,7 +585,7 @@ class ProjectedIntegrator(Integrator):
     @property
     def thermostatted(self) -> bool:
         """Whether velocities change by more than forces and constraints."""
-        return type(self.ensemble) is not ConstantEnergy
+        return not isinstance(self.ensemble, ConstantEnergy)
 
     @_OfEnsembles
     def setTemperature(self, temperature: unit.Quantity | float) -> None:
@@ -683,7 +683,7 @@ class ProjectedIntegrator(Integrator):
             It is not between 0 and 1.
         """
         wanted = relative_tolerance(tol)
-        if self.asked_tolerance is None and wanted in (DOUBLE.tolerance, self.getConstraintTolerance()):
+        if self.asked_tolerance is None and wanted in (TOLERANCES["double"], self.getConstraintTolerance()):
             return
         self.asked_tolerance = wanted
         super().setConstraintTolerance(wanted)

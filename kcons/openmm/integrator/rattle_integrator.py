@@ -9,7 +9,6 @@ half kick are those of the first of the next call: n steps cost n evaluations, i
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
 from typing import Any
 
 import openmm
@@ -55,11 +54,12 @@ class Ends(ProjectedIntegrator):
     _check_every = 1000
     _own_step = staticmethod(_step_or_end)
     #: The integrator that the Context has.
-    owner: Callable[[], openmm.CompoundIntegrator | None] = lambda self: None
+    owner: weakref.ReferenceType[openmm.CompoundIntegrator] | None = None
 
     @property
     def _holder(self) -> openmm.Integrator:
-        return self.owner() or self
+        owner = None if self.owner is None else self.owner()
+        return self if owner is None else owner
 
     def execute(self, end: float) -> None:
         """Begin or end leapfrog steps; OpenMM takes that for a step, and moves its clock."""
@@ -75,7 +75,9 @@ class RattleIntegrator(openmm.CompoundIntegrator):
     leapfrog steps that OpenMM has compiled; a call costs as many force evaluations as it has steps. Call it with many
     steps all the same: what begins and ends a call runs as slowly as ProjectedIntegrator.
 
-    For parts, thermostats and orders 4 and 6 take `ProjectedIntegrator`.
+    For parts, thermostats and orders 4 and 6 take `ProjectedIntegrator`. What this has besides steps is here as well:
+    `check`, `applyConstraints`, `applyVelocityConstraints`, `setVelocitiesToTemperature`, `minimizeEnergy`,
+    `degrees_of_freedom`, `kinetic_energy`, `computeSystemTemperature`, `context`, `attach`, `check_every`.
 
     Parameters
     ----------
@@ -112,7 +114,7 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         self._ends = Ends(dt, "rattle", tolerance=tolerance, check_every=check_every)
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
         self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())
-        self._ends.owner = weakref.ref(self)  # type: ignore[method-assign]
+        self._ends.owner = weakref.ref(self)
         # The first is the one that answers what OpenMM asks: its velocities belong to x.
         super().addIntegrator(self._ends)
         super().addIntegrator(self._verlet)
@@ -122,19 +124,11 @@ class RattleIntegrator(openmm.CompoundIntegrator):
 
     # -- running --------------------------------------------------------------------------------
 
-    @property
-    def check_every(self) -> int:
-        """Steps between two checks."""
-        return self._ends.check_every
-
-    @property
-    def context(self) -> openmm.Context:
-        """The Context that this integrator belongs to."""
-        return self._ends.context
-
-    def attach(self, context: openmm.Context) -> None:
-        """As `ProjectedIntegrator.attach`."""
-        self._ends.attach(context)
+    def __getattr__(self, name: str) -> Any:
+        """What OpenMM does not ask of every integrator is that of `ProjectedIntegrator`."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._ends, name)
 
     def _watch(self) -> Guard:
         guard = self._ends._watch()
@@ -189,51 +183,6 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         context.setStepCount(first + steps)
         if last:
             guard.look()
-
-    def check(self, context: openmm.Context | None = None) -> None:
-        """As `ProjectedIntegrator.check`."""
-        self._ends.check(context)
-
-    # -- constraints, temperature ---------------------------------------------------------------
-
-    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
-        """As `ProjectedIntegrator.applyConstraints`."""
-        self._ends.applyConstraints(context, tolerance)
-
-    def applyVelocityConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
-        """As `ProjectedIntegrator.applyVelocityConstraints`."""
-        self._ends.applyVelocityConstraints(context, tolerance)
-
-    def setVelocitiesToTemperature(
-        self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None
-    ) -> None:
-        """As `ProjectedIntegrator.setVelocitiesToTemperature`."""
-        self._ends.setVelocitiesToTemperature(context, temperature, seed)
-
-    def minimizeEnergy(
-        self,
-        context: openmm.Context | None = None,
-        tolerance: unit.Quantity | float = 10.0,
-        maxIterations: int = 0,
-    ) -> None:
-        """As `ProjectedIntegrator.minimizeEnergy`."""
-        self._ends.minimizeEnergy(context, tolerance, maxIterations)
-
-    def degrees_of_freedom(self, context: openmm.Context | None = None) -> int:
-        """As `ProjectedIntegrator.degrees_of_freedom`."""
-        return self._ends.degrees_of_freedom(context)
-
-    def independent_momenta(self, context: openmm.Context | None = None) -> int:
-        """As `ProjectedIntegrator.independent_momenta`."""
-        return self._ends.independent_momenta(context)
-
-    def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
-        """Of the velocities at x; no forces are computed."""
-        return self._ends.kinetic_energy(context)
-
-    def computeSystemTemperature(self) -> unit.Quantity:
-        """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it."""
-        return self._ends.computeSystemTemperature()
 
     # -- settings -------------------------------------------------------------------------------
 

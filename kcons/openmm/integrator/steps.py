@@ -98,9 +98,6 @@ class Integrator(openmm.CustomIntegrator):
     program: Program
     row_groups: frozenset[int]
     spare: bool
-    check_every: int
-    ensemble: Ensemble
-    context: openmm.Context
     _guard: Any
     _watch: Callable[..., Any]
     take_precision: Callable[..., None]
@@ -110,6 +107,18 @@ class Integrator(openmm.CustomIntegrator):
     independent_momenta: Callable[..., int]
     degrees_of_freedom: Callable[..., int]
     kinetic_energy: Callable[..., Any]
+
+    @property
+    def ensemble(self) -> Ensemble:
+        raise NotImplementedError
+
+    @property
+    def context(self) -> openmm.Context:
+        raise NotImplementedError
+
+    @property
+    def check_every(self) -> int:
+        raise NotImplementedError
 
 
 class Ensemble:
@@ -227,6 +236,10 @@ class Ensemble:
     def at(self, temperature: float) -> Ensemble:
         """The same at another temperature (K)."""
         raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
+
+    def with_friction(self, friction: Any) -> Ensemble:
+        """The same with another friction (1/ps)."""
+        raise UnsupportedError("there is no friction; give ensemble=Langevin(temperature, friction)")
 
     def follow(self, integrator: Integrator) -> None:
         """The integrator takes this ensemble, perhaps in the middle of a run; raise `KconsError` if it cannot."""

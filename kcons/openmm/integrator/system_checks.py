@@ -438,8 +438,8 @@ _ROUNDING = 1e-6
 
 def warn_of_barostat(context: openmm.Context, temperature: float | None, stacklevel: int) -> None:
     """Warn where a barostat judges its trials by another temperature (K) than the thermostat keeps, if there is one."""
-    for force in forces_of(context.getSystem()) if temperature is not None else ():
-        if type(force).__name__ not in BAROSTATS:
+    for force in forces_of(context.getSystem()):
+        if temperature is None or type(force).__name__ not in BAROSTATS:
             continue
         name = type(force).Temperature()
         found = float(context.getParameter(name))

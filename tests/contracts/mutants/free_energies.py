@@ -65,10 +65,10 @@ MUTANTS = [
         " tests/constraints/test_target.py::test_a_target_that_jumps_by_its_period_does_not_move_faster_there",
     ),
     (
-        "openmm/integrator/states/hearing.py",
-        "    if not heard:\n        refuse_forgotten_parts(context.getSystem(), ())",
-        "    if heard:\n        refuse_forgotten_parts(context.getSystem(), ())",
-        "tests/openmm/integrator/states/test_hearing.py::test_a_simulation_by_an_integrator_of_openmm_is_refused",
+        "openmm/integrator/guard.py",
+        "        refuse_forgotten_parts(self.system, integrator.row_groups)\n",
+        "",
+        "tests/openmm/integrator/test_edits.py::test_forgotten_parts_are_refused",
     ),
     (
         "free_energy/averages.py",

@@ -1,37 +1,35 @@
 """Mutants of what OpenMM runs."""
 
 MUTANTS = [
-    # -- programs for OpenMM --
     (
         "openmm/integrator/guard.py",
         "if squares <= self._explosive:",
         "if not squares > 1e300:",
-        "tests/openmm/integrator/states/test_calls.py::test_an_explosion_is_told_where_its_call_ends",
+        "tests/openmm/integrator/test_steps.py::test_an_explosion_is_told_where_its_call_ends",
     ),
     (
-        "openmm/integrator/step_writer.py",
+        "openmm/integrator/steps.py",
         "u=select(spread*delta(v-v_end), v_middle, v)",
         "u=select(spread, v_middle, v)",
         "tests/openmm/ensembles/test_reported_kinetic_energy.py::test_of_velocities_that_others_have_set_it_is_theirs",
     ),
     (
-        "openmm/integrator/step_writer.py",
-        'self._note_middle("v+per_h*(x-xu)")',
-        'self._note_middle("v+per_h*(x-xu)+0.5*dt*f/m")',
-        "tests/openmm/ensembles/test_reported_kinetic_energy.py"
-        "::test_with_noise_the_temperature_of_the_bath_is_reported",
+        "openmm/integrator/steps.py",
+        'step.note_middle("v+per_h*(x-xu)")',
+        'step.note_middle("v+per_h*(x-xu)+0.5*dt*f/m")',
+        "tests/openmm/ensembles/test_reported_kinetic_energy.py::test_with_noise_the_temperature_of_the_bath_is_reported",
     ),
     (
         "openmm/integrator/rattle_integrator.py",
-        "guard.count(block, ends=ends.spare and not steps and not goes_on)",
+        "guard.count(block, ends=ends.spare and not steps)",
         "guard.count(block)",
         "tests/openmm/integrator/test_rattle_integrator.py::test_the_ends_of_calls_are_checked",
     ),
     (
-        "openmm/integrator/states/settings.py",
-        "differing = self.program.differing()",
-        "differing = []",
-        "openmm_runs.py::test_a_setting_that_was_written_by_its_number_is_refused_once",
+        "openmm/integrator/program.py",
+        "        for name, value in self.settings.items():\n            self.write(name, value)\n",
+        "",
+        "tests/openmm/integrator/test_settings.py::test_a_setting_has_a_method_of_its_own",
     ),
     (
         "openmm/integrator/system_checks.py",
@@ -47,8 +45,8 @@ MUTANTS = [
     ),
     (
         "openmm/ensembles/isokinetic_ensemble.py",
-        'program.write("exact", float(precision == "double" and not rigid))',
-        'program.write("exact", 0.0)',
+        'program.set("exact", float(precision == "double" and not rigid))',
+        'program.set("exact", 0.0)',
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
     ),
     (
@@ -85,13 +83,12 @@ MUTANTS = [
         "openmm/ensembles/conserved_momenta.py",
         "if not removed:  # what a remover takes",
         "if True:  # what a remover takes",
-        "tests/openmm/ensembles/test_conserved_momenta.py::"
-        "test_a_motion_remover_takes_momentum_beside_particles_without_mass",
+        "tests/openmm/ensembles/test_conserved_momenta.py::test_a_motion_remover_takes_momentum_beside_particles_without_mass",
     ),
     (
         "openmm/integrator/guard.py",
-        'write("coarse", float(self.constraints.precision.name == "single"))',
-        'write("coarse", 0.0)',
+        '("coarse", precision.name == "single")',
+        '("coarse", False)',
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_weak_forces_are_not_lost_in_single_precision",
     ),
     (
@@ -107,7 +104,7 @@ MUTANTS = [
         "tests/openmm/ensembles/test_respa_ensemble.py::test_forces_in_reciprocal_space_have_a_number_of_steps_too",
     ),
     (
-        "openmm/integrator/lean_step_writer.py",
+        "openmm/integrator/steps.py",
         'p.when("exact+1-between != 0", "kicks need it")',
         'p.when("1-between != 0", "kicks need it")',
         "tests/openmm/ensembles/test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
@@ -119,45 +116,45 @@ MUTANTS = [
         "tests/openmm/integrator/test_system_checks.py::test_rigid_bodies_hold_all_their_distances",
     ),
     (
-        "openmm/integrator/step_writer.py",
+        "openmm/integrator/steps.py",
         'p.let("good_steps", "good_steps+delta(failed)", "count it")',
         'p.let("good_steps", "good_steps+1", "count it")',
-        "tests/openmm/integrator/test_step_writer.py::test_a_step_whose_last_projection_fails_is_not_counted",
+        "tests/openmm/integrator/test_steps.py::test_a_failed_step_is_taken_back_and_not_counted",
     ),
     (
-        "openmm/integrator/step_writer.py",
-        'p.each("x", "x_last", "back to where the step began")',
-        'p.each("x", "x", "back to where the step began")',
+        "openmm/integrator/steps.py",
+        '"failed > 0", "a solve failed"):\n        p.each("x", "x_last"',
+        '"failed > 0", "a solve failed"):\n        p.each("x", "x"',
         "tests/openmm/collective/test_collective_rows.py::test_a_step_too_large_is_taken_back",
     ),
     (
-        "openmm/integrator/step_writer.py",
+        "openmm/integrator/steps.py",
         'p.each("v", "v_last", "back to where the step began")',
         'p.each("v", "v", "back to where the step began")',
         "tests/openmm/collective/test_collective_rows.py::test_a_step_too_large_is_taken_back",
     ),
     (
-        "openmm/integrator/step_writer.py",
+        "openmm/integrator/steps.py",
         "u=v+0.5*dt*f/m+0.5*impulse",
         "u=v+0.5*dt*f/m",
-        "tests/openmm/integrator/test_lean_step_writer.py::test_leapfrog_at_rest_has_no_kinetic_energy",
+        "tests/openmm/integrator/test_steps.py::test_leapfrog_at_rest_has_no_kinetic_energy",
     ),
     (
-        "openmm/integrator/lean_step_writer.py",
+        "openmm/integrator/steps.py",
         '"select(looked, v_last, u-0.5*dt*f/m)"',
         '"v_last"',
-        "tests/openmm/integrator/test_lean_step_writer.py::test_failure_where_nobody_looked",
+        "tests/openmm/integrator/test_steps.py::test_failure_where_nobody_looked",
     ),
     (
-        "openmm/integrator/lean_step_writer.py",
-        'ensemble.middle(p, f"(x-x_start)/{h}", lambda: None)',
-        'ensemble.middle(p, f"v+(x-x_start)/{h}", lambda: None)',
+        "openmm/integrator/steps.py",
+        'ensemble.middle(step, f"(x-x_start)/{h}")',
+        'ensemble.middle(step, f"v+(x-x_start)/{h}")',
         "tests/openmm/ensembles/test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
     ),
     (
-        "openmm/integrator/lean_step_writer.py",
-        'self._kicked("kick*dt", tangent=True, unseen=True)',
-        'self._kicked("0.5*dt", tangent=True, unseen=True)',
+        "openmm/integrator/steps.py",
+        'step.kicked("kick*dt", tangent=True, unseen=True)',
+        'step.kicked("0.5*dt", tangent=True, unseen=True)',
         "tests/openmm/ensembles/test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
     ),
     (
@@ -197,13 +194,13 @@ MUTANTS = [
         "tests/openmm/collective/test_row_program.py::test_many_steps_look_less_often",
     ),
     (
-        "openmm/surfaces/surface_step_writer.py",
+        "openmm/surfaces/surface_steps.py",
         '"select(behind, 1, kick_share(first_stage))"',
         '"kick_share(first_stage)"',
-        "tests/openmm/surfaces/test_surface_step_writer.py",
+        "tests/openmm/surfaces/test_surface_steps.py",
     ),
     (
-        "openmm/surfaces/surface_step_writer.py",
+        "openmm/surfaces/surface_steps.py",
         '"select(failed, 0.5*behind, kick_share(stage))"',
         '"kick_share(stage)"',
         "tests/openmm/surfaces/test_surface_integrator.py::test_a_first_step_without_solution_leaves_velocities_without_a_kick",
@@ -212,11 +209,11 @@ MUTANTS = [
         "openmm/integrator/schemes.py",
         "            kicks[-1] += operation.fraction",
         "            kicks[0] += operation.fraction",
-        "tests/openmm/integrator/test_schemes.py",
+        "tests/openmm/integrator/test_programs.py",
     ),
     (
         "openmm/integrator/projected.py",
-        "                part.serve(self, notes)\n",
+        "            part.serve(self, notes)\n",
         "",
         "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
     ),
@@ -230,8 +227,7 @@ MUTANTS = [
         "openmm/ensembles/conserved_momenta.py",
         "context.setParameter(name, given.getParameter(name))",
         "pass",
-        "tests/openmm/ensembles/test_conserved_momenta.py"
-        "::test_forces_are_looked_at_with_the_parameters_of_the_context",
+        "tests/openmm/ensembles/test_conserved_momenta.py::test_forces_are_looked_at_with_the_parameters_of_the_context",
     ),
     (
         "openmm/ensembles/conserved_momenta.py",
@@ -243,15 +239,13 @@ MUTANTS = [
         "openmm/ensembles/conserved_momenta.py",
         "turns.keep_rows(motion, places)",
         "pass",
-        "tests/openmm/ensembles/test_conserved_momenta.py"
-        "::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
+        "tests/openmm/ensembles/test_conserved_momenta.py::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
     ),
     (
         "openmm/ensembles/conserved_momenta.py",
         "while len(found) < _PLACES or turns.open:",
         "while len(found) < _PLACES:",
-        "tests/openmm/ensembles/test_conserved_momenta.py"
-        "::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
+        "tests/openmm/ensembles/test_conserved_momenta.py::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
     ),
     (
         "openmm/ensembles/conserved_momenta.py",
@@ -263,8 +257,7 @@ MUTANTS = [
         "openmm/integrator/guard.py",
         "any(map(knows_a_place, applied))",
         "any(isinstance(force, openmm.CustomExternalForce) for force in applied)",
-        "tests/openmm/integrator/test_guard.py"
-        "::test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place",
+        "tests/openmm/integrator/test_guard.py::test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place",
     ),
     (
         "openmm/integrator/projected.py",
@@ -279,16 +272,10 @@ MUTANTS = [
         "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
-        "openmm/collective/row_program.py",
-        'clock_of(variables_of(before), notes["code"])',
-        "0.0",
-        "tests/openmm/collective/test_row_program.py::test_members_of_a_compound_integrator_pull_in_turn",
-    ),
-    (
         "openmm/callback_rows/carried_constraints.py",
         "self._engine.stand_at(self._state(context)[0])",
         "self._state(context)[0]",
-        "openmm_runs.py::test_a_run_goes_on_bit_for_bit",
+        "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
     ),
     (
         "openmm/callback_rows/callbacks.py",
@@ -301,5 +288,29 @@ MUTANTS = [
         "return self.motion.rank - 3 * fixed",
         "return self.motion.rank",
         "tests/openmm/callback_rows/test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
+    ),
+    (
+        "openmm/integrator/steps.py",
+        'asks = "select(call-1, failed, select(moved, -1, 0))"',
+        'asks = "failed"',
+        "tests/openmm/integrator/test_edits.py::test_positions_off_the_rows_are_not_pulled_back_in_silence",
+    ),
+    (
+        "openmm/integrator/steps.py",
+        '"x and v may have been changed"):\n            with p.when("moved+stale+abs(call-2)',
+        '"x and v may have been changed"):\n            with p.when("moved+stale',
+        "tests/openmm/integrator/test_steps.py::test_parameters_of_forces_are_used_in_the_next_step",
+    ),
+    (
+        "openmm/integrator/program.py",
+        "if found != self.settings[_SUM_OF_VECTORS]:",
+        "if False:",
+        "tests/openmm/integrator/test_settings.py::test_targets_stay",
+    ),
+    (
+        "openmm/integrator/guard.py",
+        "self._left == (context.getStepCount(), _box(context))",
+        "True",
+        "tests/openmm/integrator/test_rattle_integrator.py::test_change_of_the_box",
     ),
 ]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import copy
-import io
 import re
 
 import numpy as np
 import openmm
 import pytest
-from openmm import app, unit
+from openmm import unit
 from openmm_parts import HeldCoordinates
 from openmm_systems import (
-    DATA,
     PLATFORMS,
     alanine,
-    context_of,
     dumbbell,
     holding,
     loose_alanine,
@@ -103,7 +100,7 @@ def test_barostat_with_a_part_that_keeps_forces():
     """Box and positions change at the beginning of a step; the forces of that step must be the new ones."""
     system, x = water_box(64)
     system.addForce(openmm.MonteCarloBarostat(1.0, 300.0, 1))
-    integrator = ProjectedIntegrator(5e-4, parts=[Witness(192)])
+    integrator = ProjectedIntegrator(5e-4, "suzuki4", parts=[Witness(192)])
     context = started(system, integrator, x)
     integrator.setVelocitiesToTemperature(context, 300, 1)
     volumes = set()
@@ -217,43 +214,6 @@ def test_row_group_does_not_move_anything():
 # -- restarts ---------------------------------------------------------------------------------------
 
 
-def simulation(platform, integrator):
-    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
-    system, x, v = loose_alanine()
-    place = openmm.Platform.getPlatformByName(platform)
-    made = app.Simulation(pdb.topology, system, integrator, place, {"Threads": "1"} if platform == "CPU" else {})
-    made.context.setPositions(x)
-    made.context.setVelocities(v)
-    return made
-
-
-@pytest.mark.parametrize("how", ["checkpoint", "state"])
-@pytest.mark.parametrize("evaluates", [None, False, True])
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4", "leapfrog"])
-def test_restart_bit_for_bit(scheme, evaluates, how, tmp_path):
-    def integrator():
-        parts = [] if evaluates is None else [holding(evaluates=evaluates)]
-        return ProjectedIntegrator(1e-3, scheme, parts=parts)
-
-    through = simulation("Reference", integrator())
-    through.step(20)
-    name = str(tmp_path / "restart")
-    if how == "checkpoint":
-        through.saveCheckpoint(name)
-    else:
-        through.saveState(name)
-    through.step(20)
-    again = simulation("Reference", integrator())
-    if how == "checkpoint":
-        again.loadCheckpoint(name)
-    else:
-        again.loadState(name)
-    assert again.context.getStepCount() == 20
-    again.step(20)
-    np.testing.assert_array_equal(state_of(again.context), state_of(through.context))
-    assert again.context.getTime() == through.context.getTime()
-
-
 def test_restart_of_rigid_water_bit_for_bit():
     """SETTLE changes velocities that are on the constraints already in their last digits: it is not to be called."""
     system, x = water_box()
@@ -269,79 +229,6 @@ def test_restart_of_rigid_water_bit_for_bit():
     first.step(10)
     second.step(10)
     np.testing.assert_array_equal(state_of(again), state_of(through))
-
-
-@platforms
-def test_restart_is_no_worse_than_that_of_verlet_integrator(platform, tmp_path):
-    errors = []
-    for kind in (lambda: ProjectedIntegrator(1e-3), lambda: openmm.VerletIntegrator(1e-3)):
-        through = simulation(platform, kind())
-        through.step(20)
-        through.saveCheckpoint(str(tmp_path / "restart"))
-        through.step(20)
-        again = simulation(platform, kind())
-        again.loadCheckpoint(str(tmp_path / "restart"))
-        again.step(20)
-        errors.append(np.abs(state_of(again.context)[0] - state_of(through.context)[0]).max())
-    assert errors[0] <= max(errors[1], 1e-14)
-
-
-def test_checkpoint_within_a_run_goes_back():
-    system, x, v = loose_alanine()
-    integrator = ProjectedIntegrator(1e-3, parts=[holding(evaluates=True)])
-    context = started(system, integrator, x, v)
-    integrator.step(5)
-    mark = context.createCheckpoint()
-    integrator.step(5)
-    there = state_of(context)
-    context.loadCheckpoint(mark)
-    integrator.step(5)
-    np.testing.assert_array_equal(state_of(context), there)
-
-
-# -- Simulation and reporters -----------------------------------------------------------------------
-
-
-def test_reporters(tmp_path):
-    system, _, _ = alanine()
-    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
-    integrator = ProjectedIntegrator(1 * unit.femtosecond)
-    made = app.Simulation(pdb.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    made.context.setPositions(pdb.positions)
-    made.minimizeEnergy(maxIterations=20)
-    integrator.setVelocitiesToTemperature(made.context, 300 * unit.kelvin, 2)
-    table = io.StringIO()
-    made.reporters += [
-        app.StateDataReporter(table, 5, step=True, time=True, temperature=True, kineticEnergy=True, totalEnergy=True),
-        app.DCDReporter(str(tmp_path / "run.dcd"), 5),
-        app.PDBReporter(str(tmp_path / "run.pdb"), 10),
-    ]
-    made.step(20)
-    for reporter in made.reporters[1:]:
-        del reporter
-    rows = [[float(word) for word in line.split(",")] for line in table.getvalue().splitlines()[1:]]
-    assert [row[0] for row in rows] == [5, 10, 15, 20]
-    kinetic = np.array([row[2] for row in rows])
-    gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
-    np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
-    assert (tmp_path / "run.dcd").stat().st_size > 4 * 22 * 12
-    assert len(app.PDBFile(str(tmp_path / "run.pdb")).positions) == 22
-    assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(rows[-1][4], rel=1e-12)
-
-
-def test_degrees_of_freedom_count_the_rank():
-    """Methane by all ten distances has nine independent ones."""
-    corners = 0.06 * np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    system = openmm.System()
-    for m in (12.0, 1.0, 1.0, 1.0, 1.0, 0.0):
-        system.addParticle(m)
-    for i in range(5):
-        for j in range(i):
-            system.addConstraint(j, i, float(np.linalg.norm(corners[i] - corners[j])))
-    integrator = ProjectedIntegrator(1e-3)
-    context = context_of(system, integrator)
-    context.setPositions([*corners, [1, 1, 1]])
-    assert integrator.degrees_of_freedom(context) == 6
 
 
 @pytest.mark.parametrize("call", ["check", "applyConstraints", "setVelocitiesToTemperature", "degrees_of_freedom"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 
 import numpy as np
@@ -11,7 +10,6 @@ import openmm
 import pytest
 from openmm import app, unit
 from openmm_systems import (
-    DATA,
     PLATFORMS,
     alanine,
     context_of,
@@ -325,43 +323,6 @@ def test_force_groups():
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-11)
     with pytest.raises(UnsupportedError, match="before it is created"):
         fresh.setIntegrationForceGroups({0})
-
-
-def test_restart(tmp_path):
-    system, x, v = alanine()
-    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
-    integrator.step(10)
-    mark = context.createCheckpoint()
-    saved = openmm.XmlSerializer.serialize(context.getState(positions=True, velocities=True))
-    integrator.step(10)
-    there = state_of(context)
-    context.loadCheckpoint(mark)
-    integrator.step(10)
-    np.testing.assert_array_equal(state_of(context), there)
-    other = started(system, again := RattleIntegrator(1e-3), x)
-    other.setState(openmm.XmlSerializer.deserialize(saved))
-    again.step(10)
-    np.testing.assert_allclose(state_of(other)[0], there[0], rtol=0, atol=1e-10)
-
-
-def test_reporters():
-    system, _, _ = alanine()
-    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
-    integrator = RattleIntegrator(1 * unit.femtosecond)
-    made = app.Simulation(pdb.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    made.context.setPositions(pdb.positions)
-    made.minimizeEnergy(maxIterations=20)
-    integrator.setVelocitiesToTemperature(made.context, 300 * unit.kelvin, 2)
-    table = io.StringIO()
-    made.reporters.append(
-        app.StateDataReporter(table, 5, step=True, time=True, temperature=True, kineticEnergy=True, totalEnergy=True)
-    )
-    made.step(20)
-    rows = [[float(word) for word in line.split(",")] for line in table.getvalue().splitlines()[1:]]
-    assert [row[0] for row in rows] == [5, 10, 15, 20]
-    gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
-    kinetic = np.array([row[2] for row in rows])
-    np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
 
 
 # -- checks where calls end -------------------------------------------------------------------------
