@@ -12,7 +12,7 @@ import importlib, json, pkgutil, sys, types
 THEIRS = ["openmm", "openmm.app", "openmm.unit", "ase", "ase.constraints", "ase.md", "ase.optimize", "ase.io",
           "ase.md.verlet", "ase.md.langevin", "ase.md.velocitydistribution", "ase.filters", "ase.calculators.emt",
           "MDAnalysis", "MDAnalysis.analysis.base", "numpy", "numpy.linalg", "numexpr"]  # numexpr adds to numpy
-OPEN = {("ase.constraints", name) for name in ("dict2constraint", "KconsConstraints")}
+OPEN = {("ase.constraints", "KconsConstraints")}  # by which ASE opens files
 
 there = []
 for name in THEIRS:

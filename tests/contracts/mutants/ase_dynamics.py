@@ -22,8 +22,8 @@ MUTANTS = [
     # -- ASE: what changes between steps --
     (
         "ase/binding.py",
-        "if now is not held and not alike(now, held):",
-        "if False:",
+        "((now := holding(item)) is not held and not alike(now, held))",
+        "False",
         "tests/ase/test_dynamics.py::test_what_constraints_hold_changed_between_steps_is_taken",
     ),
     (
