@@ -179,27 +179,29 @@ class Interpreter:
         self.shift: FloatArray | None = None
         if start.remainder is not None:
             x, self.shift = system.near_origin(start)
-        self.begun, self.x, self.numbers = x, x, numbers
-        self.v, self.out = v.copy(), np.empty(shape)
+        self.begun = self.x = x
+        self.push = self.v = v.copy()
+        self.spare = self.out = np.empty(shape)
         self.known = f is not None
         self.forces: FloatArray = np.zeros(shape) if f is None or system.force is None else f
         self.low: FloatArray | None = None
-        self.push, self.spare, size = self.v, self.out, 0
-        if program.pairs:
-            size = 3 * x.size
-        if not size and not len(numbers):
-            self.room = _PLAIN.copy()
-        else:
+        if program.pairs or numbers is not _EMPTY:
+            size = 3 * x.size if program.pairs else 0
             self.room = room = np.empty(ROOM + size + len(numbers))
             room[PAIRS], room[ITERATIONS], room[FAR] = program.pairs, -1.0, 0.0
-        if size:
-            self.low, self.push, self.spare = room[ROOM : ROOM + size].reshape(3, *shape)
-            room[ROOM : ROOM + 2 * x.size] = 0.0
-        if len(numbers):
             room[ROOM + size :] = numbers
             self.numbers = room[ROOM + size :]
-        self.time, self.left_over = start.time, start.time_remainder
-        self._look_ahead()
+            if size:
+                self.low, self.push, self.spare = room[ROOM : ROOM + size].reshape(3, *shape)
+                room[ROOM : ROOM + 2 * x.size] = 0.0
+        else:
+            self.room, self.numbers = _PLAIN.copy(), numbers
+        self.time, self.left_over = time, left_over = start.time, start.time_remainder
+        # As State.later.
+        change = dt + left_over
+        self.then = then = time + change
+        part = then - time
+        self.left_over_then = (time - (then - part)) + (change - part)
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -233,19 +235,24 @@ class Interpreter:
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
         system, program, dt, v, room, shape = self.system, self.program, self.dt, self.v, self.room, self.shape
         packed, force, at = system.packed, system.force, 0
+        given, held = system.motion.sources
         numbers = program.numbers if system.friction is None else self._damped()
         run, tables, simple = _nothing, _EMPTY, False
         if packed is not None:
             run, tables, simple = _compiled(), packed.tables, self.simple and not system.velocity_dependent
+        cell = held.lattice
         new, array, double, end = np.empty, np.ndarray, _FLOAT, len(program.rows) - 1
         while True:
-            found = run(at, self.made + 1 < self.steps, dt, numbers, self.x, self.out, v, self.forces, room, tables)
+            more = self.made + 1 < self.steps
+            found = run(at, more, dt, numbers, self.x, self.out, v, self.forces, room, tables)
             last, at = at, found if found >= 0 else -1 - found
             if at < last:
                 self._next_step()
             if simple and program.shown[at]:  # `evaluate`, in less time
                 x = self.x = self.out
-                self.out, until = new(shape), program.ends[at]
+                until = program.ends[at]
+                if more or program.flies[at]:
+                    self.out = new(shape)
                 if force is not None:
                     # The function can neither write to it nor will anybody else: it may keep what it sees.
                     x.setflags(False)  # type: ignore[call-arg]
@@ -254,9 +261,11 @@ class Interpreter:
                     # What System.accepted finds most often.
                     usual = type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray
                     self.forces, self.known = raw if usual else system.accepted(raw, self.number, False), True
-                    tables = packed.tables  # type: ignore[union-attr]  # the force function may be a barostat, too
+                    if held.lattice is not cell or given.lattice is not cell:
+                        # It may be a barostat, too.
+                        tables, cell = packed.tables, held.lattice  # type: ignore[union-attr]
             elif at == end:
-                if self.end_step(program.rows[end]):
+                if (not more and not program.rows[end].here and packed is not None) or self.end_step(program.rows[end]):
                     break
                 at = 0
                 continue
@@ -269,7 +278,8 @@ class Interpreter:
                 if packed is not None:
                     tables = packed.tables
             at += 1
-        if packed is not None:
+        self.made += 1
+        if packed is not None and room[ITERATIONS] != packed.iterations:
             packed.took(room[ITERATIONS])
         return program.rows[end].here
 
@@ -285,10 +295,6 @@ class Interpreter:
         self.made += 1
         self.number += 1
         self.begun, self.time, self.left_over = self.x, self.then, self.left_over_then
-        self._look_ahead()
-
-    def _look_ahead(self) -> None:
-        """The time at the end of the step, and what its rounding leaves over: as State.later."""
         time, change = self.time, self.dt + self.left_over
         self.then = then = time + change
         part = then - time
@@ -302,7 +308,6 @@ class Interpreter:
         if self.system.packed is None:
             self.room[FAR] = self.system.is_far(self.x)
         if self.made + 1 >= self.steps or self.room[FAR]:
-            self.made += 1
             return True
         if self.low is not None:
             self.low.fill(0.0)
@@ -462,8 +467,9 @@ class Interpreter:
 
     def end(self, here: int) -> State:
         """The state, with remainders from here on if it is far from the origin by now."""
-        when, arrays = (self.then, self.left_over_then), (self.place(0), self.v, self.applied(here))
-        far = self.room[FAR] != 0
+        x = self.x if self.x.flags.writeable else self.x.copy()
+        when, arrays = (self.then, self.left_over_then), (x, self.v, self.applied(here))
+        far = bool(self.room[FAR])
         return self.system.ended(self.start, self.number, when, arrays, self.shift, self.low, far, self.variables())
 
     def applied(self, here: int) -> FloatArray | None:

@@ -80,8 +80,8 @@ class Program:
     rows : list of Row
     ends : list of float
         Of these.
-    shown : list of bool
-        Whether they evaluate forces at positions that no force function has seen.
+    shown, flies : list of bool
+        Whether they evaluate forces at positions that no force function has seen, and whether flights follow.
     pairs : bool
         Whether what rounding takes is kept: there are several flights, or great circles.
     """
@@ -98,6 +98,7 @@ class Program:
         self.pairs = len(flights) > 1 or any(flight.exact for flight in flights)
         self.ends = [row.end for row in self.rows]
         self.shown = [row.name == "evaluate" and row.here == 1 for row in self.rows]
+        self.flies = ["fly" in [later.name for later in self.rows[k:]] for k in range(len(self.rows))]
         self._numbers: FloatArray | None = None
 
     @property

@@ -115,4 +115,4 @@ class Splitting(Interpreted):
         start = state
         if (state is not system.last or state.forces is None) and (self.kick_first or system.velocity_dependent):
             start = system.with_forces(state)
-        return Interpreter(system, start, dt, self.program(system), steps)
+        return Interpreter(system, start, dt, self._listed(system)[1], steps)

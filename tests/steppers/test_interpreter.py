@@ -158,6 +158,7 @@ def test_methods_of_verbs_and_errors_get_the_number_of_the_step() -> None:
     program.rows.insert(0, program.rows[0]._replace(name="damp", verb=0, length=0.7, kick=0.0))
     program.ends.insert(0, 0.0)
     program.shown.insert(0, False)
+    program.flies.insert(0, False)
     with pytest.raises(ImageError) as caught:
         Noted(system, state, 0.1, program, 5).through()
     assert caught.value.step == 3 and done == [("damp", 0.7)] * 3

@@ -52,7 +52,8 @@ class PackedSystem:
         self._made_of = made_of
         self._cell, self._sources = motion.cell, motion.sources
         self._lattice = motion.lattice
-        self._took = _UNKNOWN
+        #: Those that the engine was told of last.
+        self.iterations = _UNKNOWN
         set_lattice(self._tables, self._lattice)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -91,10 +92,9 @@ class PackedSystem:
 
     def took(self, iterations: float) -> None:
         """Let the engine report these iterations; a negative number forgets them."""
-        if iterations != self._took:
-            self._took = iterations
-            if iterations >= 0:
-                self.motion.took(int(iterations))
+        self.iterations = iterations
+        if iterations >= 0:
+            self.motion.took(int(iterations))
 
 
 class PackedRows(NamedTuple):

@@ -46,8 +46,8 @@ MUTANTS = [
     ),
     (
         "steppers/program.py",
-        "here, time, kick = there, end, Kick(0.0)",
-        "here, time, kick = there, 1.0, Kick(0.0)",
+        "group, time, end, 0, operation)",
+        "group, time, 1.0, 0, operation)",
         "tests/thermostats/test_langevin.py::test_each_substep_meets_targets_at_its_own_time",
     ),
     (
@@ -106,8 +106,8 @@ MUTANTS = [
     ),
     (
         "steppers/interpreter.py",
-        "True\n                    tables = packed.tables",
-        "True\n                    tables = tables",
+        "if held.lattice is not cell or given.lattice is not cell:",
+        "if False:",
         "tests/steppers/test_interpreter.py::test_a_cell_that_the_force_function_changes",
     ),
     (
