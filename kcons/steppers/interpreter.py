@@ -71,6 +71,25 @@ class Interpreted(Listed):
     def note(self, state: State) -> None:
         """Remember what steps have ended in."""
 
+    def depends_on(self, system: System, state: State) -> Any:
+        """What `begun` looks at besides the state: while it stays the same, steps go on. None: they never do."""
+        return system.velocity_dependent
+
+    def _made_from(self, system: System, state: State, dt: float, steps: int) -> tuple[State, int]:
+        """The state after steps, and how many they were."""
+        kept, system.going = system.going, None
+        known = self.depends_on(system, state)
+        if kept is not None and kept[0] is state and kept[1] is self and kept[2] == known and kept[3].dt == dt:
+            on_their_way = kept[3]
+            on_their_way.go_on(state, steps)
+        else:
+            on_their_way = self.begun(system, state, dt, steps)
+        after = on_their_way.through()
+        self.note(after)
+        if known is not None and not on_their_way.far:
+            system.going = after, self, known, on_their_way
+        return after, on_their_way.made
+
     # As a decorator this costs half of a `with`. What overflows is looked for, and named with the step's number.
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def step(self, system: System, state: State, dt: float) -> State:
@@ -92,9 +111,7 @@ class Interpreted(Listed):
         still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
         if still is not None:
             return still
-        after = self.begun(system, state, dt, 1).through()
-        self.note(after)
-        return after
+        return self._made_from(system, state, dt, 1)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def march(self, system: System, state: State, dt: float, steps: int, *, check_every: int | None = None) -> State:
@@ -119,9 +136,7 @@ class Interpreted(Listed):
                 if alone:
                     state, made = self.step(system, state, dt), 1
                 else:
-                    on_their_way = self.begun(system, state, dt, left)
-                    state, made = on_their_way.through(), on_their_way.made
-                    self.note(state)
+                    state, made = self._made_from(system, state, dt, left)
                 left -= made
             system.schedule.made(n, check_every, state, dt, spare=spare)
             steps -= n
@@ -153,11 +168,14 @@ class Interpreter:
     numbers : ndarray
     number : int
         Of the step that is made.
+    far : bool
+        Whether they have ended far from the origin, from where the next ones have to begin anew.
     """
 
     __slots__ = (
         *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
+        "far",
     )
 
     #: Whether forces are those of the System's function, all at once.
@@ -196,12 +214,25 @@ class Interpreter:
                 room[ROOM : ROOM + 2 * x.size] = 0.0
         else:
             self.room, self.numbers = _PLAIN.copy(), numbers
-        self.time, self.left_over = time, left_over = start.time, start.time_remainder
-        # As State.later.
-        change = dt + left_over
-        self.then = then = time + change
-        part = then - time
-        self.left_over_then = (time - (then - part)) + (change - part)
+        self.then, self.left_over_then = start.time, start.time_remainder
+        self._look_ahead()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()  # steps on their way are of this process
+
+    def go_on(self, state: State, steps: int) -> None:
+        """Get ready for more steps, from the state that the last ones have ended in."""
+        self.start, self.steps, self.made = state, steps, 0
+        self.number += 1
+        self.begun = self.x = state.positions
+        self.v, self.out = state.velocities.copy(), np.empty(self.shape)
+        if self.low is None:
+            self.push, self.spare = self.v, self.out
+        else:
+            self.low.fill(0.0)
+        if self.simple and state.forces is not None:
+            self.forces = state.forces  # those of the function may be in an array that it uses again
+        self._look_ahead()
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -294,8 +325,13 @@ class Interpreter:
     def _next_step(self) -> None:
         self.made += 1
         self.number += 1
-        self.begun, self.time, self.left_over = self.x, self.then, self.left_over_then
-        time, change = self.time, self.dt + self.left_over
+        self.begun = self.x
+        self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        """The time where a step begins is that at which the last one ended; the next as State.later."""
+        self.time, self.left_over = time, left_over = self.then, self.left_over_then
+        change = self.dt + left_over
         self.then = then = time + change
         part = then - time
         self.left_over_then = (time - (then - part)) + (change - part)
@@ -469,8 +505,9 @@ class Interpreter:
         """The state, with remainders from here on if it is far from the origin by now."""
         x = self.x if self.x.flags.writeable else self.x.copy()
         when, arrays = (self.then, self.left_over_then), (x, self.v, self.applied(here))
-        far = bool(self.room[FAR])
-        return self.system.ended(self.start, self.number, when, arrays, self.shift, self.low, far, self.variables())
+        shift, far = self.shift, bool(self.room[FAR])
+        self.far = far or shift is not None
+        return self.system.ended(self.start, self.number, when, arrays, shift, self.low, far, self.variables())
 
     def applied(self, here: int) -> FloatArray | None:
         """The forces at the end, None where a drift came last."""

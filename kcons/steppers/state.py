@@ -276,6 +276,8 @@ class System:
         rates = Friction(friction, motion, self.inverse_masses)
         #: The state that the last step ended in, whose arrays need not be looked at.
         self.last: State | None = None
+        #: Steps on their way that have ended in a state, whose they are, what they depend on, and they themselves.
+        self.going: tuple[State, Any, Any, Any] | None = None
         #: None where nothing is slowed down.
         self.friction: Friction | None = rates if rates.largest > 0 else None
 

@@ -87,6 +87,9 @@ class SeededBath(Interpreted):
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
 
+    def depends_on(self, system: System, state: State) -> Any:
+        return self.thermal_energy
+
     def refuse_back(self, system: System, dt: float) -> None:
         """Raise `InputError` for a negative time step."""
         if dt < 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -203,6 +204,9 @@ class NoseHooverChain(Interpreted):
         if made is None or made[0] is not inner:
             made = self._made = inner, Program((HALF, *inner, HALF), {"chain": _chain})
         return ChainStep(system, begin, dt, self, made[1], steps)
+
+    def depends_on(self, system: System, state: State) -> Any:
+        return self.thermal_energy, self.period, self.length, self.fractions, state.step == LOOK_AT
 
     def note(self, state: State) -> None:
         self._left = state.thermostat

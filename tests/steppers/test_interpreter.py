@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from kcons.steppers import Geodesic, Rattle, Splitting, State, Suzuki4, System, 
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Project, drifts_of
 from kcons.steppers.program import Program
-from kcons.thermostats import Langevin
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
 from tests.steppers.stages.test_packed_system import GROUPS, STEPPERS, molecules, springs
 from tests.steppers.test_splitting import assert_same, one_by_one
 
@@ -208,3 +210,47 @@ def test_programs_are_of_use_in_other_processes() -> None:
         end = stepper.march(system, state, 0.1, 5)
         other = pickle.loads(pickle.dumps(stepper))
         assert_same(other.march(system, state, 0.1, 5), end)
+
+
+BATHS = [NoseHooverChain(0.1, 2.0, momentum="free"), Isokinetic(0.1, momentum="free"), Langevin(0.1, 0.3, 5)]
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4(), *BATHS], ids=lambda each: type(each).__name__)
+def test_steps_that_go_on_are_those_that_begin_anew(stepper) -> None:
+    """From the state that the last one ended in all is ready, as long as nothing has changed since."""
+    system, state = molecules(*GROUPS, "triangles")
+    again, one = copy.deepcopy(stepper), state
+    begun = []
+    stepper = copy.deepcopy(stepper)
+    first = stepper.begun
+    stepper.begun = lambda *given: begun.append(1) or first(*given)
+    other = state
+    for _ in range(4):
+        one = stepper.step(system, one, 0.02)
+        other_system = molecules(*GROUPS, "triangles")[0]
+        other = again.step(other_system, replace(other, origin=None), 0.02)
+        assert_same(one, other)
+        assert one.thermostat is None or np.array_equal(one.thermostat, other.thermostat)
+    assert len(begun) == 1
+    # Another time step, a state that was changed, a force that fails on the way: all begin anew.
+    assert stepper.step(system, one, 0.01).time == pytest.approx(one.time + 0.01)
+    moved = replace(one, velocities=2 * one.velocities)
+    assert not np.array_equal(stepper.step(system, moved, 0.01).velocities, stepper.step(system, one, 0.01).velocities)
+    force, last = system.force, stepper.step(system, one, 0.02)
+    system.force = lambda x, t: np.full_like(x, np.nan)
+    with pytest.raises(NonFiniteError):
+        stepper.step(system, last, 0.02)
+    system.force = force
+    assert_same(stepper.step(system, last, 0.02), stepper.step(system, last, 0.02))
+
+
+@pytest.mark.parametrize("make", [lambda: Langevin(0.1, 0.3, 5), lambda: NoseHooverChain(0.1, 2.0, momentum="free")])
+def test_a_temperature_that_is_changed_between_steps_counts_at_once(make) -> None:
+    system, state = molecules(*GROUPS)
+    one, other = make(), make()
+    state = one.step(system, state, 0.02)
+    kept = state.copied()
+    one.thermal_energy = other.thermal_energy = 0.3
+    after, expected = one.step(system, state, 0.02), other.step(system, replace(kept, origin=None), 0.02)
+    assert_same(after, expected)
+    assert np.array_equal(after.thermostat, expected.thermostat)

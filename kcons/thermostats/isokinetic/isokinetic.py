@@ -8,7 +8,7 @@ that a kick at fixed positions has the closed form it has without constraints.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -274,6 +274,10 @@ class Isokinetic(Splitting):
             elif begin.step < LOOK_AT:
                 steps = min(steps, LOOK_AT - begin.step)
         return IsokineticStep(system, self._share(system), begin, dt, self._programs, steps)
+
+    def depends_on(self, system: System, state: State) -> Any:
+        driven = system.motion.plan.driven
+        return None if driven else (self.thermal_energy, self.kinetic_energy, state.step == LOOK_AT)
 
     def note(self, state: State) -> None:
         asked = self.thermal_energy, self.kinetic_energy

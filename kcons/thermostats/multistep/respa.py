@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -110,6 +111,10 @@ class LangevinRespa(Langevin):
         super().check(system)
         group_names(system.force, self.names)
 
+    def depends_on(self, system: System, state: State) -> Any:
+        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
+        return None if self.middle else self.thermal_energy
+
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)
         return RespaStep(system, state, dt, self, steps)
@@ -123,7 +128,6 @@ class RespaStep(LangevinStep):
     def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa, steps: int) -> None:
         names = thermostat.names
         self.groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa", middle=thermostat.middle)
-        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
         super().__init__(system, start, dt, thermostat, 1 if thermostat.middle else steps)
         self.forces = self.groups.stacked()
 

@@ -163,13 +163,16 @@ class IsokineticSpheres(SeededBath):
         whole = g + self.auxiliary
         return 0.5 * self.thermal_energy * float((g * (whole - 1) / whole).sum())
 
+    def depends_on(self, system: System, state: State) -> Any:
+        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
+        return None if self.middle else self.thermal_energy
+
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)
         _, layout, squares, _ = self._found(system, state.positions)
         if not self._told:
             self._told = True
             logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
-        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
         return SphereStep(system, state, dt, self, layout, squares, 1 if self.middle else steps)
 
     def _found(self, system: System, positions: FloatArray) -> tuple[System, SphereLayout, FloatArray, float]:
