@@ -71,6 +71,10 @@ class Interpreted(Listed):
     def note(self, state: State) -> None:
         """Remember what steps have ended in."""
 
+    def at_once(self, state: State, steps: int) -> int:
+        """How many of the steps may be made before `begun` looks at the state again."""
+        return steps
+
     def depends_on(self, system: System, state: State) -> Any:
         """What `begun` looks at besides the state: while it stays the same, steps go on. None: they never do."""
         return system.velocity_dependent
@@ -78,7 +82,7 @@ class Interpreted(Listed):
     def _made_from(self, system: System, state: State, dt: float, steps: int) -> tuple[State, int]:
         """The state after steps, and how many they were."""
         kept, system.going = system.going, None
-        known = self.depends_on(system, state)
+        known, steps = self.depends_on(system, state), self.at_once(state, steps)
         if kept is not None and kept[0] is state and kept[1] is self and kept[2] == known and kept[3].dt == dt:
             on_their_way = kept[3]
             on_their_way.go_on(state, steps)
@@ -216,9 +220,6 @@ class Interpreter:
             self.room, self.numbers = _PLAIN.copy(), numbers
         self.then, self.left_over_then = start.time, start.time_remainder
         self._look_ahead()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()  # steps on their way are of this process
 
     def go_on(self, state: State, steps: int) -> None:
         """Get ready for more steps, from the state that the last ones have ended in."""

@@ -281,6 +281,9 @@ class System:
         #: None where nothing is slowed down.
         self.friction: Friction | None = rates if rates.largest > 0 else None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "going": None}  # those steps are of this System
+
     @cached_property
     def schedule(self) -> Schedule:
         """When states of this system are certified."""

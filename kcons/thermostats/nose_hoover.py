@@ -167,7 +167,7 @@ class NoseHooverChain(Interpreted):
         assert state.forces is not None
         free = freedom(system, state, state.forces, None, self.momentum)
         turns = free.turns and not goes_on
-        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=4)
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
         if goes_on:
             return state
         return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
@@ -197,13 +197,14 @@ class NoseHooverChain(Interpreted):
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         begin = self.start(system, state)
         if begin.step == LOOK_AT:
-            warn_of_bodies_apart(system, begin, stacklevel=5)
-        elif begin.step < LOOK_AT:
-            steps = min(steps, LOOK_AT - begin.step)
+            warn_of_bodies_apart(system, begin, stacklevel=7)
         inner, made = self.stepper.operations(system), self._made
         if made is None or made[0] is not inner:
             made = self._made = inner, Program((HALF, *inner, HALF), {"chain": _chain})
         return ChainStep(system, begin, dt, self, made[1], steps)
+
+    def at_once(self, state: State, steps: int) -> int:
+        return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
 
     def depends_on(self, system: System, state: State) -> Any:
         return self.thermal_energy, self.period, self.length, self.fractions, state.step == LOOK_AT

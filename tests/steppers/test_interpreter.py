@@ -254,3 +254,29 @@ def test_a_temperature_that_is_changed_between_steps_counts_at_once(make) -> Non
     after, expected = one.step(system, state, 0.02), other.step(system, replace(kept, origin=None), 0.02)
     assert_same(after, expected)
     assert np.array_equal(after.thermostat, expected.thermostat)
+
+
+@pytest.mark.parametrize("make", [lambda: NoseHooverChain(0.1, 2.0), lambda: Isokinetic(0.1)])
+def test_bodies_that_feel_nothing_are_noticed_also_where_steps_go_on(make) -> None:
+    """After 20,000 steps, however many are made at once."""
+    system, state = molecules(*GROUPS, force=lambda x, t: -0.1 * x * [1.0, 1.7, 0.6])
+    thermostat = make()
+    state = thermostat.step(system, replace(state, step=19_990), 0.001)
+    with pytest.warns(UserWarning, match="feel"):
+        end = thermostat.march(system, state, 0.001, 40)
+    assert end.step == 20_031
+
+
+def test_copies_of_a_system_begin_anew() -> None:
+    system, state = molecules(*GROUPS)
+    state = Rattle().step(system, state, 0.02)
+    for other, there in (copy.deepcopy((system, state)), pickle.loads(pickle.dumps((plain(system), state)))):
+        assert other.going is None
+        assert_same(Rattle().step(other, there, 0.02), Rattle().step(system, state, 0.02))
+
+
+def plain(system: System) -> System:
+    """Without a force function that is local to a test."""
+    other = copy.copy(system)
+    other.force = springs
+    return other

@@ -209,7 +209,7 @@ class Isokinetic(Splitting):
         free = freedom(system, state, state.forces, self.atoms, self.momentum)
         twice = self._twice_kinetic(share, free.count, found)
         turns = free.turns and self.thermal_energy is not None
-        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=5)
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
         velocities = rest if drive is None else drive + rest
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
@@ -268,12 +268,12 @@ class Isokinetic(Splitting):
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         begin = self.start(system, state)
-        if self.thermal_energy is not None and self.atoms is None:
-            if begin.step == LOOK_AT:
-                warn_of_bodies_apart(system, begin, stacklevel=5)
-            elif begin.step < LOOK_AT:
-                steps = min(steps, LOOK_AT - begin.step)
+        if begin.step == LOOK_AT and self.thermal_energy is not None and self.atoms is None:
+            warn_of_bodies_apart(system, begin, stacklevel=7)
         return IsokineticStep(system, self._share(system), begin, dt, self._programs, steps)
+
+    def at_once(self, state: State, steps: int) -> int:
+        return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
 
     def depends_on(self, system: System, state: State) -> Any:
         driven = system.motion.plan.driven
