@@ -118,9 +118,15 @@ MUTANTS = [
     ),
     (
         "steppers/interpreter.py",
-        "if at < last:",
-        "if False:",
-        "tests/steppers/test_interpreter.py::test_times_within_a_step_are_exact",
+        "self.made += 1\n        self.number += 1",
+        "self.made += 1",
+        "tests/steppers/test_splitting.py::test_errors_name_the_step",
+    ),
+    (
+        "steppers/interpreter.py",
+        "and kept[2] == known",
+        "",
+        "tests/steppers/test_interpreter.py::test_a_temperature_that_is_changed_between_steps_counts_at_once",
     ),
     (
         "steppers/interpreter.py",
