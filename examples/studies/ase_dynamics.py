@@ -210,7 +210,7 @@ class PieceByPiece(Timed):
     def __init__(self, dynamics: MolecularDynamics) -> None:
         super().__init__(dynamics)
         system = dynamics._systems()
-        system.flights = None
+        system.packed = None
         motion = system.motion
         motion.project_positions = self.projections.wrap(motion.project_positions)
         motion.project_velocities = self.projections.wrap(motion.project_velocities)

@@ -7,7 +7,7 @@ A stepper never changes its input. Where it raises, nothing has happened.
 - `operations`: a time step as data
 - `stepper`: what a stepper is
 - `stages`: what steps are made of
-- `executors`: who makes the operations
+- `program`, `interpreter`: operations as rows of numbers, and who makes them
 - `splitting`: kicks and drifts in turn
 - `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
 - `adaptive`: steps that choose their own size

@@ -1,9 +1,9 @@
 """A time step as data: operations one after another, each over a fraction of the step.
 
-Steppers and thermostats say what a step is made of by the tuple that `operations` returns. An executor has a method for
-each verb: `kcons.steppers.executors` runs operations on arrays, one by one or compiled, and `kcons.openmm` writes
-programs of OpenMM from them. Time passes in the drifts, so that forces and constraints that depend on it are taken at
-the time of each drift's end, also where a drift goes back.
+Steppers and thermostats say what a step is made of by the tuple that `operations` returns. Who makes it has a method
+for each verb: `kcons.steppers.interpreter` runs operations on arrays, and `kcons.openmm` writes programs of OpenMM from
+them. Time passes in the drifts, so that forces and constraints that depend on it are taken at the time of each drift's
+end, also where a drift goes back.
 """
 
 from __future__ import annotations
@@ -11,12 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar
-
-import numpy as np
-
-from kcons.constraints.target import FloatArray
 
 
 @dataclass(frozen=True)
@@ -26,7 +21,7 @@ class Operation:
     Attributes
     ----------
     verb : str
-        Name of the executors' method.
+        Name of the method that makes it.
     meaning : str
         What it does, in words.
     fraction : float
@@ -129,11 +124,6 @@ class Fly(Timed):
         """In words."""
         way = "along great circles" if self.exact else "along the constraints"
         return way if len(self.flights) == 1 else f"{way}, in {len(self.flights)} flights"
-
-    @cached_property
-    def lengths(self) -> FloatArray:
-        """`flights` as an array."""
-        return np.array(self.flights)
 
 
 @dataclass(frozen=True)

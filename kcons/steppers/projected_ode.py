@@ -19,7 +19,7 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
-from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import explained, stays
 

@@ -23,10 +23,10 @@ from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
-from kcons.steppers.stages.compensated_steps import beyond, check_finite
-from kcons.steppers.stages.drifts import Drift, FreeFlight, GreatCircles
+from kcons.steppers.stages.compiled_operations import beyond, check_finite
 from kcons.steppers.stages.friction import Friction
-from kcons.steppers.stages.fused_stages import Flights
+from kcons.steppers.stages.great_circles import GreatCircles
+from kcons.steppers.stages.packed_system import PackedSystem
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -276,8 +276,13 @@ class System:
         rates = Friction(friction, motion, self.inverse_masses)
         #: The state that the last step ended in, whose arrays need not be looked at.
         self.last: State | None = None
+        #: Steps on their way that have ended in a state, whose they are, what they depend on, and they themselves.
+        self.going: tuple[State, Any, Any, Any] | None = None
         #: None where nothing is slowed down.
         self.friction: Friction | None = rates if rates.largest > 0 else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "going": None}  # those steps are of this System
 
     @cached_property
     def schedule(self) -> Schedule:
@@ -466,21 +471,28 @@ class System:
     # -- inner ----------------------------------------------------------------------------------
 
     @cached_property
+    def moving_masses(self) -> FloatArray:
+        """Masses for each coordinate, shape (3 n_atoms,); 0 for fixed atoms."""
+        return np.repeat(np.where(self.inverse_masses[:, 0] > 0, self.masses, 0.0), 3)
+
+    @cached_property
     def root_weights(self) -> FloatArray:
         """1/sqrt(m) for each coordinate, shape (n_atoms, 3); 0 for fixed atoms."""
         return np.sqrt(self.weights)
 
-    @cached_property
-    def drift(self) -> Drift:
-        """Constrained flight by one RATTLE step."""
-        return FreeFlight(self.motion)
+    def flown(self, x: FloatArray, v: FloatArray, h: float, time: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities after one flight along the constraints as they are at a time."""
+        v = v.copy()
+        out = x + h * v
+        self.motion.project_positions(out, x, time=time, velocities=v, dt=h, flight=h, out=out)
+        return out, v
 
     @cached_property
-    def flights(self) -> Flights | None:
-        """Compiled stages for the same flight; None where `drift` does it piece by piece."""
+    def packed(self) -> PackedSystem | None:
+        """What compiled steps know of the system; None where the engine makes them, operation by operation."""
         held = self._free_of_origin
         atoms = np.zeros(0, dtype=np.int64) if held is None else np.append(self.anchor, held)
-        return Flights.of(self.motion, self.weights, atoms, self.far)
+        return PackedSystem.of(self.motion, self.weights, atoms, self.far)
 
     @cached_property
     def great_circles(self) -> GreatCircles | None:
@@ -500,9 +512,56 @@ class System:
             return None
         return np.unique(held.incidence.indices).astype(np.int64)
 
-    def remainder_of(self, state: State) -> FloatArray | None:
-        """What rounding took from the positions of a state; None where rows know a place in space, which take all."""
-        return None if state.remainder is None or self._free_of_origin is None else state.remainder
+    def near_origin(self, state: State) -> tuple[FloatArray, FloatArray | None]:
+        """Positions of a state as steps are made from them, and what was taken from them where they are far.
+
+        Where rows know a place in space, they take all positions as they are.
+        """
+        x, _, _ = self.taken(state)
+        if state.remainder is None or self._free_of_origin is None:
+            return x, None
+        shift = x[self.anchor]
+        return (x - shift) + state.remainder, shift
+
+    def ended(
+        self,
+        start: State,
+        number: int,
+        when: tuple[float, float],
+        arrays: tuple[FloatArray, FloatArray, FloatArray | None],
+        shift: FloatArray | None = None,
+        low: FloatArray | None = None,
+        far: bool = False,
+        thermostat: FloatArray | None = None,
+    ) -> State:
+        """The state that steps end in, with what rounding takes from its positions where they are far.
+
+        Parameters
+        ----------
+        start : State
+            Where they began.
+        number : int
+            Of the last.
+        when : tuple of float
+            The time, and what its rounding leaves over.
+        arrays : tuple of ndarray
+            Positions less `shift`, velocities, and forces.
+        low : ndarray, optional
+            What rounding has taken from the positions, where these are whole.
+        far : bool
+            Whether they have become so large that it counts.
+        thermostat : ndarray, optional
+        """
+        (x, v, forces), (time, left_over) = arrays, when
+        positions, remainder = x, None
+        if shift is not None:
+            positions = x + shift
+            remainder = x - (positions - shift)
+        elif far:
+            remainder = np.zeros_like(x) if low is None else low.copy()
+        origin, more = (ref(self), positions, v, time), (thermostat, start.barostat)
+        state = self.last = State(positions, v, time, forces, number, remainder, left_over, *more, origin)
+        return state
 
     def is_far(self, x: FloatArray) -> bool:
         """Whether what is held is so far from the origin that the rounding of its positions would show."""

@@ -19,7 +19,6 @@ from kcons.constraints.arguments import numbers, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
-from kcons.steppers.stages.compensated_steps import Point
 from kcons.thermostats.correlated_series import Estimate, checked, few, spread
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -113,7 +112,6 @@ def configurational_sample(
 
 def _slope(system: System, x: FloatArray, v: FloatArray, time: float, h: float) -> float:
     """dU/ds at the end of the geodesic that starts with v."""
-    point = Point(x, v, system.weights, exact=False)
-    system.drift.move(point, np.empty_like(x), time, time, h)
-    end = system.motion.project_velocities(point.x, point.v, time=time)
-    return -float((system.forces(point.x, end, time, 0) * end).sum())
+    there, v = system.flown(x, v, h, time)
+    end = system.motion.project_velocities(there, v, time=time)
+    return -float((system.forces(there, end, time, 0) * end).sum())

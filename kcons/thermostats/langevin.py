@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 import threading
+from typing import Any
 
 import numpy as np
 
 from kcons.constraints.arguments import finite_number, positive, seed_number, whole_number
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import State, System
-from kcons.steppers.executors.piecewise import ArrayStep
-from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, drifts_of
-from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.steppers.stepper import Listed, stays
+from kcons.steppers.interpreter import Interpreted, Interpreter
+from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
+from kcons.steppers.program import Program, Row
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
+
+#: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, and the factor of
+#: the velocities; after them the masses for each coordinate, 0 for fixed atoms, and noise.
+HEAT, WARM, KEEP, MASSES = range(4)
 
 
 class _Generator(threading.local):
@@ -24,6 +30,15 @@ class _Generator(threading.local):
     def __init__(self) -> None:
         self.bits = np.random.Philox(0)
         self.numbers = np.random.Generator(self.bits)
+        self.counter, self.key = [0, 0, 0, 0], [0, 0]
+        self.state: Any = {
+            "bit_generator": "Philox",
+            "state": {"counter": self.counter, "key": self.key},
+            "buffer": [0, 0, 0, 0],
+            "buffer_pos": 4,
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
 
 
 _GENERATOR = _Generator()
@@ -31,21 +46,14 @@ _GENERATOR = _Generator()
 
 def wound(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
     """The generator of this thread at the stretch of the key's stream that belongs to a part of a step."""
-    _GENERATOR.bits.state = {
-        "bit_generator": "Philox",
-        "state": {
-            "counter": np.array([0, 0, number, part], dtype=np.uint64),
-            "key": np.array(key, dtype=np.uint64),
-        },
-        "buffer": np.zeros(4, dtype=np.uint64),
-        "buffer_pos": 4,
-        "has_uint32": 0,
-        "uinteger": 0,
-    }
-    return _GENERATOR.numbers
+    generator = _GENERATOR
+    generator.key[:] = key
+    generator.counter[2:] = number, part
+    generator.bits.state = generator.state
+    return generator.numbers
 
 
-class SeededBath(Listed):
+class SeededBath(Interpreted):
     """What baths share whose noise is a function of a seed and of the number of the step.
 
     Attributes
@@ -79,36 +87,13 @@ class SeededBath(Listed):
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
 
-    def step(self, system: System, state: State, dt: float) -> State:
-        """Advance by `dt`.
+    def depends_on(self, system: System, state: State) -> Any:
+        return self.thermal_energy
 
-        Raises
-        ------
-        InputError
-            A negative time step: noise cannot be taken back. The state carries variables of another thermostat.
-        UnsupportedError
-            Momentum is to be conserved where rows hold atoms in space.
-        ConvergenceError, NonFiniteError, InputError, UnsupportedError
-            As for all splittings.
-        """
-        self.check(system)
-        still = stays(state, dt)
-        if still is not None:
-            return still
+    def refuse_back(self, system: System, dt: float) -> None:
+        """Raise `InputError` for a negative time step."""
         if dt < 0:
             raise InputError(f"the time step is {system.shown_time(dt)}; noise cannot be taken back", item="dt")
-        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            return self.begun(system, state, dt).through(self.operations(system))
-
-    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
-        """A step that is about to be made from the state.
-
-        Raises
-        ------
-        InputError
-            The state carries variables of another thermostat.
-        """
-        raise NotImplementedError
 
     def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
         """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
@@ -165,20 +150,24 @@ class Langevin(SeededBath):
     ) -> None:
         super().__init__(thermal_energy, friction, seed, substeps)
         self.conserve_momentum = bool(conserve_momentum)
-        self._substeps = _geodesic_baoab((1.0 / self.substeps,) * self.substeps)
-        self._great_circles = _geodesic_baoab((1.0,), exact=True)
+        self._in_flights = listed_and_made(_geodesic_baoab((1.0 / self.substeps,) * self.substeps))
+        self._great_circles = listed_and_made(_geodesic_baoab((1.0,), exact=True))
         self._open: tuple[System, FloatArray] | None = None
 
     def __repr__(self) -> str:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        exact = system is not None and system.great_circles is not None
-        return self._great_circles if exact else self._substeps
+        return self.listed(system)[0]
 
-    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
+    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
+        """The operations, and as the interpreter goes through them."""
+        return self._in_flights if system is None or system.great_circles is None else self._great_circles
+
+    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
+        self.refuse_back(system, dt)
         carried(state, 1, "Langevin")
-        return LangevinStep(system, system.with_forces(state), dt, self)
+        return LangevinStep(system, system.with_forces(state), dt, self, steps)
 
     def directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
         """Those in which no row knows a place in space."""
@@ -197,58 +186,88 @@ def _geodesic_baoab(flight: tuple[float, ...], *, exact: bool = False) -> tuple[
     return Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project()
 
 
-class LangevinStep(ArrayStep):
-    """A step on its way, velocities on the constraints after each drift."""
+class _Mix(Operation):
+    """v = keep v + noise, where noise is known."""
 
-    def __init__(self, system: System, start: State, dt: float, thermostat: Langevin) -> None:
-        super().__init__(system, start, dt)
+    verb, meaning = "mix", "friction and noise"
+
+
+class _Measure(Operation):
+    """The heat that has come in since."""
+
+    verb, meaning = "measure", "heat"
+
+
+def listed_and_made(operations: tuple[Operation, ...], groups: tuple[str, ...] = ("",)) -> tuple[Any, Program]:
+    """Operations, and the program in which an exchange is made of projections and what is between them."""
+    parts: list[Operation] = []
+    for operation in operations:
+        exchange = isinstance(operation, Exchange)
+        parts += [Project(), operation, _Mix(), Project(), _Measure()] if exchange else [operation]
+    return operations, Program(parts, {"mix": _mix, "measure": _measure}, groups)
+
+
+_SUMS = {"reassoc", "contract", "nsz"}
+
+
+@njit(cache=True, nogil=True, fastmath=_SUMS)
+def kinetic(v, masses):  # type: ignore[no-untyped-def]
+    """sum m v^2/2, of numbers in a row."""
+    total = 0.0
+    for i in range(v.size):
+        total += masses[i] * v[i] * v[i]
+    return 0.5 * total
+
+
+@njit(cache=True, nogil=True)
+def _mix(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    u, n = flat(v), v.size
+    noise, keep = numbers[MASSES + n :], numbers[KEEP]
+    numbers[WARM] = kinetic(u, numbers[MASSES : MASSES + n])
+    for i in range(n):
+        u[i] = keep * u[i] + noise[i]
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def _measure(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    before = numbers[WARM]
+    numbers[WARM] = kinetic(flat(v), numbers[MASSES : MASSES + v.size])
+    numbers[HEAT] += numbers[WARM] - before
+    return 0
+
+
+class LangevinStep(Interpreter):
+    """Steps on their way, of which the noise is drawn in Python."""
+
+    def __init__(self, system: System, start: State, dt: float, thermostat: Langevin, steps: int) -> None:
+        heat = 0.0 if start.thermostat is None else float(start.thermostat[HEAT])
+        masses = system.moving_masses
+        numbers = np.concatenate(([heat, 0.0, 0.0], masses, masses))
+        super().__init__(system, start, dt, thermostat.listed(system)[1], steps, numbers)
         self.thermostat = thermostat
-        self.heat = 0.0 if start.thermostat is None else float(start.thermostat[0])
 
-    def kick(self, operation: Kick) -> None:
-        assert self.forces is not None
-        self.v = self.v + (operation.fraction * self.dt) * (self.forces * self.system.inverse_masses)
-
-    def pieces(self, operation: Fly) -> list[tuple[float, float]]:
-        begin, end, count = self.now, self.frame.at(operation.ends[-1]), len(operation.flights)
-        h, time = operation.fraction * self.dt / count, end - begin
-        return [*((h, begin + k * time / count) for k in range(1, count)), (h, end)]
-
-    def exchange(self, operation: Exchange) -> None:
-        """Friction and noise in the tangent plane, and the heat they bring."""
-        system, motion, thermostat = self.system, self.system.motion, self.thermostat
-        x, time, dt = self.x, self.now, operation.fraction * self.dt
-        v = self.along(self.v)
-        before = system.kinetic_energy(v)
+    def exchange(self, row: Row, begun: bool) -> None:
+        """Draw the noise; what friction does not act on, velocities of targets and centre of mass, is added to it."""
+        system, thermostat, dt = self.system, self.thermostat, row.length * self.dt
         keep = math.exp(-thermostat.friction * dt)
         spread = math.sqrt(-math.expm1(-2 * thermostat.friction * dt) * thermostat.thermal_energy)
-        noise = self.noise(v.shape)
+        noise = self.numbers[MASSES + self.v.size :].reshape(self.v.shape)
+        wound((thermostat.seed, 0), self.number, row.number).standard_normal(out=noise)
         noise *= spread * system.root_weights
-        # What friction does not act on: velocities that the targets demand, and of the centre of mass.
-        kept = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else None
+        self.numbers[KEEP] = keep
+        driven = system.motion.plan.driven
+        if not driven and not thermostat.conserve_momentum:
+            return
+        x, v, time = self.place(row.here), self.v, self.at(row.end)
+        kept = system.motion.project_velocities(x, np.zeros_like(v), time=time) if driven else np.zeros_like(v)
         if thermostat.conserve_momentum:
             directions = thermostat.directions(system, x, time)
             noise -= drift_velocity(noise, system.masses, directions)
-            drift = drift_velocity(v if kept is None else v - kept, system.masses, directions)
-            kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
-        noise += keep * v if kept is None else kept + keep * (v - kept)
-        self.v = self.along(noise)
-        after = system.kinetic_energy(self.v)
-        self.heat += after - before
-        if thermostat.friction > 0:
-            thermostat.exchanged = self.number, after
+            kept = kept + drift_velocity(v - kept, system.masses, directions)
+        noise += (1.0 - keep) * kept
 
-    def noise(self, shape: tuple[int, ...]) -> FloatArray:
-        """Normal numbers for this exchange."""
-        return self.thermostat.drawn(self.number, shape)
-
-    def evaluate(self, operation: Operation) -> None:
-        check_finite(self.x, "position", self.number)
-        super().evaluate(operation)
-
-    def project(self, operation: Operation) -> None:
-        check_finite(self.v, "velocity", self.number)
-        self.along(self.v)
-
-    def end(self) -> State:
-        return self.frame.closed(self.x, self.v, self.forces, np.array([self.heat]))
+    def variables(self) -> FloatArray:
+        if self.thermostat.friction > 0:
+            self.thermostat.exchanged = self.number, float(self.numbers[WARM])
+        return self.numbers[: HEAT + 1].copy()

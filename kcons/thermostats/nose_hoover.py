@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +12,14 @@ from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import Rattle, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
+from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Chain, Operation
+from kcons.steppers.program import Program, Row
 from kcons.steppers.splitting import Splitting
-from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.steppers.stepper import Listed, require_stepper, stays
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import (
     AT_REST,
     LOOK_AT,
@@ -30,11 +33,15 @@ from kcons.thermostats.freedom import (
     warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
+from kcons.thermostats.langevin import kinetic
 
 #: Fractions in which the chain moves, by order: a symmetric step, Suzuki's five, Kahan and Li's nine.
 FRACTIONS = {2: (1.0,), 4: SUZUKI_4, 6: KAHAN_LI_6}
 #: What comes before a step on the constraints, and after it.
 HALF = Chain(0.5)
+#: What the numbers of a program begin with: k_B T, the links, the fractions in which they move, and how often they do;
+#: after them as many masses of the links, positions and velocities of these with g, and masses for each coordinate.
+KT, LINKS, PARTS, SIZE = range(4)
 
 
 def chain_fractions(chain_order: int, repeats: int) -> tuple[float, ...]:
@@ -57,7 +64,7 @@ def chain_fractions(chain_order: int, repeats: int) -> tuple[float, ...]:
     return tuple(share / count for share in FRACTIONS[chain_order]) * count
 
 
-class NoseHooverChain(Listed):
+class NoseHooverChain(Interpreted):
     """Canonical dynamics without noise: half a step of the chain, a step on the constraints, half a step of the chain.
 
     The chain scales velocities, which stay tangent to rows that rest. Degrees of freedom are counted by rank, less
@@ -121,11 +128,13 @@ class NoseHooverChain(Listed):
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
         self.period = positive(period, "period")
         self.stepper: Splitting = Rattle() if stepper is None else stepper
-        require_stepper(self.stepper)
+        if not isinstance(self.stepper, Splitting):
+            raise InputError(f"stepper is {stepper!r}; give a splitting, such as kcons.Rattle()", item="stepper")
         if self.stepper.order != 2:
             raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
         self.momentum: Momentum = momentum
         self.force_evaluations = self.stepper.force_evaluations
+        self._made: tuple[tuple[Operation, ...], Program] | None = None
 
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
@@ -158,7 +167,7 @@ class NoseHooverChain(Listed):
         assert state.forces is not None
         free = freedom(system, state, state.forces, None, self.momentum)
         turns = free.turns and not goes_on
-        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=4)
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
         if goes_on:
             return state
         return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
@@ -185,55 +194,29 @@ class NoseHooverChain(Listed):
         chain[self.length : 2 * self.length] *= -1
         return replace(state, thermostat=chain)
 
-    def step(self, system: System, state: State, dt: float) -> State:
-        """Advance by `dt`.
-
-        Raises
-        ------
-        InputError
-            A time step that the chain cannot follow; the state carries variables of another thermostat.
-        ConvergenceError, NonFiniteError, InputError, UnsupportedError
-            As for the stepper. NonFiniteError also for velocities at the start.
-        """
-        self.check(system)
-        still = stays(state, dt)
-        if still is not None:
-            return still
+    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         begin = self.start(system, state)
         if begin.step == LOOK_AT:
-            warn_of_bodies_apart(system, begin, stacklevel=4)
-        try:
-            v, chain = self._half(system, begin.velocities, begin.thermostat, dt)
-            after = self.stepper.step(system, replace(begin, velocities=v), dt)
-            v, chain = self._half(system, after.velocities, chain, dt)
-        except OverflowError:
-            check_finite(begin.velocities, "velocity", state.step + 1)
-            raise InputError(
-                f"step {state.step + 1}: a chain of period {system.shown_time(self.period)} cannot follow a time step "
-                f"of {system.shown_time(dt)}; take at most a twentieth of the period",
-                item="dt",
-            ) from None
-        self._left = chain
-        return replace(after, velocities=v, thermostat=chain)
+            warn_of_bodies_apart(system, begin, stacklevel=7)
+        inner, made = self.stepper.operations(system), self._made
+        if made is None or made[0] is not inner:
+            made = self._made = inner, Program((HALF, *inner, HALF), {"chain": _chain})
+        return ChainStep(system, begin, dt, self, made[1], steps)
+
+    def at_once(self, state: State, steps: int) -> int:
+        return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
+
+    def depends_on(self, system: System, state: State) -> Any:
+        return self.thermal_energy, self.period, self.length, self.fractions, state.step == LOOK_AT
+
+    def note(self, state: State) -> None:
+        self._left = state.thermostat
 
     def _masses(self, count: float) -> FloatArray:
         """Q = k_B T (period/2 pi)^2, times g for the first link."""
         q = np.full(self.length, self.thermal_energy * (self.period / (2 * math.pi)) ** 2)
         q[0] *= count
         return q
-
-    def _half(
-        self, system: System, v: FloatArray, thermostat: FloatArray | None, dt: float
-    ) -> tuple[FloatArray, FloatArray]:
-        assert thermostat is not None
-        chain = thermostat.copy()
-        masses = self._masses(float(chain[-1]))
-        scale = _advance(
-            chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, HALF.fraction * dt, self.fractions
-        )
-        if not math.isfinite(scale):
-            raise OverflowError
-        return v * scale, chain
 
     def conserved_energy(self, system: System, state: State) -> float:
         """Total energy of system and chain; needs `System.potential`."""
@@ -243,6 +226,50 @@ class NoseHooverChain(Listed):
         place, speed, count = state.thermostat[:n], state.thermostat[n : 2 * n], float(state.thermostat[2 * n])
         chain = 0.5 * float(self._masses(count) @ speed**2) + kt * (count * float(place[0]) + float(place[1:].sum()))
         return system.total_energy(state) + chain
+
+
+class ChainStep(Interpreter):
+    """Steps on their way, with a chain."""
+
+    def __init__(
+        self, system: System, start: State, dt: float, thermostat: NoseHooverChain, program: Program, steps: int
+    ) -> None:
+        assert start.thermostat is not None
+        chain, fractions = start.thermostat, thermostat.fractions
+        head = thermostat.thermal_energy, len(chain) // 2, len(fractions)
+        links = thermostat._masses(float(chain[-1]))
+        self.chain_at = slice(SIZE + len(fractions) + len(links), SIZE + len(fractions) + len(links) + len(chain))
+        numbers = np.concatenate((head, fractions, links, chain, system.moving_masses))
+        super().__init__(system, start, dt, program, steps, numbers)
+        self.thermostat = thermostat
+
+    def chain(self, row: Row, begun: bool) -> None:
+        """The chain could not move."""
+        check_finite(self.v, "velocity", self.number)
+        raise InputError(
+            f"step {self.number}: a chain of period {self.system.shown_time(self.thermostat.period)} cannot follow a "
+            f"time step of {self.system.shown_time(self.dt)}; take at most a twentieth of the period",
+            item="dt",
+        )
+
+    def variables(self) -> FloatArray:
+        return self.numbers[self.chain_at].copy()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _chain(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """Move the chain on, and scale the velocities; 1 if these are no numbers then."""
+    n, parts = int(numbers[LINKS]), int(numbers[PARTS])
+    q = SIZE + parts
+    end = q + 3 * n + 1
+    u, masses = flat(v), numbers[end:]
+    twice = 2.0 * kinetic(u, masses)
+    scale = _advance(numbers[q + n : end], numbers[q : q + n], twice, numbers[KT], time, numbers[SIZE:q])
+    if not math.isfinite(scale):
+        return 1
+    for i in range(u.size):
+        u[i] *= scale
+    return 0
 
 
 @njit(cache=True, nogil=True)

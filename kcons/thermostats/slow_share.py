@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import generator_of, numbers, refuse_other
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
-from kcons.steppers.stages.compensated_steps import Point, check_finite
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.multistep import ForceGroups
 from kcons.thermostats.temperature_split import configuration, flight_of
@@ -72,12 +72,11 @@ def slow_share(
         v = thermal_velocities(system, here, 1.0, rng)
         changes = np.zeros((2, *here.shape))
         for way in (flight, -flight):
-            point = Point(here, v, system.weights, exact=False)
-            system.drift.move(point, np.empty_like(here), 0.0, 0.0, way)
+            there, _ = system.flown(here, v, way)
             for name in force.groups:
-                f = system.accepted(force.of(name, point.x, 0.0), number, True)
+                f = system.accepted(force.of(name, there, 0.0), number, True)
                 check_finite(f, "force", number)
-                pace = math.copysign(1.0, way) * paced(system, point.x, f, 0.0)
+                pace = math.copysign(1.0, way) * paced(system, there, f, 0.0)
                 changes += np.array([name == group, True])[:, None, None] * pace
         squares = [system.motion.project_velocities(here, c) ** 2 * system.masses[:, None] for c in changes]
         slow, whole = slow + float(squares[0].sum()), whole + float(squares[1].sum())

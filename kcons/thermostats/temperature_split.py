@@ -36,7 +36,7 @@ from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import System
-from kcons.steppers.stages.compensated_steps import Point, check_finite
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.configurational_temperature import temperature
 from kcons.thermostats.correlated_series import FEWEST, Estimate
 from kcons.thermostats.freedom import atom_numbers
@@ -406,10 +406,9 @@ class TemperatureSplit:
                 turned = _turned(arms, spin, way)
                 found[1] -= self._slopes(x + (turned - arms), np.cross(spin, turned)) / (2 * way)
             if self._rest.any():
-                point = Point(x, v, self._system.weights, exact=False)
-                self._system.drift.move(point, np.empty_like(x), 0.0, 0.0, way)
-                end = self._system.motion.project_velocities(point.x, point.v)
-                found[2] -= self._slopes(point.x, end) / (2 * way)
+                there, speed = self._system.flown(x, v, way)
+                end = self._system.motion.project_velocities(there, speed)
+                found[2] -= self._slopes(there, end) / (2 * way)
         return found
 
     def _slopes(self, x: FloatArray, v: FloatArray) -> FloatArray:

@@ -87,7 +87,7 @@ def test_documents_and_examples_import_public_names():
 #: At most: lines of a function; parameters but for self, outside of the compiled solvers.
 FUNCTION, PARAMETERS = 100, 11
 #: Folders whose kernels take one argument an array.
-KERNELS = ("solvers/", "steppers/stages/fused_stages.py", "thermostats/isokinetic/fused_step.py")
+KERNELS = ("solvers/",)
 
 
 def sizes(path: Path) -> dict[str, int]:

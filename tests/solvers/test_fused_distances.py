@@ -10,7 +10,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
 from kcons.solvers.fused_distances import _FUNCTIONS, packed_positions, packed_tangents, set_lattice
-from kcons.steppers.stages.fused_stages import MOST_ROWS, packed_rows
+from kcons.steppers.stages.packed_system import MOST_ROWS, packed_rows
 
 FAR_AWAY = np.array([5.0, -7.0, 3.0])
 TRIANGLE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])

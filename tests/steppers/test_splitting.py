@@ -9,7 +9,7 @@ import pytest
 
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.steppers import Rattle, ReversibilityCheck, State, Suzuki4, run
-from tests.steppers.stages.test_fused_stages import GROUPS, STEPPERS, SYSTEMS, molecules, springs, triangles
+from tests.steppers.stages.test_packed_system import GROUPS, STEPPERS, SYSTEMS, molecules, springs, triangles
 
 ARRAYS = ("positions", "velocities", "forces", "remainder")
 
@@ -47,6 +47,15 @@ def test_the_same_to_the_last_bit(stepper, name) -> None:
         assert_same(found, expected)
         assert found.step == state.step + steps
         state = found
+
+
+@pytest.mark.parametrize("name", ["hydrogens", "periodic", "far"])
+def test_a_march_by_the_engine_is_the_same_to_the_last_bit(name) -> None:
+    names, options = SYSTEMS[name]
+    for stepper in (Rattle(), Suzuki4()):
+        system, state = molecules(*names, **options, piecewise=True)
+        expected = one_by_one(stepper, system, state, 0.02, 5)
+        assert_same(stepper.march(system, state, 0.02, 5), expected)
 
 
 def test_forces_that_know_the_time() -> None:

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.steppers import State, System
+from kcons.steppers import State, Stepper, System
 from kcons.thermostats import Isokinetic
 
 Array = NDArray[np.float64]
@@ -118,12 +118,25 @@ def molecules(name="dumbbells", n=11, *, ions=0, at=0.0, force=springs, **option
     return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
 
 
-def thermostats(system: System, **options) -> tuple[Isokinetic, Isokinetic]:
-    """One that uses compiled halves of `system`, and one that does not."""
-    pair = Isokinetic(momentum="free", **options), Isokinetic(momentum="free", **options)
-    assert pair[0]._share(system).stages is not None
-    pair[1]._share(system).stages = None
-    return pair
+class ByTheEngine:
+    """A thermostat whose steps are made operation by operation."""
+
+    def __init__(self, thermostat: Stepper) -> None:
+        self.thermostat = thermostat
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        packed, system.packed = system.packed, None  # type: ignore[misc]
+        assert packed is not None
+        try:
+            return self.thermostat.step(system, state, dt)
+        finally:
+            system.packed = packed  # type: ignore[misc]
+
+
+def isokinetics(system: System, **options) -> tuple[Isokinetic, ByTheEngine]:
+    """A thermostat with compiled steps, and one without."""
+    assert system.packed is not None
+    return Isokinetic(momentum="free", **options), ByTheEngine(Isokinetic(momentum="free", **options))
 
 
 def distance(a: State, b: State) -> float:

@@ -22,7 +22,7 @@ def started(n=2, **options):
     return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
 
 
-@pytest.mark.parametrize(("length", "steps"), [(1, 500), (3, 500), (5, 100)])
+@pytest.mark.parametrize(("length", "steps"), [(1, 500), (3, 450), (5, 100)])
 def test_a_negative_step_undoes_a_step(length, steps):
     held, state = started()
     thermostat = NoseHooverChain(0.5, 1.0, length=length)

@@ -146,8 +146,7 @@ class _Table:
 
     def __init__(self, scheme: Extrapolation, system: System, start: State, size: float, speed: float) -> None:
         self.scheme, self.system, self.start, self.size = scheme, system, start, size
-        far = system.remainder_of(start) is not None
-        x = start.positions - start.positions[system.anchor] if far else start.positions
+        x, _ = system.near_origin(start)
         self._tolerated = scheme.tolerance * np.array([scheme.length, speed])
         self._rounding = EPS * np.array([rms(x, system), rms(start.velocities, system)])
         self._line: list[FloatArray] = []

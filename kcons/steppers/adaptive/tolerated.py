@@ -17,8 +17,7 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
-from kcons.steppers.executors.frame import Frame
-from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import retold
 
@@ -186,19 +185,16 @@ def landed(
     forces : bool
         Whether to evaluate them there.
     """
-    frame = Frame(system, start, size)
-    if until is not None:
-        frame.time, frame.left_over = until, 0.0
-    number, time = frame.number, frame.time
-    x = frame.x + change[0]
-    v = frame.v + change[1]
+    (x, shift), number = system.near_origin(start), start.step + 1
+    time, left_over = start.later(size) if until is None else (until, 0.0)
+    x, v = x + change[0], system.taken(start)[1] + change[1]
     check_finite(x, "position", number)
     check_finite(v, "velocity", number)
     motion = system.motion
     x = motion.project_positions(x, x, time=time, reference_time=time)
     v = motion.project_velocities(x, v, time=time)
-    low = np.zeros_like(x) if frame.shift is None and system.is_far(x) else None
-    return frame.closed(x, v, system.forces(frame.whole(x), v, time, number) if forces else None, low=low)
+    f = system.forces(x if shift is None else x + shift, v, time, number) if forces else None
+    return system.ended(start, number, (time, left_over), (x, v, f), shift, None, shift is None and system.is_far(x))
 
 
 def rms(values: FloatArray, system: System) -> float:

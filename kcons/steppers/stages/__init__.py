@@ -1,7 +1,7 @@
 """What steps are made of.
 
-- `drifts`: constrained flight without forces
+- `compiled_operations`: operations one after another in one compiled call
+- `packed_system`: what compiled operations know of a system
 - `friction`: friction of the system
-- `compensated_steps`: positions and velocities on their way, without adding up rounding errors
-- `fused_stages`: whole stages in one compiled call
+- `great_circles`: exact flight on spheres
 """

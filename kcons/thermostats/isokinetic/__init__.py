@@ -1,8 +1,7 @@
 """The Gaussian isokinetic thermostat: constant kinetic energy as a velocity constraint.
 
-- `kick`: the kick at fixed positions in closed form
-- `step`: one step, and the atoms it acts on
-- `fused_step`: the two halves of a step in one compiled call each
+- `kick`: the kick at fixed positions in closed form, and as an operation of compiled steps
+- `step`: steps, and the atoms that they act on
 - `isokinetic`: the thermostat
 """
 

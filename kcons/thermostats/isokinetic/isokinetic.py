@@ -7,9 +7,8 @@ that a kick at fixed positions has the closed form it has without constraints.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +17,8 @@ from kcons.constraints.arguments import positive
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
+from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
-from kcons.steppers.stepper import stays
 from kcons.thermostats.freedom import (
     LOOK_AT,
     Momentum,
@@ -31,7 +30,7 @@ from kcons.thermostats.freedom import (
     warn_of_conserved_momenta,
 )
 from kcons.thermostats.isokinetic import kick as closed_form
-from kcons.thermostats.isokinetic.step import SMALLEST, Share, isokinetic_step, left_for, split
+from kcons.thermostats.isokinetic.step import SMALLEST, IsokineticStep, Share, left_for, programs, split
 
 Convention = Literal["exact", "notes"]
 
@@ -144,6 +143,7 @@ class Isokinetic(Splitting):
             if isinstance(operation, Evaluate):
                 operations.append(Project())
         self._operations = tuple(operations[:-1])
+        self._programs = programs(self._operations)
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
@@ -209,7 +209,7 @@ class Isokinetic(Splitting):
         free = freedom(system, state, state.forces, self.atoms, self.momentum)
         twice = self._twice_kinetic(share, free.count, found)
         turns = free.turns and self.thermal_energy is not None
-        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=5)
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
         velocities = rest if drive is None else drive + rest
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
@@ -266,24 +266,22 @@ class Isokinetic(Splitting):
             known = self._shares = (system, Share(system, self.atoms))
         return known[1]
 
-    def step(self, system: System, state: State, dt: float) -> State:
-        """Advance by `dt`.
-
-        Raises
-        ------
-        ConvergenceError, NonFiniteError, InputError, UnsupportedError
-            As for all splittings, and at the start of a run as for `start`.
-        """
-        still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
-        if still is not None:
-            return still
+    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         begin = self.start(system, state)
         if begin.step == LOOK_AT and self.thermal_energy is not None and self.atoms is None:
-            warn_of_bodies_apart(system, begin, stacklevel=5)
-        after = isokinetic_step(system, self._share(system), begin, dt, self._operations)
+            warn_of_bodies_apart(system, begin, stacklevel=7)
+        return IsokineticStep(system, self._share(system), begin, dt, self._programs, steps)
+
+    def at_once(self, state: State, steps: int) -> int:
+        return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
+
+    def depends_on(self, system: System, state: State) -> Any:
+        driven = system.motion.plan.driven
+        return None if driven else (self.thermal_energy, self.kinetic_energy, state.step == LOOK_AT)
+
+    def note(self, state: State) -> None:
         asked = self.thermal_energy, self.kinetic_energy
-        self._left = after.thermostat, *asked, after.velocities, after.positions
-        return after
+        self._left = state.thermostat, *asked, state.velocities, state.positions
 
     # -- what can be read -----------------------------------------------------------------------
 

@@ -17,11 +17,19 @@ import numpy as np
 
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
+from kcons.solvers.fused_distances import MORE, packed_tangents
+from kcons.solvers.kernels.array_views import flat, integers, piece
+from kcons.steppers.stages.compiled_operations import all_finite
 
 #: Sums may be taken in any order, so that they are compiled to vector instructions; NaN stays NaN.
 _SUMS = {"reassoc", "contract", "arcp", "nsz"}
 #: Below this share of the terms, their sum has lost digits.
 _CANCELS = 0.01
+#: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
+MANY = 1e4
+#: What the numbers of a program begin with, as `State.thermostat`: 2K, the integral of alpha, f.M_par^+ f, and g; after
+#: them the masses of the thermostatted atoms for each coordinate, 0 for others, and room for accelerations.
+TWICE, INTEGRAL, SQUARE, COUNT, SIZE = range(5)
 
 
 class Weights(NamedTuple):
@@ -141,28 +149,30 @@ def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
     return uf, ff
 
 
-# -- kicks, in one call -----------------------------------------------------------------------------
+# -- kicks, in place --------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)
-def before_drift(u, f, weights, masses, square, twice, t, many, out):  # type: ignore[no-untyped-def]
-    """out = keep u + push M^-1 f, with forces that are not projected; log of the growth, and whether it was done.
+def before_drift(u, f, weights, masses, square, twice, t):  # type: ignore[no-untyped-def]
+    """u = keep u + push M^-1 f, with forces that are not projected; log of the growth, and whether it was done.
 
-    It is not where digits would be lost, or where a drift would have to take out more than `many` times 2K.
+    It is not where digits would be lost, or where a drift would have to take out more than `MANY` times 2K. Atoms that
+    are not thermostatted are pushed.
     """
     aligned, raw = raw_sums(u, f, weights, masses)
     keep, push, log_growth, cancels = _weights(aligned, square, twice, t)
-    if cancels or not push * push * raw <= many * twice:
+    if cancels or not push * push * raw <= MANY * twice:
         return 0.0, False
-    a, b, w, c = u.ravel(), f.ravel(), weights.ravel(), out.ravel()
+    a, b, w, m = flat(u), flat(f), flat(weights), flat(masses)
     for i in range(a.size):
-        c[i] = keep * a[i] + push * (w[i] * b[i])
+        some = m[i] > 0
+        a[i] = (keep if some else 1.0) * a[i] + (push if some else t) * (w[i] * b[i])
     return log_growth, True
 
 
 @njit(cache=True, nogil=True)
-def after_drift(u, pace, masses, twice, t, out):  # type: ignore[no-untyped-def]
-    """Bring u to its length, and out = keep u + push F.
+def after_drift(u, pace, masses, twice, t):  # type: ignore[no-untyped-def]
+    """Bring u to its length, and u = keep u + push F.
 
     Returns f.F, the factor of u, log of the growth, and whether it was done: it is not where digits would be lost.
     """
@@ -176,7 +186,45 @@ def after_drift(u, pace, masses, twice, t, out):  # type: ignore[no-untyped-def]
     got = keep * (keep * twice + 2 * push * aligned) + push * push * square
     right = math.sqrt(twice / got) if got > 0 else math.nan
     left, more = right * factor * keep, right * push
-    a, b, c = u.ravel(), pace.ravel(), out.ravel()
+    a, b, m = flat(u), flat(pace), flat(masses)
     for i in range(a.size):
-        c[i] = left * a[i] + more * b[i]
+        some = m[i] > 0
+        a[i] = (left if some else 1.0) * a[i] + (more if some else t) * b[i]
     return square, factor, log_growth - math.log(factor), True
+
+
+# -- the same as operations of a program -------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """`before_drift`, from velocities on the constraints."""
+    n = v.size
+    weights, masses = piece(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    if not all_finite(forces):
+        return 1
+    growth, done = before_drift(v, forces, weights, masses, numbers[SQUARE], numbers[TWICE], time)
+    if not done:
+        return 1
+    numbers[INTEGRAL] += growth
+    return 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """`after_drift`, from velocities on the constraints and forces, which are projected first."""
+    n = v.size
+    weights, masses = piece(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    if not all_finite(forces):
+        return 1
+    pace = numbers[SIZE + n : SIZE + 2 * n]
+    for i in range(n):
+        pace[i] = weights[i] * forces[i]
+    if not packed_tangents(x, pace.reshape(v.shape), tables):
+        return 1
+    square, _, growth, done = after_drift(v, pace, masses, numbers[TWICE], time)
+    if not done or not all_finite(v):
+        return 1
+    numbers[SQUARE] = square
+    numbers[INTEGRAL] += growth
+    return 0

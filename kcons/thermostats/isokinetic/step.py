@@ -8,33 +8,35 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
-from kcons.steppers.executors.frame import Frame
-from kcons.steppers.executors.piecewise import ArrayStep
-from kcons.steppers.operations import Fly, Operation, Project, Turn
-from kcons.steppers.stages.compensated_steps import Point, check_finite
+from kcons.steppers.interpreter import Interpreter
+from kcons.steppers.operations import Operation, Turn
+from kcons.steppers.program import Program, Row
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic import kick as closed_form
-from kcons.thermostats.isokinetic.fused_step import (
-    DONE,
-    ENGINE,
-    FORCE,
-    KICK,
-    MANY,
-    POSITION,
-    VELOCITY,
-    IsokineticStages,
-)
+from kcons.thermostats.isokinetic.kick import INTEGRAL, SIZE, SQUARE, TWICE
 
 #: Kinetic energy below which v.f/2K may overflow.
 SMALLEST = 1e-290
-#: Operations of a step with one drift.
-FEWEST = 5
 _MAX_ITERATIONS = 50
-_WHAT = {FORCE: "force", POSITION: "position", VELOCITY: "velocity"}
+
+
+class _FirstTurn(Turn):
+    """The turn that a step begins with, whose forces need not be projected: the drift takes out the rest."""
+
+    verb = "first_turn"
+
+
+def programs(operations: Sequence[Operation]) -> tuple[Program, Program, Program]:
+    """A step compiled, with the turns in Python, and where targets move."""
+    first, *others = operations
+    assert isinstance(first, Turn)
+    parts = _FirstTurn(first.fraction), *others
+    functions = {"first_turn": closed_form.first_turn, "turn": closed_form.turn}
+    return Program(parts, functions), Program(parts), Program(parts, python=("project", "fly"))
 
 
 def split(system: System, x: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray | None, FloatArray]:
@@ -74,8 +76,6 @@ class Share:
         #: Coordinates of other atoms that move, None if there are none.
         others = (self.masses == 0) & (system.weights > 0)
         self.others = others if others.any() else None
-        #: Halves of a step in one call each, None where the engine and the closed form are called one by one.
-        self.stages = IsokineticStages.of(system, self.masses, self.others is not None)
 
     def square(self, v: FloatArray) -> float:
         """v^T M v."""
@@ -90,7 +90,7 @@ class Share:
     def push_square(self, system: System, state: State) -> float:
         """f . M_par^+ f at the state."""
         assert state.forces is not None
-        pace = paced(system, Frame(system, state, 0.0).x, state.forces, state.time)
+        pace = paced(system, system.near_origin(state)[0], state.forces, state.time)
         return float(closed_form.square_sum(pace, self.masses))
 
 
@@ -108,191 +108,100 @@ def _paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> Fl
     return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
 
 
-# As a decorator this costs half of a `with`. What overflows is looked for, and named with the step's number.
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def isokinetic_step(system: System, share: Share, start: State, dt: float, operations: Sequence[Operation]) -> State:
-    """A step: in two compiled calls where that is possible and it has one flight, else an operation at a time."""
-    if share.stages is not None and len(operations) == FEWEST:
-        after = _compiled(system, share, share.stages, start, dt, operations)
-        if after is not None:
-            return after
-    return IsokineticStep(system, share, start, dt).through(operations)
+class IsokineticStep(Interpreter):
+    """Steps on their way; velocities are drive + v, the drive None where targets rest."""
 
-
-def _compiled(
-    system: System, share: Share, stages: IsokineticStages, start: State, dt: float, operations: Sequence[Operation]
-) -> State | None:
-    """A step of order 2 in two compiled calls; None, with nothing done, where the first of them cannot do its half."""
-    force = system.force
-    assert force is not None and start.thermostat is not None
-    frame = Frame(system, start, dt)
-    f, number, tables = frame.forces, frame.number, stages.tables()
-    assert f is not None
-    twice, integral, square, count = start.thermostat.tolist()
-    turn, flight, _, _, last = operations
-    status, there, speed, first_growth = stages.before(
-        frame.x, frame.v, f, square, twice, turn.fraction * dt, flight.fraction * dt, tables
-    )
-    if status == POSITION:
-        check_finite(there, "position", number)
-    if status != DONE:
-        return None
-    f = system.accepted(force(lent(frame.whole(there)), frame.time), number, True)
-    status, after, _, square, _, growth = stages.after(there, speed, f, twice, last.fraction * dt, tables)
-    if status != DONE:
-        rest = IsokineticStep(system, share, start, dt)
-        rest.x, rest.v, rest.forces, rest.now, rest.integral = there, speed, f, frame.time, integral + first_growth
-        return rest.through(operations[3:])
-    return frame.closed(there, after, f, np.array([twice, integral + first_growth + growth, square, count]))
-
-
-class IsokineticStep(ArrayStep):
-    """A step on its way; velocities are drive + v, the drive None where targets rest."""
-
-    def __init__(self, system: System, share: Share, start: State, dt: float) -> None:
-        super().__init__(system, start, dt)
+    def __init__(
+        self, system: System, share: Share, start: State, dt: float, made: tuple[Program, Program, Program], steps: int
+    ) -> None:
         assert start.thermostat is not None
+        driven = system.motion.plan.driven
+        program = made[2 if driven else 1 if system.packed is None else 0]
+        masses = share.masses.ravel()
+        numbers = np.concatenate((start.thermostat, masses, masses))
+        super().__init__(system, start, dt, program, steps, numbers)
         self.share = share
-        self.stages = share.stages if system.force is not None else None
-        self.tables = np.empty(0) if self.stages is None else self.stages.tables()
-        self.twice, self.integral, self.push_square, self.count = start.thermostat.tolist()
         self.drive: FloatArray | None = None
         #: How long v must be, squared.
-        self.left = self.twice
-        #: Whether v has to be projected before it turns.
-        self.askew = False
-        if system.motion.plan.driven:
-            drive, self.v = split(system, self.x, self.v, self.now)
-            assert drive is not None
-            self.drive, self.left = drive, left_for(self.twice, share.square(drive), self.number)
+        self.left = float(start.thermostat[TWICE])
+        if driven:
+            self.drive, self.v[:] = split(system, self.x, self.v, self.time)
+            assert self.drive is not None
+            self.left = left_for(self.left, share.square(self.drive), self.number)
 
     # -- verbs ----------------------------------------------------------------------------------
 
-    def turn(self, operation: Turn) -> None:
-        """The kick: from velocities on the constraints, or projected in the same call."""
-        t = operation.fraction * self.dt
-        if not self.askew:
-            self._turn_before_drift(t)
+    def fly(self, row: Row, begun: bool) -> None:
+        if self.drive is not None:
+            self._driven_flight(row)
             return
-        self.askew = False
-        if self.stages is None or not self._project_and_turn(self.stages, t):
-            if self.drive is None:
-                self.v = self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
-            self._turn_after_drift(t)
-            check_finite(self.v, "velocity", self.number)
+        super().fly(row, begun)
 
-    def fly(self, operation: Fly) -> None:
+    def project(self, row: Row, begun: bool) -> None:
         if self.drive is None:
-            super().fly(operation)
-            check_finite(self.x, "position", self.number)
-            return
-        for h, end in self.pieces(operation):
-            self._driven_flight(h, end)
+            super().project(row, begun)
 
-    def evaluate(self, operation: Operation) -> None:
-        if self.system.force is not None:
-            # Compiled projections look for NaN.
-            self.forces = self.system.forces(
-                self.frame.whole(self.x), self.v, self.now, self.number, finite=self.stages is None
-            )
-
-    def project(self, operation: Project) -> None:
-        """Left to the turn that follows."""
-        self.askew = True
-
-    def end(self) -> State:
-        v = self.v if self.drive is None else self.drive + self.v
-        thermostat = np.array([self.twice, self.integral, self.push_square, self.count])
-        return self.frame.closed(self.x, v, self.forces, thermostat)
-
-    # -- turns ----------------------------------------------------------------------------------
-
-    def _turn_before_drift(self, t: float) -> None:
+    def first_turn(self, row: Row, begun: bool) -> None:
         """With forces as they are: the drift takes out what they would do across the constraints."""
-        system, share = self.system, self.share
-        if system.force is None:
-            return
-        assert self.forces is not None
-        u = np.empty_like(self.v)
-        log_growth, done = closed_form.before_drift(
-            self.v, self.forces, system.weights, share.masses, self.push_square, self.left, t, MANY, u
-        )
-        if not done:
-            self._turn_after_drift(t)
-            return
-        if share.others is not None:
-            u = np.where(share.others, self.v + t * system.weights * self.forces, u)
-        self.v = u
-        self.integral += log_growth
+        t, system, share = row.length * self.dt, self.system, self.share
+        check_finite(self.forces, "force", self.number)
+        if not begun:
+            growth, done = closed_form.before_drift(
+                self.v, self.forces, system.weights, share.masses, float(self.numbers[SQUARE]), self.left, t
+            )
+            if done:
+                self.numbers[INTEGRAL] += growth
+                return
+        self._turn_by_projected_forces(row, t)
 
-    def _turn_after_drift(self, t: float) -> None:
+    def turn(self, row: Row, begun: bool) -> None:
         """Bring v, projected, to its length, and follow the closed form."""
-        system, share = self.system, self.share
-        if system.force is None:
-            factor = math.sqrt(self.left / share.square(self.v))
-            self.v = self._times(factor, self.v)
-            self.integral -= math.log(factor)
-            return
-        assert self.forces is not None
-        pace = _paced(system, self.x, self.forces, self.now)
-        u = np.empty_like(pace)
-        self.push_square, factor, log_growth, done = closed_form.after_drift(
-            self.v, pace, share.masses, self.left, t, u
-        )
-        self.integral += log_growth
-        if not done:
-            self._turn_against(pace, factor, t)
-            return
-        if share.others is not None:
-            u = np.where(share.others, self.v + t * pace, u)
-        self.v = u
+        check_finite(self.v, "velocity", self.number)
+        self._turn_by_projected_forces(row, row.length * self.dt)
+        check_finite(self.v, "velocity", self.number)
 
-    def _turn_against(self, pace: FloatArray, factor: float, t: float) -> None:
-        """Where the force is strong and v runs against it."""
+    def _turn_by_projected_forces(self, row: Row, t: float) -> None:
         share = self.share
-        u, growth = closed_form.turned(factor * self.v, pace, share.masses, self.left, t)
-        if share.others is not None:
-            u = np.where(share.others, self.v + t * pace, u)
-        self.v = u
-        self.integral += growth
+        check_finite(self.forces, "force", self.number)
+        pace = _paced(self.system, self.place(row.here), self.forces, self.at(row.end))
+        square, factor, growth, done = closed_form.after_drift(self.v, pace, share.masses, self.left, t)
+        if not done:
+            # The force is strong, and v runs against it.
+            turned, more = closed_form.turned(factor * self.v, pace, share.masses, self.left, t)
+            self.v[:] = turned if share.others is None else np.where(share.others, self.v + t * pace, turned)
+            growth += more
+        self.numbers[SQUARE] = square
+        self.numbers[INTEGRAL] += growth
 
-    def _project_and_turn(self, stages: IsokineticStages, t: float) -> bool:
-        """A projection and the turn after it in one call; whether it was done."""
-        assert self.forces is not None
-        status, u, pace, square, factor, log_growth = stages.after(
-            self.x, self.v, self.forces, self.left, t, self.tables
-        )
-        if status == ENGINE:
-            return False
-        if status in _WHAT:
-            check_finite({FORCE: self.forces, POSITION: self.x, VELOCITY: u}[status], _WHAT[status], self.number)
-        self.push_square = square
-        self.integral += log_growth
-        if status == KICK:
-            self._turn_against(pace, factor, t)
-            check_finite(self.v, "velocity", self.number)
-        else:
-            self.v = u
-        return True
+    def end(self, here: int) -> State:
+        if self.drive is not None:
+            self.v = self.drive + self.v
+        return super().end(here)
+
+    def variables(self) -> FloatArray:
+        return self.numbers[:SIZE].copy()
 
     # -- moving targets ------------------------------------------------------------------------
 
-    def _driven_flight(self, h: float, now: float) -> None:
+    def _driven_flight(self, row: Row) -> None:
         """Moving targets do work: u is scaled by one factor before and after the flight, that which keeps K.
 
         So it is symmetric, of order 2 (Hairer, BIT 40, 726 (2000)).
         """
-        system, share = self.system, self.share
+        system, share, x, h = self.system, self.share, self.place(row.here), self.length(row)
         assert self.drive is not None
-        then = self.now
-        log_factor, last = 0.0, math.inf
+        then, now = self.at(row.begin), self.at(row.end)
+        out, log_factor, last = self.place(row.there), 0.0, math.inf
         for _ in range(_MAX_ITERATIONS):
-            point = Point(self.x, self.drive + self._times(math.exp(log_factor), self.v), system.weights, exact=False)
-            system.drift.move(point, np.empty_like(self.x), then, now, h)
-            check_finite(point.x, "position", self.number)
-            drive, u = split(system, point.x, point.v, now)
+            v = self.drive + self._times(math.exp(log_factor), self.v)
+            np.add(x, h * v, out=out)
+            system.motion.project_positions(
+                out, x, time=now, reference_time=then, velocities=v, dt=h, flight=h, out=out
+            )
+            check_finite(out, "position", self.number)
+            drive, u = split(system, out, v, now)
             assert drive is not None
-            left = left_for(self.twice, share.square(drive), self.number)
+            left = left_for(float(self.numbers[TWICE]), share.square(drive), self.number)
             u = self._times(math.exp(log_factor), u)
             miss = 0.5 * math.log(left / share.square(u))
             if abs(miss) <= 1e-15 or (abs(miss) < 1e-12 and abs(miss) >= last):
@@ -306,8 +215,9 @@ class IsokineticStep(ArrayStep):
                 tolerance=1e-12,
                 iterations=_MAX_ITERATIONS,
             )
-        self.x, self.now, self.drive, self.v, self.left = point.x, now, drive, u, left
-        self.integral -= 2 * log_factor
+        self.drive, self.left = drive, left
+        self.v[:] = u
+        self.numbers[INTEGRAL] -= 2 * log_factor
 
     def _times(self, factor: float, u: FloatArray) -> FloatArray:
         return u * factor if self.share.others is None else np.where(self.share.others, u, u * factor)

@@ -21,7 +21,6 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.steppers import Rattle, State, Stepper, System
-from kcons.steppers.executors.frame import Frame
 from kcons.steppers.stepper import Portable, require_stepper, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
@@ -310,7 +309,7 @@ class HamiltonianMonteCarlo(Portable):
 
     def _refreshed(self, system: System, state: State, random: np.random.Generator) -> FloatArray:
         """Velocities of which a part is kept and a part drawn, in the tangent plane."""
-        x, v = Frame(system, state, 0.0).x, state.velocities
+        x, v = system.near_origin(state)[0], state.velocities
         noise = random.standard_normal(v.shape)
         noise *= np.sqrt((1 - self.keep**2) * self.thermal_energy * system.inverse_masses)
         kept = self.keep * v

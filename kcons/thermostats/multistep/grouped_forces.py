@@ -11,7 +11,7 @@ from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
-from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import carried
 from kcons.thermostats.multistep.force_groups import ForceGroups
 
@@ -102,6 +102,13 @@ class GroupedForces:
         f = system.accepted(force.of(name, lent(x), time), step, True)
         check_finite(f, "force", step)
         self.now[name] = f
+
+    def stacked(self) -> FloatArray:
+        """Those of all groups one after another, shape (n_groups n_atoms, 3)."""
+        if len(self.names) == 1:
+            return self.now[self.names[0]]
+        none = np.zeros((self.system.n_atoms, 3))
+        return np.concatenate([self.now.get(name, none) for name in self.names])
 
     def total(self) -> FloatArray | None:
         """Their sum, None where the slowest ones are those of another place."""

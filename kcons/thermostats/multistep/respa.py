@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-import numpy as np
+from typing import Any
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
 from kcons.steppers.compositions import SUZUKI_4
-from kcons.steppers.executors.piecewise import ArrayStep
-from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation
-from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.thermostats.langevin import Langevin, LangevinStep
+from kcons.steppers.interpreter import Interpreter
+from kcons.steppers.operations import Evaluate
+from kcons.steppers.program import Row
+from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
 from kcons.thermostats.multistep.nesting import Level, SlowKicks, evaluations, levels_of, middle_of, nested
@@ -94,9 +93,11 @@ class LangevinRespa(Langevin):
         flight = inner_flight(order, self.substeps)
         self.inner_order = order
         self.middle = middle_of(self.levels, slow_kicks)
-        self._substeps = nested(self.levels, order, flight, middle=self.middle)
-        self._great_circles = nested(self.levels, order, (1.0,), exact=True, middle=self.middle)
-        self.force_evaluations = sum(evaluations(self._substeps).values())
+        self.names = tuple(level.group for level in self.levels)
+        self._in_flights = listed_and_made(nested(self.levels, order, flight, middle=self.middle), self.names)
+        circles = nested(self.levels, order, (1.0,), exact=True, middle=self.middle)
+        self._great_circles = listed_and_made(circles, self.names)
+        self.force_evaluations = sum(evaluations(self._in_flights[0]).values())
 
     def __repr__(self) -> str:
         steps = {level.group: level.steps for level in self.levels}
@@ -108,44 +109,36 @@ class LangevinRespa(Langevin):
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
         super().check(system)
-        group_names(system.force, tuple(level.group for level in self.levels))
+        group_names(system.force, self.names)
 
-    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
-        return RespaStep(system, state, dt, self)
+    def depends_on(self, system: System, state: State) -> Any:
+        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
+        return None if self.middle else self.thermal_energy
+
+    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
+        self.refuse_back(system, dt)
+        return RespaStep(system, state, dt, self, steps)
 
 
 class RespaStep(LangevinStep):
-    """A step on its way."""
+    """Steps on their way."""
 
-    def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa) -> None:
-        names = tuple(level.group for level in thermostat.levels)
-        groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa", middle=thermostat.middle)
-        super().__init__(system, start, dt, thermostat)
-        self.groups = groups
-        self.equal_flights = thermostat.inner_order == 2
-        #: Exchanges so far.
-        self.exchanges = 0
+    simple = False
 
-    def kick(self, operation: Kick) -> None:
-        self.v = self.v + (operation.fraction * self.dt) * (
-            self.groups.now[operation.group] * self.system.inverse_masses
-        )
+    def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa, steps: int) -> None:
+        names = thermostat.names
+        self.groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa", middle=thermostat.middle)
+        super().__init__(system, start, dt, thermostat, 1 if thermostat.middle else steps)
+        self.forces = self.groups.stacked()
 
-    def pieces(self, operation: Fly) -> list[tuple[float, float]]:
-        return super().pieces(operation) if self.equal_flights else ArrayStep.pieces(self, operation)
+    def evaluate(self, row: Row, begun: bool) -> None:
+        assert isinstance(row.operation, Evaluate)
+        self.show(row)
+        self.groups.evaluate(row.operation.group, self.whole(self.x), self.at(row.end), self.number)
+        self.forces = self.groups.stacked()
 
-    def exchange(self, operation: Exchange) -> None:
-        super().exchange(operation)
-        self.exchanges += 1
+    def applied(self, here: int) -> FloatArray | None:
+        return self.groups.total()
 
-    def noise(self, shape: tuple[int, ...]) -> FloatArray:
-        return self.thermostat.drawn(self.number, shape, self.exchanges)
-
-    def evaluate(self, operation: Operation) -> None:
-        assert isinstance(operation, Evaluate)
-        check_finite(self.x, "position", self.number)
-        self.groups.evaluate(operation.group, self.frame.whole(self.x), self.now, self.number)
-
-    def end(self) -> State:
-        variables = self.groups.closed(np.array([self.heat]))
-        return self.frame.closed(self.x, self.v, self.groups.total(), variables)
+    def variables(self) -> FloatArray:
+        return self.groups.closed(super().variables())

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,10 @@ from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
-from kcons.steppers.executors.piecewise import ArrayStep
-from kcons.steppers.operations import Evaluate, Exchange, Fly, Operation, Project, Turn
-from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.interpreter import Interpreter
+from kcons.steppers.operations import Evaluate, Operation, Project, Turn
+from kcons.steppers.program import Program, Row
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import MARK
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
@@ -109,9 +111,11 @@ class IsokineticSpheres(SeededBath):
         self.inner_order = order
         flight = inner_flight(order, self.substeps)
         self.middle = middle_of(self.levels, slow_kicks)
-        self._in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
-        self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
-        self.force_evaluations = sum(evaluations(self._in_flights).values())
+        self.names = tuple(level.group for level in self.levels)
+        in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
+        circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
+        self._in_flights, self._great_circles = (_listed_and_made(each, self.names) for each in (in_flights, circles))
+        self.force_evaluations = sum(evaluations(in_flights).values())
         self._known: tuple[System, SphereLayout, FloatArray, float] | None = None
         self._told = False
 
@@ -124,8 +128,11 @@ class IsokineticSpheres(SeededBath):
         return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        exact = system is not None and system.great_circles is not None
-        return self._great_circles if exact else self._in_flights
+        return self.listed(system)[0]
+
+    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
+        """The operations, and as the interpreter goes through them."""
+        return self._in_flights if system is None or system.great_circles is None else self._great_circles
 
     def check(self, system: System) -> None:
         """Raise where there can be no spheres, or where the groups of forces are not those that have steps.
@@ -140,7 +147,7 @@ class IsokineticSpheres(SeededBath):
         super().check(system)
         if self._known is None or self._known[0] is not system:
             refuse_driven(system)
-            group_names(system.force, tuple(level.group for level in self.levels))
+            group_names(system.force, self.names)
 
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
@@ -156,12 +163,17 @@ class IsokineticSpheres(SeededBath):
         whole = g + self.auxiliary
         return 0.5 * self.thermal_energy * float((g * (whole - 1) / whole).sum())
 
-    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
+    def depends_on(self, system: System, state: State) -> Any:
+        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
+        return None if self.middle else self.thermal_energy
+
+    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
+        self.refuse_back(system, dt)
         _, layout, squares, _ = self._found(system, state.positions)
         if not self._told:
             self._told = True
             logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
-        return SphereStep(system, state, dt, self, layout, squares)
+        return SphereStep(system, state, dt, self, layout, squares, 1 if self.middle else steps)
 
     def _found(self, system: System, positions: FloatArray) -> tuple[System, SphereLayout, FloatArray, float]:
         known, kt = self._known, self.thermal_energy
@@ -171,8 +183,29 @@ class IsokineticSpheres(SeededBath):
         return known
 
 
-class SphereStep(ArrayStep):
-    """A step on its way; velocities are on the constraints and on their spheres but between a drift and `project`."""
+class _Rescale(Operation):
+    """Velocities get the length that they have on their spheres."""
+
+    verb, meaning = "rescale", "velocities back to their length"
+
+
+class _Restore(Operation):
+    """Velocities and auxiliary variables onto their spheres, with which each step begins."""
+
+    verb, meaning = "restore", "onto the spheres"
+
+
+def _listed_and_made(operations: tuple[Operation, ...], names: tuple[str, ...]) -> tuple[Any, Program]:
+    parts: list[Operation] = [_Restore()]
+    for operation in operations:
+        parts += [operation, _Rescale()] if isinstance(operation, Project) else [operation]
+    return operations, Program(parts, None, names)
+
+
+class SphereStep(Interpreter):
+    """Steps on their way; velocities are on the constraints and on their spheres but between a drift and `project`."""
+
+    simple = False
 
     def __init__(
         self,
@@ -182,59 +215,61 @@ class SphereStep(ArrayStep):
         bath: IsokineticSpheres,
         layout: SphereLayout,
         squares: FloatArray,
+        steps: int,
     ) -> None:
         n, auxiliary = len(squares), bath.auxiliary
-        names = tuple(level.group for level in bath.levels)
         self.groups, known = GroupedForces.of(
-            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", marked=True, middle=bath.middle
+            system, start, bath.names, 1 + n * auxiliary, "IsokineticSpheres", marked=True, middle=bath.middle
         )
-        super().__init__(system, start, dt)
+        super().__init__(system, start, dt, bath.listed(system)[1], steps)
         self.bath, self.squares = bath, squares
         self.tables = layout.cluster, layout.spheres, layout.masses, layout.totals
-        self.v = self.v.copy()
         if known is not None:
             known = known[1:]
         else:
             known = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (n * auxiliary,), _BEGIN)
-            self.v = self.along(self.v)
+            self.along(self.v, self.place(0), self.time)
         self.w: FloatArray = known.reshape(n, auxiliary).copy()
-        kernels.rescale(self.v, self.w, squares, True, *self.tables)
         #: Accelerations along the constraints, by groups, where they are known.
         self.paces: dict[str, FloatArray] = {}
-        self.exchanges = 0
 
-    def turn(self, operation: Turn) -> None:
-        group = operation.group
+    def turn(self, row: Row, begun: bool) -> None:
+        assert isinstance(row.operation, Turn)
+        group = row.operation.group
         if group not in self.paces:
-            self.paces[group] = self.along(self.groups.now[group] * self.system.weights)
-        kernels.turn(self.v, self.w, self.paces[group], operation.fraction * self.dt, self.squares, *self.tables)
+            pace = self.groups.now[group] * self.system.weights
+            self.paces[group] = self.along(pace, self.place(row.here), self.at(row.end))
+        kernels.turn(self.v, self.w, self.paces[group], row.length * self.dt, self.squares, *self.tables)
 
-    def fly(self, operation: Fly) -> None:
-        super().fly(operation)
-        check_finite(self.x, "position", self.number)
-        self.paces.clear()
+    def restore(self, row: Row, begun: bool) -> None:
+        """Velocities and auxiliary variables get the lengths of their spheres."""
+        kernels.rescale(self.v, self.w, self.squares, True, *self.tables)
 
-    def project(self, operation: Project) -> None:
-        """Velocities onto the constraints, with the length they had before the drift."""
-        self.v = self.along(self.v)
+    def rescale(self, row: Row, begun: bool) -> None:
+        """Velocities get the length they had before the drift."""
         kernels.rescale(self.v, self.w, self.squares, False, *self.tables)
 
-    def exchange(self, operation: Exchange) -> None:
+    def exchange(self, row: Row, begun: bool) -> None:
         """Friction and noise on the spheres."""
         system, bath = self.system, self.bath
         n = self.v.size
-        drawn = bath.drawn(self.number, (n + self.w.size,), self.exchanges)
-        self.exchanges += 1
-        noise = self.along(drawn[:n].reshape(self.v.shape) * system.root_weights)
-        decay = bath.friction * operation.fraction * self.dt
+        drawn = bath.drawn(self.number, (n + self.w.size,), row.number)
+        noise = drawn[:n].reshape(self.v.shape) * system.root_weights
+        self.along(noise, self.place(row.here), self.at(row.end))
+        decay = bath.friction * row.length * self.dt
         keep, spread = math.exp(-decay), math.sqrt(-math.expm1(-2 * decay) * bath.thermal_energy)
         own = drawn[n:].reshape(self.w.shape)
         kernels.stir(self.v, self.w, noise, own, keep, spread, self.squares, *self.tables)
 
-    def evaluate(self, operation: Operation) -> None:
-        assert isinstance(operation, Evaluate)
-        self.groups.evaluate(operation.group, self.frame.whole(self.x), self.now, self.number)
+    def evaluate(self, row: Row, begun: bool) -> None:
+        assert isinstance(row.operation, Evaluate)
+        self.paces.clear()
+        self.show(row)
+        self.groups.evaluate(row.operation.group, self.whole(self.x), self.at(row.end), self.number)
 
-    def end(self) -> State:
+    def applied(self, here: int) -> FloatArray | None:
+        return self.groups.total()
+
+    def variables(self) -> FloatArray:
         check_finite(self.v, "velocity", self.number)
-        return self.frame.closed(self.x, self.v, self.groups.total(), self.groups.closed(np.append(MARK, self.w)))
+        return self.groups.closed(np.append(MARK, self.w))

@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
-from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.langevin import wound
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic

@@ -9,8 +9,8 @@ MUTANTS = [
     ),
     (
         "thermostats/langevin.py",
-        "if thermostat.friction > 0:",
-        "if thermostat.friction >= 0:",
+        "if self.thermostat.friction > 0:",
+        "if self.thermostat.friction >= 0:",
         "tests/ase/test_logger.py::test_without_noise_the_log_is_of_the_end[0.0]",
     ),
     (
@@ -118,8 +118,8 @@ MUTANTS = [
     ),
     (
         "steppers/state.py",
-        "return None if state.remainder is None or self._free_of_origin is None else state.remainder",
-        "return state.remainder",
+        "if state.remainder is None or self._free_of_origin is None:",
+        "if state.remainder is None:",
         "tests/steppers/test_state.py::test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place",
     ),
     (

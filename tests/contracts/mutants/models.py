@@ -33,10 +33,10 @@ MUTANTS = [
         "tests/models/growth/test_constrained.py::test_dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
     ),
     (
-        "steppers/stages/drifts.py",
+        "steppers/stages/great_circles.py",
         "((self.radii * n - d) + self.radii",
         "(self.radii",
-        "tests/steppers/stages/test_drifts.py::test_great_circles_end_on_the_sphere_wherever_they_start",
+        "tests/steppers/test_flights.py::test_great_circles_end_on_the_sphere_wherever_they_start",
     ),
     (
         "models/growth/model.py",

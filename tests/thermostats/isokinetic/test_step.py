@@ -1,4 +1,4 @@
-"""Steps through compiled halves: those made call by call, and the engine where a half cannot be done."""
+"""Compiled steps: those by the engine, operation by operation, and the engine where a kernel cannot go on."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from thermostat_systems import ROWS, distance, molecules, springs, thermostats
+from thermostat_systems import ROWS, distance, isokinetics, molecules, springs
 
-from kcons.errors import NonFiniteError
-from kcons.steppers import run
+from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import ConvergenceError, NonFiniteError
+from kcons.motion import Motion
+from kcons.steppers import State, System, run
+from kcons.steppers.stages.compiled_operations import PYTHON
 from kcons.thermostats import Isokinetic
-from kcons.thermostats.isokinetic.fused_step import ENGINE, KICK
+from kcons.thermostats.isokinetic.step import IsokineticStep, programs
 
 ORDERS = pytest.mark.parametrize("order", [2, 4, 6])
 EVERY = pytest.mark.parametrize("name", ROWS)
@@ -29,13 +33,13 @@ EVERY = pytest.mark.parametrize("name", ROWS)
     ids=["plain", "ions", "periodic", "far"],
 )
 @EVERY
-def test_steps_are_those_made_call_by_call(name, options, order) -> None:
+def test_steps_are_those_made_operation_by_operation(name, options, order) -> None:
     system, state = molecules(name, **options)
-    halves, calls = thermostats(system, order=order)
-    state = halves.start(system, state)
+    compiled, calls = isokinetics(system, order=order)
+    state = compiled.start(system, state)
     close = 1e-9 if "at" in options else 2e-14
     for dt in (0.05, -0.02, 0.03):
-        following, expected = halves.step(system, state, dt), calls.step(system, state, dt)
+        following, expected = compiled.step(system, state, dt), calls.step(system, state, dt)
         assert distance(following, expected) <= close
         assert distance(following, state) > 1e-3
         np.testing.assert_allclose(following.forces, expected.forces, rtol=0, atol=close)
@@ -47,10 +51,10 @@ def test_steps_are_those_made_call_by_call(name, options, order) -> None:
 def test_a_part_of_the_atoms(order) -> None:
     """The others, held ones too, are only pushed."""
     system, state = molecules("triangles", ions=5)
-    halves, calls = thermostats(system, order=order, atoms=np.arange(15), kinetic_energy=2.0)
-    state = halves.start(system, state)
+    compiled, calls = isokinetics(system, order=order, atoms=np.arange(15), kinetic_energy=2.0)
+    state = compiled.start(system, state)
     for _ in range(3):
-        following, expected = halves.step(system, state, 0.05), calls.step(system, state, 0.05)
+        following, expected = compiled.step(system, state, 0.05), calls.step(system, state, 0.05)
         assert distance(following, expected) <= 2e-14
         state = following
     inside = 0.5 * system.masses[:15] @ np.einsum("ij,ij->i", state.velocities[:15], state.velocities[:15])
@@ -59,7 +63,7 @@ def test_a_part_of_the_atoms(order) -> None:
 
 def test_kinetic_energy_stays() -> None:
     system, state = molecules("triangles", ions=3)
-    thermostat = thermostats(system, kinetic_energy=2.0)[0]
+    thermostat = isokinetics(system, kinetic_energy=2.0)[0]
     worst = 0.0
     for _ in range(300):
         state = run(system, state, 0.02, 10, stepper=thermostat)
@@ -78,7 +82,7 @@ def test_what_came_in_stays_as_it_was() -> None:
         return springs(x, t)
 
     system, state = molecules(force=force)
-    thermostat = thermostats(system)[0]
+    thermostat = isokinetics(system)[0]
     state = thermostat.start(system, state)
     arrays = (state.positions, state.velocities, state.forces, state.thermostat)
     before = [a.copy() for a in arrays]
@@ -96,7 +100,7 @@ def test_what_came_in_stays_as_it_was() -> None:
 def test_any_layout_of_the_arrays(name, order) -> None:
     """Kernels read raw memory."""
     system, state = molecules(name)
-    thermostat = thermostats(system, order=order)[0]
+    thermostat = isokinetics(system, order=order)[0]
     state = thermostat.start(system, state)
     expected = thermostat.step(system, state, 0.05)
     for item in ("positions", "velocities", "forces"):
@@ -104,25 +108,70 @@ def test_any_layout_of_the_arrays(name, order) -> None:
         assert distance(thermostat.step(system, turned, 0.05), expected) <= 1e-15
 
 
-# -- where a half cannot be done --------------------------------------------------------------------
+@EVERY
+def test_a_turn_is_along_the_exact_solution(name) -> None:
+    """Projected forces, length, and alpha = v.f/2K at the middle, against the engine and the closed form."""
+    system, state = molecules(name, ions=3)
+    thermostat = Isokinetic(momentum="free")
+    state = thermostat.start(system, state)
+    end = thermostat.step(system, state, 1e-3)
+    held, twice = system.motion.constraint_set, state.thermostat[0]
+    f = springs(end.positions, 0.0)
+    pace = system.motion.project_velocities(end.positions, f * system.weights)
+    assert end.thermostat[2] == pytest.approx((f * pace).sum(), rel=1e-13)
+    assert 2 * system.kinetic_energy(end.velocities) == pytest.approx(twice, rel=1e-14)
+    assert np.abs(held.jacobian(end.positions) @ end.velocities.ravel()).max() <= 1e-14
+    middle = compiled_middle(thermostat, system, state)
+    assert end.thermostat[1] == pytest.approx(1e-3 * middle, rel=1e-3)
+
+
+def compiled_middle(thermostat, system, state) -> float:
+    return thermostat.friction(system, thermostat.step(system, state, 0.5e-3))
+
+
+# -- where a kernel cannot go on --------------------------------------------------------------------
+
+
+def noted(monkeypatch, method: str) -> list[int]:
+    """Steps in which Python made an operation."""
+    calls: list[int] = []
+    made = getattr(IsokineticStep, method)
+
+    def note(self, row, begun):
+        calls.append(self.number)
+        return made(self, row, begun)
+
+    monkeypatch.setattr(IsokineticStep, method, note)
+    return calls
 
 
 def test_the_engine_lands_where_many_iterations_are_needed(monkeypatch) -> None:
-    """As a flight that the kernel gives up; the step is the same."""
-    system, state = molecules("triangles")
-    compiled, calls = thermostats(system)
+    """As a flight that the kernel gives up; steps are the same, and those without solution name row and step."""
+    system, state = molecules("triangles", force=lambda x, t: 0 * x)
+    compiled, calls = isokinetics(system)
+    made, taken, failed = noted(monkeypatch, "fly"), 0, 0
     state = compiled.start(system, state)
-    expected = calls.step(system, state, 0.05)
-    stages = compiled._share(system).stages
-    after = stages.after
+    for dt in np.geomspace(0.3, 30.0, 30):
+        outcomes = []
+        made.clear()
+        for each in (compiled, calls):
+            try:
+                outcomes.append(each.step(system, state, float(dt)))
+            except ConvergenceError as error:
+                outcomes.append(error)
+            if each is compiled:
+                taken += bool(made) and isinstance(outcomes[0], State)
+        one, two = outcomes
+        if isinstance(two, State):
+            assert distance(one, two) <= 1e-10
+        else:
+            failed += 1
+            assert (one.step, one.row, one.atoms) == (two.step, two.row, two.atoms) == (1, two.row, two.atoms)
+            assert f"step 1: time step too large (dt = {dt:g})" in str(one)
+    assert taken and failed
 
-    monkeypatch.setattr(stages, "after", lambda *given: (ENGINE, *after(*given)[1:]))
-    assert distance(compiled.step(system, state, 0.05), expected) <= 1e-13
-    monkeypatch.setattr(stages, "before", lambda *given: (ENGINE, None, None, 0.0))
-    assert distance(compiled.step(system, state, 0.05), expected) <= 1e-13
 
-
-def test_forces_too_strong_for_a_kick_without_projection() -> None:
+def test_forces_too_strong_for_a_kick_without_projection(monkeypatch) -> None:
     """Along the bonds, where nothing of them may be left."""
     system, state = molecules("triangles")
 
@@ -133,20 +182,106 @@ def test_forces_too_strong_for_a_kick_without_projection() -> None:
         return springs(x, t) + push
 
     system.force = strong
-    compiled, calls = thermostats(system)
+    compiled, calls = isokinetics(system)
     state = compiled.start(system, state)
-    stages = compiled._share(system).stages
-    given = (state.thermostat[2], state.thermostat[0], 0.01, 0.02)
-    assert stages.before(state.positions, state.velocities, state.forces, *given, stages.tables())[0] == KICK
-    after, expected = compiled.step(system, state, 0.02), calls.step(system, state, 0.02)
-    assert distance(after, expected) <= 1e-6
+    made = noted(monkeypatch, "first_turn")
+    after = compiled.step(system, state, 0.02)
+    assert made == [1]
+    assert distance(after, calls.step(system, state, 0.02)) <= 1e-6
+
+
+def test_velocities_against_a_strong_force(monkeypatch) -> None:
+    """Digits would be lost in the closed form; the tangent one takes over."""
+    system, state = molecules(name="bent", n=2)
+    pull = np.array([0.0, 0.0, 1e8])
+    system.force = lambda x, t: system.masses[:, None] * pull
+    v = np.tile([0.0, 0.0, -1.0], (len(system.masses), 1))
+    compiled, calls = isokinetics(system)
+    start = compiled.start(system, State(state.positions, v))
+    made = noted(monkeypatch, "first_turn")
+    after = compiled.step(system, start, 0.01)
+    assert made == [1]
+    assert distance(after, calls.step(system, start, 0.01)) <= 1e-13
+    assert system.kinetic_energy(after.velocities) == pytest.approx(0.5 * system.masses.sum(), rel=1e-14)
+
+
+@pytest.mark.parametrize("method", ["first_turn", "turn"])
+def test_turns_by_python_are_those_of_the_kernel(method) -> None:
+    """Where a function says that it has done nothing, the method does all."""
+    system, state = molecules("tetrahedra", ions=3)
+    thermostat = Isokinetic(momentum="free", order=4)
+    start = thermostat.start(system, state)
+    expected = thermostat.step(system, start, 0.05)
+    program = programs(thermostat.operations())[0]
+    program.rows[:] = [r._replace(verb=PYTHON, function=None) if r.name == method else r for r in program.rows]
+    thermostat._programs = (program, *thermostat._programs[1:])
+    after = thermostat.step(system, start, 0.05)
+    assert distance(after, start) > 0 and distance(after, expected) <= 1e-14
+    np.testing.assert_allclose(after.thermostat, expected.thermostat, rtol=1e-12, atol=1e-13)
+
+
+def test_numbers_that_overflow() -> None:
+    system, state = molecules(ions=2)
+    thermostat = isokinetics(system, kinetic_energy=1e300)[0]
+    with pytest.raises(NonFiniteError, match="non-finite position at step 1 on atom 0"):
+        thermostat.step(system, state, 1e200)
+
+
+def test_a_new_cell_is_used_at_once() -> None:
+    system, state = molecules("dumbbells", cell=np.diag([9.0, 9.0, 9.0]), pbc=True)
+    x = state.positions.copy()
+    x[1::2] += [9.0, 0, 0]  # each bond through the cell's wall
+    state = replace(state, positions=x)
+    thermostat = isokinetics(system)[0]
+    thermostat.step(system, state, 0.01)
+    system.motion.set_cell(
+        np.diag([12.0, 9.0, 9.0]), positions=x - np.tile([[0.0, 0, 0], [9.0, 0, 0]], (len(x) // 2, 1))
+    )
+    x = x.copy()
+    x[1::2] += [3.0, 0, 0]
+    state = replace(state, positions=x, forces=None, thermostat=None)
+    after = thermostat.step(system, state, 0.01)
+    assert np.abs(system.motion.constraint_set.value(after.positions)).max() <= 1e-13
+
+
+def test_rows_of_mixed_kinds() -> None:
+    """Called by address, from kernels that know nothing of them; a step without solution is the engine's."""
+    x = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [0.3, 0.2, 4.0], [1.0, 1.0, 5.0]])
+    rows = [Distance([[0, 1], [1, 2], [3, 4]]), Angle([[0, 1, 2]])]
+    system = System(Motion(ConstraintSet(rows, x, [16.0, 1.0, 2.0, 3.0, 4.0]), x), springs)
+    state = system.initial_state(x, 0.3 * np.random.default_rng(2).normal(size=x.shape), project=True)
+    compiled, calls = isokinetics(system)
+    one = two = compiled.start(system, state)
+    energy = system.kinetic_energy(one.velocities)
+    for _ in range(5):
+        one, two = compiled.step(system, one, 0.02), calls.step(system, two, 0.02)
+    assert distance(one, two) <= 1e-14 < distance(one, state)
+    assert system.kinetic_energy(one.velocities) == pytest.approx(energy, rel=1e-14)
+    assert np.abs(system.motion.constraint_set.value(one.positions)).max() <= 1e-14
+    errors = []
+    for each in (compiled, calls):
+        with pytest.raises(ConvergenceError, match="step 6") as caught:
+            each.step(system, one, 60.0)
+        errors.append((caught.value.row, caught.value.atoms))
+    assert errors[0] == errors[1]
+
+
+def test_a_march_is_the_steps_one_by_one() -> None:
+    for options in ({}, {"order": 4}, {"atoms": np.arange(15), "kinetic_energy": 2.0}):
+        system, state = molecules("triangles", ions=5)
+        thermostat = Isokinetic(momentum="free", **options)
+        one = two = thermostat.start(system, state)
+        for _ in range(9):
+            one = thermostat.step(system, one, 0.03)
+        two = thermostat.march(system, two, 0.03, 9)
+        assert np.array_equal(one.thermostat, two.thermostat) and distance(one, two) == 0.0 and two.step == 9
 
 
 @ORDERS
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_force_that_is_not_finite(order, bad) -> None:
     system, state = molecules("triangles", ions=2)
-    thermostat = thermostats(system, order=order)[0]
+    thermostat = isokinetics(system, order=order)[0]
     state = run(system, state, 0.01, 4, stepper=thermostat)
     before = state.positions.copy(), state.velocities.copy()
 

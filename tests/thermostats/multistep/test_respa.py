@@ -13,6 +13,7 @@ from kcons.constraints import Distance, FixedAtoms, MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import ForceGroups, IsokineticSpheres, Langevin, LangevinRespa
+from kcons.thermostats.langevin import MASSES, LangevinStep
 from kcons.thermostats.multistep.respa import inner_flight
 
 TWO = {"slow": 1, "fast": 4}
@@ -138,6 +139,25 @@ def test_a_run_goes_on_to_the_last_bit(kind):
     other = run(second, State.load(file), 0.1, 10, stepper=made())
     for name in ("positions", "velocities", "forces", "thermostat"):
         np.testing.assert_array_equal(getattr(end, name), getattr(other, name))
+
+
+def test_each_exchange_of_a_step_has_noise_of_its_own(monkeypatch):
+    """Drawn for the seed, the step and its place in it, also where several steps are made at once."""
+    held, state = molecules("bent", 2)
+    split = grouped(held.motion, fast=springs, slow=gentle)
+    thermostat, seen, made = LangevinRespa(0.5, 1.0, 3, steps=TWO), [], LangevinStep.exchange
+
+    def noted(self, row, begun):
+        made(self, row, begun)
+        seen.append((self.number, self.numbers[MASSES + self.v.size :].reshape(self.v.shape).copy()))
+
+    monkeypatch.setattr(LangevinStep, "exchange", noted)
+    thermostat.march(split, state, 0.1, 3)
+    assert [number for number, _ in seen] == [1] * 4 + [2] * 4 + [3] * 4
+    spread = math.sqrt(-math.expm1(-2 * 0.1 / 4) * 0.5)
+    for k, (number, noise) in enumerate(seen):
+        drawn = thermostat.drawn(number, noise.shape, k % 4)
+        np.testing.assert_allclose(noise, spread * drawn * split.root_weights, rtol=1e-14)
 
 
 def test_targets_that_move_are_met_in_each_inner_step():

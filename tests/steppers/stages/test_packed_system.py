@@ -1,4 +1,4 @@
-"""Compiled stages: the same steps as piece by piece, and the engine where they cannot."""
+"""Compiled steps: the same as by the engine operation by operation, and the engine where they cannot."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from kcons.steppers import (
     System,
     run,
 )
-from kcons.steppers.stages.fused_stages import MOST_ROWS
+from kcons.steppers.stages.packed_system import MOST_ROWS
 
 STEPPERS = [Rattle(), Geodesic(4), Suzuki4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
 PAIRS = [[0, 1], [0, 2], [1, 2]]
@@ -62,9 +62,9 @@ def triangles(
     masses = np.concatenate([np.tile([16.0, 1.0, 1.0], n), np.full(ions, 23.0)])
     rows = Distance((3 * np.arange(n)[:, None, None] + np.array(PAIRS)).reshape(-1, 2))
     system = System(Motion(ConstraintSet([rows], x, masses, **options), x), force)
-    assert system.flights is not None
+    assert system.packed is not None
     if piecewise:
-        system.flights = None
+        system.packed = None
     return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
 
 
@@ -115,7 +115,7 @@ def molecules(
         rows.append(FixedAtoms(list(fixed)))
     system = System(Motion(ConstraintSet(rows, x, m, **options), x), force)
     if piecewise:
-        system.flights = None
+        system.packed = None
     return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
 
 
@@ -156,7 +156,7 @@ SYSTEMS = {
 def test_few_rows_of_any_shape(stepper, name) -> None:
     names, options = SYSTEMS[name]
     (system, state), (other, _) = molecules(*names, **options), molecules(*names, piecewise=True, **options)
-    assert system.flights is not None and other.flights is None
+    assert system.packed is not None and other.packed is None
     calls = []
     for call in ("project_positions", "project_velocities"):
         setattr(system.motion, call, calls.append)
@@ -436,30 +436,30 @@ def test_what_is_left_to_the_engine() -> None:
     x = SHAPE + 0.0
     m = np.array([16.0, 1.0, 1.0])
 
-    def flights(*rows, x=x, m=m):
-        return System(Motion(ConstraintSet(rows, x, m), x)).flights
+    def packed(*rows, x=x, m=m):
+        return System(Motion(ConstraintSet(rows, x, m), x)).packed
 
-    assert flights(Distance(PAIRS)) is not None
-    assert flights(Distance(PAIRS[:2])) is not None
-    assert flights(Distance(PAIRS[:2]), FixedAtoms([0])) is not None
-    assert flights() is not None
+    assert packed(Distance(PAIRS)) is not None
+    assert packed(Distance(PAIRS[:2])) is not None
+    assert packed(Distance(PAIRS[:2]), FixedAtoms([0])) is not None
+    assert packed() is not None
     lengths = np.linalg.norm(x[[0, 0, 1]] - x[[1, 2, 2]], axis=1)
     moving = MovingTarget(lambda t: lengths + 0.1 * t)
-    assert flights(Distance(PAIRS, moving)) is None
-    assert flights(Distance([[0, 1]]), Angle([[1, 0, 2]])) is not None
-    assert flights(Distance([[0, 1]]), Plane(2, [0, 0, 1.0])) is not None
-    assert flights(Distance([[0, 1]]), Plane(2, [0, 0, 1.0], MovingTarget(lambda t: 0.1 * t))) is None
+    assert packed(Distance(PAIRS, moving)) is None
+    assert packed(Distance([[0, 1]]), Angle([[1, 0, 2]])) is not None
+    assert packed(Distance([[0, 1]]), Plane(2, [0, 0, 1.0])) is not None
+    assert packed(Distance([[0, 1]]), Plane(2, [0, 0, 1.0], MovingTarget(lambda t: 0.1 * t))) is None
     assert (
-        flights(ImplicitSurface([0, 2], lambda r: r[:, 2] ** 3 + r[:, 2], lambda r: (3 * r**2 + 1) * [0, 0, 1.0]))
+        packed(ImplicitSurface([0, 2], lambda r: r[:, 2] ** 3 + r[:, 2], lambda r: (3 * r**2 + 1) * [0, 0, 1.0]))
         is None
     )
     many = np.arange(6.0 * (MOST_ROWS + 1)).reshape(-1, 3)
     pairs = np.arange(2 * MOST_ROWS + 2).reshape(-1, 2)
-    assert flights(Distance(pairs), x=many, m=np.ones(len(many))) is None
-    assert flights(Distance(pairs[1:]), x=many, m=np.ones(len(many))) is not None
+    assert packed(Distance(pairs), x=many, m=np.ones(len(many))) is None
+    assert packed(Distance(pairs[1:]), x=many, m=np.ones(len(many))) is not None
     particles = np.arange(MOST_ROWS + 1)
-    assert flights(Sphere(particles, [0, 0, -9.0]), x=many, m=np.ones(len(many))) is None
-    assert flights(Sphere(particles[1:], [0, 0, -9.0]), x=many, m=np.ones(len(many))) is not None
+    assert packed(Sphere(particles, [0, 0, -9.0]), x=many, m=np.ones(len(many))) is None
+    assert packed(Sphere(particles[1:], [0, 0, -9.0]), x=many, m=np.ones(len(many))) is not None
 
 
 def test_a_new_cell_is_seen() -> None:
@@ -514,9 +514,9 @@ def mixed(name: str, *, force=springs, piecewise: bool = False) -> tuple[System,
     if "cell" in options:
         x = x + rng.integers(-1, 2, size=x.shape) @ options["cell"]
     system = System(motion, force)
-    assert system.flights is not None
+    assert system.packed is not None
     if piecewise:
-        system.flights = None
+        system.packed = None
     return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
 
 
@@ -580,7 +580,7 @@ def test_what_a_python_row_raises_comes_out_of_a_step() -> None:
 
     x = np.array([[1.0, 0.2, 0.1]])
     system = System(Motion(ConstraintSet(Custom([[0]], function, lambda r: 2 * r), x, [1.0]), x), springs)
-    assert system.flights is not None
+    assert system.packed is not None
     state = run(system, system.initial_state(x, [[0.0, 0.1, 0.0]], project=True), 0.01, 5)
     kept = state.copied()
     broken.append(True)
@@ -624,12 +624,12 @@ def test_copies_of_a_system_have_solvers_of_their_own() -> None:
     others = [copy.deepcopy(system), pickle.loads(pickle.dumps(system))]
     del system
     for other in others:
-        assert other.flights is not None
+        assert other.packed is not None
         assert distance(run(other, state, 0.01, 3), end) == 0.0
 
 
 def test_two_systems_of_one_motion_do_not_share_rooms() -> None:
     system, state = mixed("angles")
     other = System(system.motion, springs)
-    assert not np.shares_memory(system.flights.tables(), other.flights.tables())
+    assert not np.shares_memory(system.packed.tables, other.packed.tables)
     assert distance(Rattle().step(system, state, 0.02), Rattle().step(other, state, 0.02)) == 0.0

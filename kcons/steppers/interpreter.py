@@ -1,0 +1,521 @@
+"""The interpreter of time steps on arrays: programs run in compiled calls, and in Python where no kernel can.
+
+Every operation is made by a method that is named by its verb. The kernel (`stages.compiled_operations`) makes as many
+of them as it knows in one call; it comes back for the forces, and for what it cannot solve, which the engine then does
+with more means. Where rows move, are too many or of kinds that kernels do not know, all operations are made by the
+methods.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, ImageError, InputError
+from kcons.motion.certificate import checked_every
+from kcons.steppers.operations import Damp, Fly, Settle
+from kcons.steppers.program import Program, Row
+from kcons.steppers.stages.compiled_operations import (
+    FAR,
+    ITERATIONS,
+    LENGTH,
+    PAIRS,
+    ROOM,
+    WIDTH,
+    add_kick,
+    check_finite,
+    fly,
+    fly_once,
+    kernel,
+    land,
+    tangents,
+)
+from kcons.steppers.state import State, System
+from kcons.steppers.stepper import Listed, explained, stays
+
+_MAX_ITERATIONS = 50
+_EPS = float(np.finfo(float).eps)
+_FLOAT = np.dtype(np.float64)
+_EMPTY = np.empty(0)
+#: A room of nothing but its beginning.
+_PLAIN = np.array([0.0, -1.0, 0.0])
+_compiled, _tangents = cache(kernel), cache(tangents)
+
+
+def _nothing(at: int, *given: Any) -> int:
+    """In the place of the kernel where everything is left to Python."""
+    return at
+
+
+class Interpreted(Listed):
+    """Base of the steppers whose steps the interpreter makes."""
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` where the stepper may not be used."""
+        raise NotImplementedError
+
+    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
+        """Steps that are about to be made from a state, as many as can be made at once.
+
+        Raises
+        ------
+        InputError
+            The state carries variables of another thermostat.
+        """
+        raise NotImplementedError
+
+    def note(self, state: State) -> None:
+        """Remember what steps have ended in."""
+
+    def at_once(self, state: State, steps: int) -> int:
+        """How many of the steps may be made before `begun` looks at the state again."""
+        return steps
+
+    def depends_on(self, system: System, state: State) -> Any:
+        """What `begun` looks at besides the state: while it stays the same, steps go on. None: they never do."""
+        return system.velocity_dependent
+
+    def _made_from(self, system: System, state: State, dt: float, steps: int) -> tuple[State, int]:
+        """The state after steps, and how many they were."""
+        kept, system.going = system.going, None
+        known, steps = self.depends_on(system, state), self.at_once(state, steps)
+        if kept is not None and kept[0] is state and kept[1] is self and kept[2] == known and kept[3].dt == dt:
+            on_their_way = kept[3]
+            on_their_way.go_on(state, steps)
+        else:
+            on_their_way = self.begun(system, state, dt, steps)
+        after = on_their_way.through()
+        self.note(after)
+        if known is not None and not on_their_way.far:
+            system.going = after, self, known, on_their_way
+        return after, on_their_way.made
+
+    # As a decorator this costs half of a `with`. What overflows is looked for, and named with the step's number.
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`; 0 changes nothing.
+
+        Raises
+        ------
+        ConvergenceError
+            No solution (the step is too large); carries `step`.
+        NonFiniteError
+            A force, position or velocity became NaN or infinite; carries `step`.
+        InputError
+            `dt` is not finite, or negative and cannot be taken back; the force function returned a wrong shape; the
+            state carries variables of another thermostat.
+        UnsupportedError
+            The stepper may not be used with this system.
+        """
+        self.check(system)
+        still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
+        if still is not None:
+            return still
+        return self._made_from(system, state, dt, 1)[0]
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def march(self, system: System, state: State, dt: float, steps: int, *, check_every: int | None = None) -> State:
+        """The state after so many steps, the same to the last bit as by `step`.
+
+        Nobody looks at the states between: where all is compiled, the end of a step and the beginning of the next are
+        one call. `check_every` is as for `run`.
+
+        Raises
+        ------
+        KconsError
+            As `step`; `error.step` says which one.
+        CertificateError
+            As `run`.
+        """
+        self.check(system)
+        check_every, spare = checked_every(check_every if dt != 0 else 0)
+        alone = type(self).step is not Interpreted.step or dt == 0 or not math.isfinite(dt)
+        while steps > 0:
+            n = left = system.schedule.within(steps, check_every)
+            while left > 0:
+                if alone:
+                    state, made = self.step(system, state, dt), 1
+                else:
+                    state, made = self._made_from(system, state, dt, left)
+                left -= made
+            system.schedule.made(n, check_every, state, dt, spare=spare)
+            steps -= n
+        return state
+
+
+class Interpreter:
+    """Steps on their way from one state.
+
+    Parameters
+    ----------
+    system : System
+    start : State
+        With its forces, if the program begins with them.
+    dt : float
+    program : Program
+    steps : int
+        How many are wanted; one is made if the state has a remainder, since the atom that positions are relative to
+        moves, and as many as it takes if the system becomes far from the origin.
+    numbers : ndarray, optional
+        Those of the functions that the program calls, and of a thermostat.
+
+    Attributes
+    ----------
+    x, v : ndarray, shape (n_atoms, 3)
+        Where forces were evaluated last; where `here` is not 0, positions are in another array. Near the origin.
+    forces : ndarray, shape (n_groups n_atoms, 3)
+        Those that were evaluated last.
+    numbers : ndarray
+    number : int
+        Of the step that is made.
+    far : bool
+        Whether they have ended far from the origin, from where the next ones have to begin anew.
+    """
+
+    __slots__ = (
+        *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
+        *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
+        "far",
+    )
+
+    #: Whether forces are those of the System's function, all at once.
+    simple = True
+
+    def __init__(
+        self,
+        system: System,
+        start: State,
+        dt: float,
+        program: Program,
+        steps: int = 1,
+        numbers: FloatArray = _EMPTY,
+    ) -> None:
+        self.system, self.dt, self.program, self.start = system, dt, program, start
+        self.steps, self.made, self.number = 1 if start.remainder is not None else steps, 0, start.step + 1
+        x, v, f = system.taken(start)
+        self.shape = shape = x.shape
+        self.shift: FloatArray | None = None
+        if start.remainder is not None:
+            x, self.shift = system.near_origin(start)
+        self.begun = self.x = x
+        self.push = self.v = v.copy()
+        self.spare = self.out = np.empty(shape)
+        self.known = f is not None
+        self.forces: FloatArray = np.zeros(shape) if f is None or system.force is None else f
+        self.low: FloatArray | None = None
+        if program.pairs or numbers is not _EMPTY:
+            size = 3 * x.size if program.pairs else 0
+            self.room = room = np.empty(ROOM + size + len(numbers))
+            room[PAIRS], room[ITERATIONS], room[FAR] = program.pairs, -1.0, 0.0
+            room[ROOM + size :] = numbers
+            self.numbers = room[ROOM + size :]
+            if size:
+                self.low, self.push, self.spare = room[ROOM : ROOM + size].reshape(3, *shape)
+                room[ROOM : ROOM + 2 * x.size] = 0.0
+        else:
+            self.room, self.numbers = _PLAIN.copy(), numbers
+        self.then, self.left_over_then = start.time, start.time_remainder
+        self._look_ahead()
+
+    def go_on(self, state: State, steps: int) -> None:
+        """Get ready for more steps, from the state that the last ones have ended in."""
+        self.start, self.steps, self.made = state, steps, 0
+        self.number += 1
+        self.begun = self.x = state.positions
+        self.v, self.out = state.velocities.copy(), np.empty(self.shape)
+        if self.low is None:
+            self.push, self.spare = self.v, self.out
+        else:
+            self.low.fill(0.0)
+        if self.simple and state.forces is not None:
+            self.forces = state.forces  # those of the function may be in an array that it uses again
+        self._look_ahead()
+
+    # -- the loop -------------------------------------------------------------------------------
+
+    def through(self) -> State:
+        """Make the steps; `made` is how many were.
+
+        Raises
+        ------
+        ConvergenceError, ImageError, NonFiniteError
+            With `step`.
+        InputError
+            As of the force function.
+        """
+        try:
+            here = self._march()
+        except ConvergenceError as error:
+            before = State(self.whole(self.begun), self.v, self.time)
+            raise explained(error, self.system, before, self.dt, self.number) from error
+        except ImageError as error:
+            error.step = self.number
+            raise
+        except InputError:
+            # Overflow, where the engine met it first.
+            for numbers, item in ((self.out, "position"), (self.v, "velocity"), (self.push, "velocity")):
+                check_finite(numbers, item, self.number)
+            raise
+        return self.end(here)
+
+    def _march(self) -> int:
+        """Go through the program; where the positions are in the end."""
+        # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
+        system, program, dt, v, room, shape = self.system, self.program, self.dt, self.v, self.room, self.shape
+        packed, force, at = system.packed, system.force, 0
+        given, held = system.motion.sources
+        numbers = program.numbers if system.friction is None else self._damped()
+        run, tables, simple = _nothing, _EMPTY, False
+        if packed is not None:
+            run, tables, simple = _compiled(), packed.tables, self.simple and not system.velocity_dependent
+        cell = held.lattice
+        new, array, double, end = np.empty, np.ndarray, _FLOAT, len(program.rows) - 1
+        while True:
+            more = self.made + 1 < self.steps
+            found = run(at, more, dt, numbers, self.x, self.out, v, self.forces, room, tables)
+            last, at = at, found if found >= 0 else -1 - found
+            if at < last:
+                self._next_step()
+            if simple and program.shown[at]:  # `evaluate`, in less time
+                x = self.x = self.out
+                until = program.ends[at]
+                if more or program.flies[at]:
+                    self.out = new(shape)
+                if force is not None:
+                    # The function can neither write to it nor will anybody else: it may keep what it sees.
+                    x.setflags(False)  # type: ignore[call-arg]
+                    now = self.then if until == 1.0 else self.time + (until * dt + self.left_over)
+                    raw: Any = force(x if self.shift is None else x + self.shift, now)
+                    # What System.accepted finds most often.
+                    usual = type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray
+                    self.forces, self.known = raw if usual else system.accepted(raw, self.number, False), True
+                    if held.lattice is not cell or given.lattice is not cell:
+                        # It may be a barostat, too.
+                        tables, cell = packed.tables, held.lattice  # type: ignore[union-attr]
+            elif at == end:
+                if (not more and not program.rows[end].here and packed is not None) or self.end_step(program.rows[end]):
+                    break
+                at = 0
+                continue
+            else:
+                if found < 0:
+                    packed.refuse()  # type: ignore[union-attr]
+                row = program.rows[at]
+                if row.function is None or found < 0 or not self.call(row):
+                    getattr(self, row.name)(row, found < 0)
+                if packed is not None:
+                    tables = packed.tables
+            at += 1
+        self.made += 1
+        if packed is not None and room[ITERATIONS] != packed.iterations:
+            packed.took(room[ITERATIONS])
+        return program.rows[end].here
+
+    def _damped(self) -> FloatArray:
+        """What the kernel reads of the program where friction changes the length of flights."""
+        numbers = self.program.numbers.copy()
+        for k, row in enumerate(self.program.rows):
+            if row.name == "fly":
+                numbers[WIDTH * k + LENGTH] = self.length(row) / self.dt
+        return numbers
+
+    def _next_step(self) -> None:
+        self.made += 1
+        self.number += 1
+        self.begun = self.x
+        self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        """The time where a step begins is that at which the last one ended; the next as State.later."""
+        self.time, self.left_over = time, left_over = self.then, self.left_over_then
+        change = self.dt + left_over
+        self.then = then = time + change
+        part = then - time
+        self.left_over_then = (time - (then - part)) + (change - part)
+
+    def end_step(self, row: Row) -> bool:
+        """Whether the march is over: all steps are made, or all is so far from the origin that remainders are kept."""
+        if row.here:
+            self.x = self.place(row.here)
+            self.out = np.empty(self.shape)
+        if self.system.packed is None:
+            self.room[FAR] = self.system.is_far(self.x)
+        if self.made + 1 >= self.steps or self.room[FAR]:
+            return True
+        if self.low is not None:
+            self.low.fill(0.0)
+        self._next_step()
+        return False
+
+    # -- where it is ----------------------------------------------------------------------------
+
+    def place(self, number: int) -> FloatArray:
+        """The array of positions of this number."""
+        if number == 0 and not self.x.flags.writeable:
+            self.x = self.x.copy()  # the engine's kernels are compiled for arrays that can be written to
+        return (self.x, self.out, self.spare)[number]
+
+    def at(self, end: float) -> float:
+        """The time at the fraction `end` of the step."""
+        if end == 1.0:
+            return self.then
+        return self.time + (end * self.dt + self.left_over) if end else self.time
+
+    def whole(self, x: FloatArray) -> FloatArray:
+        """Positions as the force function sees them."""
+        return x if self.shift is None else x + self.shift
+
+    def length(self, row: Row) -> float:
+        """How long a flight is."""
+        friction, h = self.system.friction, row.length * self.dt
+        return h if friction is None else friction.flight(h)
+
+    def force_of(self, row: Row) -> FloatArray:
+        """The forces of its group."""
+        n = len(self.x)
+        return self.forces[row.group * n : (row.group + 1) * n] if row.kick else self.system.weights
+
+    def along(self, v: FloatArray, x: FloatArray, time: float) -> FloatArray:
+        """v itself, made tangent to the constraints at x."""
+        packed = self.system.packed
+        if packed is None or not _tangents()(x, v, packed.tables):
+            if packed is not None:
+                packed.refuse()
+            self.system.motion.project_velocities(x, v, time=time, out=v)
+        return v
+
+    def show(self, row: Row) -> None:
+        """Let go of the positions that a force function is going to see: they are not written to again."""
+        if row.here:
+            self.x = self.place(row.here)
+            self.out = np.empty(self.x.shape)
+
+    # -- verbs ----------------------------------------------------------------------------------
+    # Each is given its row, and whether the kernel has done all of it but the solve.
+
+    def kick(self, row: Row, begun: bool) -> None:
+        """Take the kick, and what rounding took of velocities."""
+        kick, f, weights = row.kick * self.dt, self.force_of(row), self.system.weights
+        pairs = self.low is not None
+        if not (land(self.v, self.push, kick, f, weights) if pairs else add_kick(self.v, kick, f, weights)):
+            check_finite(f, "force", self.number)
+
+    def fly(self, row: Row, begun: bool) -> None:
+        """A flight along the constraints, from velocities on them or off by M^-1 A^T times anything.
+
+        x1 = x0 + h u with sigma(x1, t1) = 0, u = v + M^-1 A(x0)^T l: RATTLE without forces, order 2. The impulse takes
+        what v has across the constraints, so that kicks need no projection before it. Rows of velocities hold at the
+        middle, a((x0 + x1)/2) . u = c((t0 + t1)/2), which is the symmetric choice. Where there is friction, the time
+        that passes is not the length of the flight.
+
+        References
+        ----------
+        McLachlan and Perlmutter, J. Nonlinear Sci. 16, 283 (2006).
+        """
+        assert isinstance(row.operation, Fly)
+        system, h, here, there = self.system, self.length(row), self.place(row.here), self.place(row.there)
+        kick, f, weights = row.kick * self.dt, self.force_of(row), system.weights
+        circles = system.great_circles if row.operation.exact else None
+        before = np.zeros(0) if circles is None or self.low is None else self.low.copy()
+        if not begun:
+            if self.low is None:
+                sound = fly_once(here, self.v, kick, f, weights, h, there)
+            else:
+                sound = fly(here, self.low, self.v, self.push, kick, f, weights, h, there)
+            if not sound:
+                check_finite(f, "force", self.number)
+        if circles is not None:
+            assert self.low is not None
+            circles.land(here, before, self.v, self.push, h, there, self.low)
+            return
+        self.room[ITERATIONS] = -1.0
+        system.motion.project_positions(
+            there, here, time=self.at(row.end), reference_time=self.at(row.begin), velocities=self.push, dt=h, flight=h,
+            out=there,
+        )  # fmt: skip
+
+    def project(self, row: Row, begun: bool) -> None:
+        """Velocities onto the constraints."""
+        if not begun:
+            self.kick(row, False)
+        x = self.place(row.here)
+        check_finite(x, "position", self.number)
+        self.system.motion.project_velocities(x, self.v, time=self.at(row.end), out=self.v)
+        check_finite(self.v, "velocity", self.number)
+
+    def evaluate(self, row: Row, begun: bool) -> None:
+        """Forces at the new positions; the kick looks for NaN."""
+        self.show(row)
+        if self.system.force is not None:
+            x = self.whole(self.x)
+            self.forces = self.system.forces(x, self.v, self.at(row.end), self.number, copy=False, finite=False)
+            self.known = True
+
+    def call(self, row: Row) -> bool:
+        """Let a function do what the kernel would let it do; whether it has."""
+        self.kick(row, False)
+        n, h, x = len(self.x), row.length * self.dt, self.place(row.here)
+        f = self.forces[row.group * n : (row.group + 1) * n].ravel()
+        return not row.function(x, self.v, f, h, self.numbers, _EMPTY)
+
+    def settle(self, row: Row, begun: bool) -> None:
+        """v = projected(v + h M^-1 f(x, v)), by iteration."""
+        assert isinstance(row.operation, Settle)
+        system, now = self.system, self.at(row.end)
+        self.kick(row, False)
+        self.show(row)
+        positions, drifted = self.whole(self.x), self.v.copy()
+        half_kick = (row.length * self.dt) * system.inverse_masses
+        start = float(np.abs(drifted).max(initial=0.0))
+        v, change = drifted, math.inf
+        for _ in range(_MAX_ITERATIONS):
+            forces = system.forces(positions, v, now, self.number)
+            push = half_kick * forces
+            following = system.motion.project_velocities(self.x, drifted + push, time=now)
+            last, change = change, float(np.abs(following - v).max(initial=0.0))
+            v = following
+            # Where the system comes to rest, v is the small difference of what it had and the kick: these are rounded.
+            size = max(start, float(np.abs(push).max(initial=0.0)), float(np.abs(v).max(initial=0.0)))
+            if change <= 2 * _EPS * size or (change >= last and change <= 1e-13 * size):
+                self.forces, self.known = system.forces(positions, v, now, self.number), True
+                np.copyto(self.v, v)
+                check_finite(self.v, "velocity", self.number)
+                return
+        raise ConvergenceError(
+            f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
+            f"after {_MAX_ITERATIONS} iterations; time step too large",
+            residual=change / max(size, float(np.finfo(float).tiny)),
+            tolerance=2 * _EPS,
+            iterations=_MAX_ITERATIONS,
+        )
+
+    def damp(self, row: Row, begun: bool) -> None:
+        """Friction of the system at fixed positions."""
+        assert isinstance(row.operation, Damp) and self.system.friction is not None
+        self.kick(row, False)
+        here = self.place(row.here)
+        self.system.friction.damp(here, self.v, row.length * self.dt, self.at(row.end))
+
+    # -- the end --------------------------------------------------------------------------------
+
+    def end(self, here: int) -> State:
+        """The state, with remainders from here on if it is far from the origin by now."""
+        x = self.x if self.x.flags.writeable else self.x.copy()
+        when, arrays = (self.then, self.left_over_then), (x, self.v, self.applied(here))
+        shift, far = self.shift, bool(self.room[FAR])
+        self.far = far or shift is not None
+        return self.system.ended(self.start, self.number, when, arrays, shift, self.low, far, self.variables())
+
+    def applied(self, here: int) -> FloatArray | None:
+        """The forces at the end, None where a drift came last."""
+        if self.system.force is None:
+            return self.start.forces
+        return self.forces.copy() if self.known and not here else None
+
+    def variables(self) -> FloatArray | None:
+        """Those of a thermostat."""
+        return None

@@ -1,0 +1,151 @@
+"""Operations of a step as the program that the interpreter goes through.
+
+What a row does is decided here, once for a list of operations: kicks are taken by what follows them, in the same pass
+over the arrays, and drifts are cut into flights, which end by turns in two arrays, so that the positions that forces
+are evaluated at are in an array of their own, which is never written to again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.solvers.called_solvers import address_of
+from kcons.steppers.operations import Fly, Kick, Operation
+from kcons.steppers.stages.compiled_operations import ADDRESS, CALL, END, FLY, FUNCTION, KICK, PROJECT, PYTHON, WIDTH
+
+#: Operations that show positions to a force function, after which they are not written to again.
+SHOWN = ("evaluate", "settle")
+
+
+class Row(NamedTuple):
+    """What is done at once.
+
+    Attributes
+    ----------
+    name : str
+        The interpreter's method.
+    verb : int
+        What the kernel does.
+    here, there : int
+        Which array has the positions before and after it.
+    length, kick : float
+        Of the flight, and of the kick before it, as fractions of the step.
+    group : int
+        Whose forces.
+    begin, end : float
+        The fractions of the step at which time is before and after it.
+    number : int
+        How many of the same name are before it in the step.
+    operation : Operation or None
+        What it is made of; None for the end of the step.
+    function : compiled function or None
+        What is called.
+    """
+
+    name: str
+    verb: int
+    here: int = 0
+    there: int = 0
+    length: float = 0.0
+    kick: float = 0.0
+    group: int = 0
+    begin: float = 0.0
+    end: float = 0.0
+    number: int = 0
+    operation: Operation | None = None
+    function: Any = None
+
+
+class Program:
+    """A step as rows, the last of which is its end.
+
+    Parameters
+    ----------
+    operations : sequence of Operation
+    functions : mapping of str to compiled function, optional
+        What the kernel calls for these verbs; those that it does not know and that are not here are left to Python.
+    groups : sequence of str
+        Names of the groups of forces, in the order in which the interpreter has them.
+    python : collection of str
+        Verbs of the kernel that are left to Python, too.
+
+    Attributes
+    ----------
+    rows : list of Row
+    ends : list of float
+        Of these.
+    shown, flies : list of bool
+        Whether they evaluate forces at positions that no force function has seen, and whether flights follow.
+    pairs : bool
+        Whether what rounding takes is kept: there are several flights, or great circles.
+    """
+
+    def __init__(
+        self,
+        operations: Sequence[Operation],
+        functions: Mapping[str, Any] | None = None,
+        groups: Sequence[str] = ("",),
+        python: Sequence[str] = (),
+    ) -> None:
+        self.rows = list(_rows(operations, functions or {}, {name: k for k, name in enumerate(groups)}, python))
+        flights = [row.operation for row in self.rows if isinstance(row.operation, Fly)]
+        self.pairs = len(flights) > 1 or any(flight.exact for flight in flights)
+        self.ends = [row.end for row in self.rows]
+        self.shown = [row.name == "evaluate" and row.here == 1 for row in self.rows]
+        self.flies = ["fly" in [later.name for later in self.rows[k:]] for k in range(len(self.rows))]
+        self._numbers: FloatArray | None = None
+
+    @property
+    def numbers(self) -> FloatArray:
+        """What the kernel reads of the rows."""
+        if self._numbers is None:
+            table = np.zeros((len(self.rows), WIDTH))
+            for line, row in zip(table, self.rows, strict=True):
+                line[:ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
+                line[ADDRESS] = 0 if row.verb != CALL else address_of(row.function, FUNCTION)
+            self._numbers = table.ravel()
+        return self._numbers
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_numbers": None}  # addresses are of no use elsewhere
+
+
+def _rows(
+    operations: Sequence[Operation], functions: Mapping[str, Any], groups: Mapping[str, int], python: Sequence[str]
+) -> Iterator[Row]:
+    kick = Kick(0.0)  # what is still to be taken
+    here, time, met = 0, 0.0, Counter[str]()
+    for number, operation in enumerate(operations):
+        verb = operation.verb
+        if kick.fraction and verb not in ("fly", "project"):
+            yield Row("kick", KICK, here, here, 0.0, kick.fraction, groups[kick.group], time, time)
+            kick = Kick(0.0)
+        if isinstance(operation, Kick):
+            kick = operation
+            continue
+        what = CALL if verb in functions else FLY if verb == "fly" else PROJECT if verb == "project" else PYTHON
+        if isinstance(operation, Fly):
+            what = PYTHON if operation.exact or verb in python else what
+            later = takewhile(lambda other: other.verb not in SHOWN, operations[number:])
+            left = sum(len(other.flights) for other in later if isinstance(other, Fly))
+            for length, end in zip(operation.flights, operation.ends, strict=True):
+                left -= 1
+                there, group = 1 + left % 2, groups.get(kick.group, 0)
+                yield Row(verb, what, here, there, length, kick.fraction, group, time, end, 0, operation)
+                here, time, kick = there, end, Kick(0.0)
+            continue
+        what = PYTHON if verb in python else what
+        group = groups.get(kick.group if kick.fraction else getattr(operation, "group", ""), 0)
+        times = (operation.fraction, kick.fraction, group, time, time, met[verb])
+        yield Row(verb, what, here, here, *times, operation, functions.get(verb))
+        met[verb] += 1
+        kick, here = Kick(0.0), 0 if verb in SHOWN else here
+    if kick.fraction:
+        yield Row("kick", KICK, here, here, 0.0, kick.fraction, groups[kick.group], time, time)
+    yield Row("end_step", END, here, here, 0.0, 0.0, 0, 1.0, 1.0)

@@ -1,0 +1,164 @@
+"""All that is held by one system as the table that compiled steps read, where kernels know all of it.
+
+The tables are those of `solvers.fused_distances`: rigid triangles, chains and rows of all kinds that are at rest, each
+with its solver, behind one array of numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.motion.motion import Motion
+from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.cluster_solver import ClusterSolver
+from kcons.solvers.distance_clusters import DistanceClusters
+from kcons.solvers.fused_distances import packed, set_lattice
+from kcons.solvers.rigid_triangles import RigidTriangles
+from kcons.solvers.single_rows import SingleRows
+from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.solvers.sparse.row_functions import COUNT
+
+#: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
+MOST_ROWS = 96
+#: Chains have a kernel of their own, which costs as much as that for all shapes on so many rows, and so many more a
+#: slot of eight lanes; where others are held so that both are called, on more.
+CHAIN_ROWS, CHAIN_ROWS_BESIDES, ROWS_A_SLOT = 20, 40, 2
+#: No number of iterations.
+_UNKNOWN = -1.0
+
+
+class PackedSystem:
+    """What compiled steps know of one system: its rows and the cell, 1/m, and how far from the origin is far.
+
+    Parameters
+    ----------
+    motion : Motion
+    found : PackedRows
+        All its rows, from `packed_rows`, with the rest of `made_of` behind them.
+    made_of : tuple
+        What `of` was given.
+    """
+
+    def __init__(self, motion: Motion, found: PackedRows, made_of: tuple[Any, ...]) -> None:
+        self.motion = motion
+        self._tables, self._called = found
+        self._made_of = made_of
+        self._cell, self._sources = motion.cell, motion.sources
+        self._lattice = motion.lattice
+        #: Those that the engine was told of last.
+        self.iterations = _UNKNOWN
+        set_lattice(self._tables, self._lattice)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).of, self._made_of  # addresses are of no use elsewhere
+
+    @classmethod
+    def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> PackedSystem | None:
+        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows.
+
+        Parameters
+        ----------
+        motion : Motion
+        weights : ndarray, shape (n_atoms, 3)
+            1/m.
+        held : ndarray of int
+            Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
+        far : float
+            The system is far if the first is this many times farther from the origin than from any other.
+        """
+        found = packed_rows(motion, weights.ravel(), held, np.array([far]))
+        return None if found is None else cls(motion, found, (motion, weights, held, far))
+
+    @property
+    def tables(self) -> FloatArray:
+        """What the kernels need to know, with the cell as it is now."""
+        given, held = self._sources
+        if held.lattice is not self._lattice or given.lattice is not self._lattice:
+            self._lattice = self._cell()
+            set_lattice(self._tables, self._lattice)
+        return self._tables
+
+    def refuse(self) -> None:
+        """Raise what a Python function among the rows has raised, where a kernel reports that it could not go on."""
+        for solver in self._called:
+            solver.refuse()
+
+    def took(self, iterations: float) -> None:
+        """Let the engine report these iterations; a negative number forgets them."""
+        self.iterations = iterations
+        if iterations >= 0:
+            self.motion.took(int(iterations))
+
+
+class PackedRows(NamedTuple):
+    """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
+
+    tables: FloatArray
+    called: list[CalledSolver]
+
+
+def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
+    """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
+    plan, held = motion.plan, motion.constraint_set
+    if held.moving or plan.loose is not None or any(plan.whole):
+        return None
+    if plan.driven and held.target(0.0)[~held.holonomic].any():
+        return None
+    # Where few atoms are held, the engine works on a copy of these, and counts only them.
+    compact = plan.constraint_set is not held
+    inverse_masses, pinned = plan.inverse_masses, plan.pinned
+    if compact:
+        inverse_masses = np.zeros(motion.n_atoms)
+        inverse_masses[held.touched] = plan.inverse_masses
+        pinned = held.touched[pinned]
+    triangles: RigidTriangles | None = None
+    chains: Chains | None = None
+    rows: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+    mixed = [solver for solver in plan.solvers if not isinstance(solver, DistanceClusters)]
+    for solver in plan.solvers:
+        if isinstance(solver, DistanceClusters):
+            if triangles is None and not compact and not mixed and isinstance(solver, RigidTriangles):
+                triangles = solver
+            elif chains is None and not mixed and isinstance(solver, Chains):
+                chains = solver
+            else:
+                rows.append(solver.rows)
+    if chains is not None and not _worth_it(chains, sum(map(len, rows))):
+        rows.append(chains.rows)
+        chains = None
+    others = np.concatenate(rows)
+    if len(others) > MOST_ROWS or not all(isinstance(each, SparseRows | SingleRows) for each in mixed):
+        return None
+    if mixed and (held.images is not None or sum(len(each.rows) for each in mixed) > MOST_ROWS):
+        return None
+    # Solvers of their own, for the atoms of the whole system: those of the plan may be at work for another one.
+    called = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
+    pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
+    lengths = held.target(0.0)[others]
+    places, numbers = plan.pinned_targets(None), held.touched if compact else None
+    given = triangles, chains, pairs, lengths, inverse_masses, pinned, places
+    return PackedRows(packed(*given, *more, numbers=numbers, late=plan.late[others], called=called), called)
+
+
+def _solver_like(
+    solver: ClusterSolver, held: ConstraintSet, inverse_masses: FloatArray, late: NDArray[np.bool_]
+) -> CalledSolver:
+    rows = np.sort(solver.rows)
+    if isinstance(solver, SingleRows):
+        return SingleRows(held, rows, inverse_masses)
+    like = SparseRows(held, rows, inverse_masses, late[rows])
+    like.numbers[COUNT] = 1.0  # all positions here are the ends of flights
+    return like
+
+
+def _worth_it(chains: Chains, others: int) -> bool:
+    """Whether chains are faster by their own kernel than with other rows by that for all shapes."""
+    least = (CHAIN_ROWS_BESIDES if others else CHAIN_ROWS) + ROWS_A_SLOT * chains.slots
+    return len(chains.rows) > least or len(chains.rows) + others > MOST_ROWS
