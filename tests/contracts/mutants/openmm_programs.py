@@ -176,24 +176,6 @@ MUTANTS = [
         "tests/openmm/ensembles/test_langevin_ensemble.py",
     ),
     (
-        "openmm/collective/row_program.py",
-        "weight{c}*({of('more', i)}-{of('expected', i)})",
-        "weight{c}*({of('more', i)}+{of('expected', i)})",
-        "tests/openmm/collective/test_row_program.py::test_the_iteration_learns_from_each_push",
-    ),
-    (
-        "openmm/collective/row_program.py",
-        'p.let(f"back{c}_{i}_{j}", f"-({done})*back{c}_{i}_{i}"',
-        'p.let(f"back{c}_{i}_{j}", f"({done})*back{c}_{i}_{i}"',
-        "tests/openmm/collective/test_row_program.py::test_the_iteration_learns_from_each_push",
-    ),
-    (
-        "openmm/collective/row_program.py",
-        "select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)",
-        "0*follows{c}",
-        "tests/openmm/collective/test_row_program.py::test_many_steps_look_less_often",
-    ),
-    (
         "openmm/surfaces/surface_steps.py",
         '"select(behind, 1, kick_share(first_stage))"',
         '"kick_share(first_stage)"',
@@ -266,30 +248,6 @@ MUTANTS = [
         "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
-        "openmm/surfaces/closed_forms.py",
-        "super()._declare_solution(p)",
-        "super()",
-        "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
-    ),
-    (
-        "openmm/callback_rows/carried_constraints.py",
-        "self._engine.stand_at(self._state(context)[0])",
-        "self._state(context)[0]",
-        "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
-    ),
-    (
-        "openmm/callback_rows/callbacks.py",
-        "_READ[key] = engine = Engine(uuid.uuid4().hex, *recipe)",
-        "_READ[key] = engine = Engine(key, *recipe)",
-        "tests/openmm/callback_rows/test_callbacks.py::test_copies_of_a_system_have_engines_of_their_own",
-    ),
-    (
-        "openmm/callback_rows/carried_constraints.py",
-        "return self.motion.rank - 3 * fixed",
-        "return self.motion.rank",
-        "tests/openmm/callback_rows/test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
-    ),
-    (
         "openmm/integrator/steps.py",
         'asks = "select(call-1, failed, select(moved, -1, 0))"',
         'asks = "failed"',
@@ -312,5 +270,47 @@ MUTANTS = [
         "self._left == (context.getStepCount(), _box(context))",
         "True",
         "tests/openmm/integrator/test_rattle_integrator.py::test_change_of_the_box",
+    ),
+    (
+        "openmm/collective/row_program.py",
+        "weight{c}*({of('more', i)}-{of('expected', i)})",
+        "weight{c}*({of('more', i)}+{of('expected', i)})",
+        "tests/openmm/collective/test_row_program.py::test_the_iteration_learns_from_each_push",
+    ),
+    (
+        "openmm/collective/row_program.py",
+        'p.let(f"back{c}_{i}_{j}", f"-({done})*back{c}_{i}_{i}"',
+        'p.let(f"back{c}_{i}_{j}", f"({done})*back{c}_{i}_{i}"',
+        "tests/openmm/collective/test_row_program.py::test_the_iteration_learns_from_each_push",
+    ),
+    (
+        "openmm/collective/row_program.py",
+        "select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)",
+        "0*follows{c}",
+        "tests/openmm/collective/test_row_program.py::test_many_steps_look_less_often",
+    ),
+    (
+        "openmm/surfaces/closed_forms.py",
+        "super()._declare_solution(p)",
+        "super()",
+        "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
+    ),
+    (
+        "openmm/callback_rows/carried_constraints.py",
+        "self._engine.stand_at(self._state(context)[0])",
+        "self._state(context)[0]",
+        "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
+    ),
+    (
+        "openmm/callback_rows/callbacks.py",
+        "_READ[key] = engine = Engine(uuid.uuid4().hex, *recipe)",
+        "_READ[key] = engine = Engine(key, *recipe)",
+        "tests/openmm/callback_rows/test_callbacks.py::test_copies_of_a_system_have_engines_of_their_own",
+    ),
+    (
+        "openmm/callback_rows/carried_constraints.py",
+        "return self.motion.rank - 3 * fixed",
+        "return self.motion.rank",
+        "tests/openmm/callback_rows/test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
     ),
 ]

@@ -248,13 +248,6 @@ def test_copies_and_pickles_go_on_alike():
         assert np.abs(end[0] - ends[0][0]).max() <= 1e-12
 
 
-def test_xml_leads_back_to_the_class():
-    _, integrator, part = held_chain([Row(bond(0, 3), name="end to end"), angle(2, 3, 4)], "suzuki4")
-    read = ProjectedIntegrator.from_xml(openmm.XmlSerializer.serialize(integrator), parts=[copy.deepcopy(part)])
-    assert read.listing() == integrator.listing()
-    assert "end to end" in integrator.listing() and "push along the rows" in integrator.listing()
-
-
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_checkpoints_go_on_alike(platform):
     context, integrator, _ = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True, platform=platform)

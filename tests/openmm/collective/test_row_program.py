@@ -267,29 +267,6 @@ def molecule():
     return system, bond(0, 1)
 
 
-def test_members_of_a_compound_integrator_pull_in_turn():
-    """One goes on where the other has ended, and each is judged by the time that has passed in all."""
-    system, length = molecule()
-    rows = CollectiveRows(system, [Row(length, 0.15, 0.5)])
-    members = [
-        ProjectedIntegrator(0.002, parts=[rows], check_every=3),
-        ProjectedIntegrator(0.002, "geodesic", parts=[rows], check_every=3),
-    ]
-    compound = openmm.CompoundIntegrator()
-    for member in members:
-        compound.addIntegrator(member)
-    context = openmm.Context(system, compound, openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
-    steps = 0
-    for number, block in ((0, 5), (1, 20), (0, 5), (1, 10), (0, 1)):
-        compound.setCurrentIntegrator(number)
-        compound.step(block)
-        steps += block
-        members[number].check()
-        assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
-        assert abs(rows.targets(context)[0] - (0.15 + 0.5 * 0.002 * steps)) < 1e-12
-
-
 def test_a_state_of_another_program_has_no_time_of_targets():
     """The pull begins anew there; the error says how to go on instead, and that way ends where one run would."""
     states = []
@@ -305,7 +282,7 @@ def test_a_state_of_another_program_has_no_time_of_targets():
                 integrator.step(1)
             rows.set_target(integrator, 0, 0.17)
         integrator.step(20)
-        states.append(context.getState(positions=True, velocities=True, integratorParameters=True))
+        states.append(context.getState(positions=True, velocities=True))
     assert abs(rows.values(context)[0] - (0.15 + 0.5 * 0.002 * 40)) < 1e-12
     context.setPositions([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.15, 0.0]])
     with pytest.raises(ConstraintError) as caught:  # the time of these targets is known

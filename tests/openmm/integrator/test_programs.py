@@ -207,11 +207,7 @@ def test_hooks_of_parts_are_called_where_they_belong():
         def begin(self, program):
             program.let("stage", "7", "begin")
 
-        def begin_early(self, program):
-            program.let("stage", "8", "early")
-
     integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=[Telling([0], 0, 0.0, 2, evaluates=True)])
     lines = integrator.program.lines
     begin = next(k for k, line in enumerate(lines) if line.words == "begin")
     assert lines[begin - 1][:3] == ("when", "", "moved+stale != 0")
-    assert not any(line.words == "early" for line in lines)
