@@ -70,7 +70,5 @@ def test_every_namespace_is_as_it_was():
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["looked at"] > 500
-    assert {"kcons.openmm.integrator.guard", "kcons.ase", "kcons.mdanalysis"} <= set(
-        found["kcons"]
-    )
+    assert {"kcons.openmm.integrator.guard", "kcons.ase", "kcons.mdanalysis"} <= set(found["kcons"])
     assert found["changed"] == []
