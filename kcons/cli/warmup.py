@@ -26,7 +26,7 @@ def _warmup(chosen: argparse.Namespace) -> int:
             item="what",
         )
     terminal = console()
-    announcer.announced = True  # it is said here
+    announcer.announced = announcer.keeps  # it is said here
     for name in wanted:
         needed = NEEDS.get(name)
         if needed is not None and find_spec(needed) is None:

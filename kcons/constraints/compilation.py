@@ -348,6 +348,11 @@ class Announcer:
         self._timer: threading.Timer | None = None
 
     @property
+    def keeps(self) -> bool:
+        """Whether other processes find what is compiled."""
+        return self._own_folder is None
+
+    @property
     def compiling(self) -> bool:
         """Whether a kernel is being compiled."""
         return bool(self._depth)
@@ -388,7 +393,7 @@ class Announcer:
             if self.announced or not self._depth:
                 return
             self.announced = True
-        if self._own_folder is None:
+        if self.keeps:
             logger.warning(
                 "kcons compiles the kernels that this system needs. This happens once on a machine and takes some "
                 "seconds; `kcons warmup` does it beforehand"

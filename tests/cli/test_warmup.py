@@ -56,6 +56,15 @@ def test_what_was_compiled_beforehand_is_there():
     assert json.loads(needed) and set(json.loads(needed)) <= set(json.loads(called))
 
 
+@pytest.mark.parametrize("folder", [None, "gone at the end"])
+def test_kernels_that_nobody_keeps_are_announced(folder, monkeypatch, capsys):
+    monkeypatch.setattr(announcer, "announced", False)
+    monkeypatch.setattr(announcer, "_own_folder", folder)
+    monkeypatch.setattr(compiled_systems, "KINDS", {})
+    assert main.main(["warmup"]) == 0
+    assert announcer.announced == (folder is None)
+
+
 def test_it_says_what_was_compiled(monkeypatch, capsys):
     """Only what is not there: a kind that takes a second, which it does once."""
     left = [1.0, 0.0]
