@@ -27,7 +27,7 @@ integrator = ProjectedIntegrator(4 * unit.femtoseconds, parts=[rows], ensemble=L
 simulation = app.Simulation(molecule.topology, system, integrator, Platform.getPlatformByName("CPU"))
 context = simulation.context
 context.setPositions(x)
-simulation.minimizeEnergy(maxIterations=100)
+integrator.minimizeEnergy(context, maxIterations=100)
 integrator.setVelocitiesToTemperature(context, 300 * unit.kelvin, 1)
 
 print("time/ps   distance/nm   mean force/(kJ/mol/nm)   work/(kJ/mol)")

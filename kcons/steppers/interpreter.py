@@ -289,7 +289,11 @@ class Interpreter:
                     # The function can neither write to it nor will anybody else: it may keep what it sees.
                     x.setflags(False)  # type: ignore[call-arg]
                     now = self.then if until == 1.0 else self.time + (until * dt + self.left_over)
-                    raw: Any = force(x if self.shift is None else x + self.shift, now)
+                    there = x
+                    if self.shift is not None:
+                        there = x + self.shift
+                        there.setflags(False)  # type: ignore[call-arg]
+                    raw: Any = force(there, now)
                     # What System.accepted finds most often.
                     usual = type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray
                     self.forces, self.known = raw if usual else system.accepted(raw, self.number, False), True

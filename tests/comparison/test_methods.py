@@ -279,8 +279,9 @@ def test_force_evaluations_are_counted_right(name):
         made += len(CALLS) - before
     each = METHODS[name].force_evaluations
     assert run.evaluations == 20 * each
-    # What a scheme evaluates at its end serves the next step; the first has one more.
-    assert run.evaluations <= made <= run.evaluations + 2
+    # What a scheme evaluates at its end serves the next step; the first has one more, and each call beside parts.
+    calls = 20 if "held" in name else 0
+    assert run.evaluations <= made <= run.evaluations + calls + 2
 
 
 def test_which_methods_run():

@@ -58,8 +58,6 @@ class Problem:
         self.rows = list(self.held.constraints)  # with the targets that were found
         self.x = self.motion.restore_positions(x, time=0.0)
         self.v = self.motion.project_velocities(self.x, 0.5 * np.random.default_rng(2).normal(size=x.shape), time=0.0)
-        #: Knows the time.
-        self.moving = any(item.moving for item in self.rows)
 
     def dense(self, x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
         """The acceleration by generalized inverses of the whole matrix."""
