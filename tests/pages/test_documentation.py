@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: Studies with tests of their own, in tests/studies, and scripts that write no table.
 OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "solvers_alone", "whole_comparison")}
-PLAIN = {"check_speed", "constraint_figures", "own_constraints"}
+PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
 EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
