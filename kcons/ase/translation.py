@@ -123,19 +123,9 @@ _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
 
 
 def file_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
-    """The one constraint of ASE that holds the same, as in `ase_forms`, for a file; None if there is none.
-
-    Distances are those of FixInternals, which ASE writes again with their lengths; FixBondLengths loses them.
-    """
+    """The one constraint of ASE that holds the same, as in `ase_forms`, for a file; None if there is none."""
     forms, left = ase_forms(rows)
-    if len(forms) != 1 or left:
-        return None
-    (form,) = forms
-    if form["name"] == "FixBondLengths":
-        kwargs = form["kwargs"]
-        bonds = [list(bond) for bond in zip(kwargs["bondlengths"], kwargs["pairs"], strict=True)]
-        return _named("FixInternals", bonds=bonds, angles_deg=[], dihedrals_deg=[], mic=True)
-    return form
+    return forms[0] if len(forms) == 1 and not left else None
 
 
 def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Constraint]]:
