@@ -66,7 +66,7 @@ def smoke(python, folder):
             print(f"   FAILED: {' '.join(map(str, command))}\n{result.stdout}{result.stderr}")
             return False
     # Without any extra, what needs one says which.
-    for words, extra in ((["kcons", "compare", "water"], "ase"), (["python", "-c", "import kcons.openmm"], "openmm")):
+    for words, extra in ((["kcons", "compare", "water"], "plots"), (["python", "-c", "import kcons.openmm"], "openmm")):
         command = [place / words[0], *words[1:]]
         result = subprocess.run(command, cwd=folder.parent, capture_output=True, text=True)
         if not result.returncode or f"pip install 'kcons[{extra}]'" not in result.stderr:
