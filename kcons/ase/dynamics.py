@@ -277,6 +277,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time = after.time
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
+        system.follow(after, self._state)
         self._answers.note()
         if after.barostat is not None:
             self._cell = surroundings(self.atoms)

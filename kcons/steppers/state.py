@@ -281,6 +281,12 @@ class System:
         #: None where nothing is slowed down.
         self.friction: Friction | None = rates if rates.largest > 0 else None
 
+    def follow(self, after: State, state: State) -> None:
+        """Let steps of kicks and drifts go on from `state`: what the last one ended in, velocities in other digits."""
+        going = self.going
+        if going is not None and going[0] is after and going[3].simple and not len(going[3].numbers):
+            self.going = (state, *going[1:])
+
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "going": None}  # those steps are of this System
 
