@@ -12,7 +12,7 @@ from kcons.motion import failures
 from kcons.motion.restoring.nearest_point import FarStart, Rescuers, Work
 from kcons.plan.plan import Plan
 from kcons.solvers.cluster_solver import Request, go_on
-from kcons.solvers.sparse.step_control import MANY_ITERATIONS
+from kcons.solvers.tolerances import MANY_ITERATIONS
 
 
 class LocalProjections:

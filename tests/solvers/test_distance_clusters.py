@@ -5,7 +5,8 @@ import pytest
 
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import Request
-from kcons.solvers.distance_clusters import lengths_resolved
+from kcons.solvers.distance_clusters import resolved
+from kcons.solvers.kernels.lattices import NO_LATTICE, OPEN
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.small_clusters import SmallClusters
 from kcons.solvers.sparse.distances import SparseDistances
@@ -71,5 +72,5 @@ def test_the_failing_row_is_one_of_the_cluster_in_whichever_lane(name, which, br
 @pytest.mark.parametrize(("at", "miss", "expected"), [(0.0, 5e-15, True), (0.0, 1e-12, False), (1e4, 1e-12, True)])
 def test_lengths_are_resolved_as_far_as_positions_are(at, miss, expected):
     x = np.array([[at, 0, 0], [at + 1.0, 0, 0]])
-    pairs = np.array([[0, 1]], dtype=np.uint32)
-    assert lengths_resolved(x, pairs, np.array([x[1, 0] - x[0, 0] + miss]), None) is expected
+    pairs = np.array([0, 1], dtype=np.uint32)
+    assert resolved(x, pairs, np.array([x[1, 0] - x[0, 0] + miss]), NO_LATTICE, OPEN) is expected

@@ -18,6 +18,7 @@ from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.sparse.distances import sparse_distances
+from kcons.solvers.tolerances import EPS, MAX_HALVINGS, STALLED
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
 RESCUE_ROWS = 400
@@ -29,15 +30,11 @@ NEAREST_ROUNDS = 200
 #: rows, by the square of their number. A projection that fails counts as this many, and so many may be rescued.
 MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
 #: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
-_STILL, _ROUNDING = 1e-12, 16 * float(np.finfo(float).eps)
+_STILL, _ROUNDING = 1e-12, 16 * EPS
 #: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
 SLOW, MIXED = 3, 5
 #: Part of the way to the nearest point that may be left along the constraints without a word.
 LEFT_OVER = 1e-6
-#: Rounds towards the constraints that must gain a tenth, or damping does better.
-STALLED = 10
-#: Halvings of one step of it.
-MAX_HALVINGS = 30
 
 
 class Work:
