@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+# Compiled into kernels, which are made anew where something here changes.
+
 EPS = float(np.finfo(float).eps)
 
 # -- positions ------------------------------------------------------------------------------------------------
