@@ -8,7 +8,7 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.called_solvers import Kernels
 from kcons.solvers.chains.strips import SHORT, long_strip, short_strip, whole_slots
 from kcons.solvers.chains.sweeps import BONDS, LENGTHS, SLOT, project
-from kcons.solvers.cluster_solver import Outcome, Request, go_on
+from kcons.solvers.cluster_solver import Outcome, Request, resume
 from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver, resolved
 from kcons.solvers.kernels.aligned_memory import aligned, copied, in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import halves, integers, none_of, piece
@@ -120,6 +120,6 @@ class Chains(SimdClusterSolver):
         for _ in range(MAX_ROUNDS):
             if not outcome.converged or resolved(request.changed, self._ends, lengths, self._cell, self._kind):
                 break
-            if not go_on(super().positions, request, multipliers):
+            if not resume(super().positions, request, multipliers):
                 break
         return outcome

@@ -28,21 +28,21 @@ MUTANTS = [
     ),
     # -- any rows --
     (
-        "solvers/general_clusters.py",
-        "SPEED_TOLERANCE = 1e-11",
-        "SPEED_TOLERANCE = 1e-7",
+        "solvers/tolerances.py",
+        "DENSE_SPEED_TOLERANCE = 1e-11",
+        "DENSE_SPEED_TOLERANCE = 1e-7",
         "tests/solvers/test_general_clusters.py::test_velocities_that_cannot_be_tangent_are_refused",
     ),
     (
         "solvers/general_clusters.py",
-        "np.maximum(1e-14, 2 * _EPS",
-        "np.maximum(1e-10, 2 * _EPS",
+        "np.maximum(ROUNDING, 2 * EPS",
+        "np.maximum(1e-10, 2 * EPS",
         "tests/solvers/test_general_clusters.py::test_no_more_is_left_than_rounding",
     ),
     (
         "solvers/general_clusters.py",
-        "2 * _EPS * reach / self._scale",
-        "2e4 * _EPS * reach / self._scale",
+        "2 * EPS * reach / self._scale",
+        "2e4 * EPS * reach / self._scale",
         "tests/solvers/test_general_clusters.py::test_no_more_is_left_than_rounding",
     ),
     (
@@ -65,7 +65,7 @@ MUTANTS = [
     ),
     # -- distances of any connection --
     (
-        "solvers/sparse/step_control.py",
+        "solvers/tolerances.py",
         "NEWTON_TOLERANCE = 4e-15",
         "NEWTON_TOLERANCE = 4e-11",
         "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
@@ -91,7 +91,7 @@ MUTANTS = [
     # -- eight small clusters at once --
     (
         "solvers/small_clusters.py",
-        "kept = kept and all_within(groups.TINY, inner)",
+        "kept = kept and all_within(TINY, inner)",
         "kept = kept and all_within(-1e300, inner)",
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-flipped]",
     ),
@@ -192,8 +192,8 @@ MUTANTS = [
     # -- functions --
     (
         "solvers/called_solvers.py",
-        "add(words, v, inv_dt)",
-        "add(words, v, 1.0)",
+        "_call_apply(words[k + 2], (v, inv_dt, mine))",
+        "_call_apply(words[k + 2], (v, 1.0, mine))",
         "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
     ),
     (
@@ -235,8 +235,8 @@ MUTANTS = [
     ),
     (
         "solvers/kernels/two_and_four_wide.py",
-        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, args[2], args[2], [0, 1]), flags=FLAGS)",
-        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, args[2], args[2], [0, 0]), flags=FLAGS)",
+        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, value, value, [0, 1]), flags=FLAGS)",
+        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, value, value, [0, 0]), flags=FLAGS)",
         "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
     ),
 ]

@@ -11,8 +11,8 @@ from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import Motion
-from kcons.motion.local_projections import LocalProjections
-from kcons.motion.restoring.nearest_point import Work
+from kcons.motion.restoring.nearest_point import IterationBudget
+from kcons.motion.solver_sequence import SolverSequence
 from kcons.plan.plan import make_plan
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.24, 0.9266, 0]])
@@ -26,7 +26,7 @@ def projections():
     triangles = np.concatenate([np.array([[0, 1], [0, 2], [1, 2]]) + 3 * k for k in range(3)])
     chain = np.array([[k, k + 1] for k in range(9, 15)])
     held = ConstraintSet([Distance(np.concatenate([triangles, chain])), FixedAtoms([15])], x, np.ones(len(x)))
-    return LocalProjections(held, make_plan(held, x, 0.0), None), held, x
+    return SolverSequence(held, make_plan(held, x, 0.0), None), held, x
 
 
 def test_positions_and_tangents_of_all_solvers():
@@ -63,7 +63,7 @@ def test_the_nearest_point_is_that_of_the_engine():
     solve, held, x = projections()
     off = x + 0.05 * np.random.default_rng(2).normal(size=x.shape)
     y = off.copy()
-    solve.nearest(y, 0.0, Work(solve.plan))
+    solve.nearest(y, 0.0, IterationBudget(solve.plan))
     np.testing.assert_allclose(y, Motion(held, x).restore_positions(off, bonds=[]), rtol=0, atol=1e-13)
 
 
