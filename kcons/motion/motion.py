@@ -34,6 +34,7 @@ from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
 from kcons.motion.restoring.nearest_point import LEFT_OVER, IterationBudget
 from kcons.motion.solver_sequence import SolverSequence
+from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import Plan, make_plan
 from kcons.plan.second_order.conversion import without_second_order_rows
 from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody
@@ -125,8 +126,7 @@ class Motion:
     @property
     def fixed_atoms(self) -> IntArray:
         """Those that `FixedAtoms` hold."""
-        held = [c.atoms.ravel() for c in self.constraint_set.constraints if c.family == "FixedAtoms"]
-        return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)
+        return fixed_atoms(self.constraint_set)
 
     def took(self, iterations: int) -> None:
         """Remember, for reports, the iterations of a kernel that ran all solvers in one call."""
