@@ -33,6 +33,7 @@ from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
 from kcons.motion.restoring.rigid_pieces import Move, bend, free_motions, stretch, torsion
 from kcons.plan.plan import Plan
+from kcons.solvers import tolerances
 
 #: Rows that moved groups leave off by less than this (radian, or part of the length) are left to the search for the
 #: nearest point.
@@ -94,7 +95,7 @@ def restored(
         except (ConvergenceError, ImageError, SingularGeometryError) as failure:
             error = error or failure
             continue
-        wrong = _off(held, found, time)
+        wrong = _off(held, plan, found, time)
         if wrong is None:
             wrong = geometry.changed(found, strict=geometry.turned)
             if wrong is None:
@@ -104,19 +105,22 @@ def restored(
     raise error
 
 
-def _off(held: ConstraintSet, x: FloatArray, time: float) -> InfeasibleError | None:
-    """What to raise if `x` is off a row by the set's own measure, the one that certificates use."""
+def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> InfeasibleError | None:
+    """What to raise if `x` is off a row by the set's own measure, the one that reports use."""
     with np.errstate(all="ignore"):
-        found = held.residuals(x, None, time)
-    miss = np.abs(found.sigma)
-    row = off_row(miss, found.allowed)
+        miss = np.abs(held.value(x, time))
+        # Rows between fixed atoms are as good as the places given.
+        allowed = np.maximum(
+            tolerances.ROUNDINGS * held.tolerance(x, time), np.where(plan.labels < 0, tolerances.NEAR * held.scale, 0.0)
+        )
+    row = off_row(miss, allowed)
     if row < 0:
         return None
     return InfeasibleError(
         f"the positions that were found miss row {held.row_name(row)} by {miss[row]:.6g}; check its target against its "
         "neighbours', or start nearer to a solution",
         residual=float(miss[row] / held.scale[row]),
-        tolerance=float(found.allowed[row] / held.scale[row]),
+        tolerance=float(allowed[row] / held.scale[row]),
         row=row,
         atoms=held.row_atoms(row),
     )
