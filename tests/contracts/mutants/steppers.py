@@ -350,7 +350,7 @@ MUTANTS = [
         "plan/rank.py",
         "late[rows[order]] = left_over",
         "pass",
-        "tests/plan/test_rank.py::test_dependent_rows_are_eliminated_last",
+        "tests/plan/test_plan.py::test_dependent_rows_are_eliminated_last",
     ),
     (
         "motion/certificate.py",
