@@ -78,7 +78,7 @@ def row_blocks(
     n_parts = int(joined(2 * np.arange(len(sides) + 1), sides.ravel(), len(vertices)).max(initial=-1)) + 1
     if len(sides) == len(vertices) - n_parts:  # no edge closes a cycle
         return nothing
-    block = plain_if_small(_edge_blocks, len(u))(u, v, len(vertices))
+    block = edge_blocks(u, v, len(vertices))
     # A wide row has several edges, all in one block.
     keys = np.unique(block * constraint_set.n_rows + row)
     block, row = np.divmod(keys, constraint_set.n_rows)
@@ -88,9 +88,15 @@ def row_blocks(
     return row[keep], np.concatenate([[0], np.cumsum(sizes)])
 
 
+def edge_blocks(u: IntArray, v: IntArray, n_vertices: int) -> IntArray:
+    """Number of the 2-connected block of each edge, from u to v, of a multigraph without loops."""
+    blocks: IntArray = plain_if_small(_edge_blocks, len(u))(u, v, n_vertices)
+    return blocks
+
+
 @njit(cache=True)
 def _edge_blocks(u, v, n_vertices):  # type: ignore[no-untyped-def]
-    """Block number of each edge of a multigraph without loops (Hopcroft and Tarjan 1973, with own stack)."""
+    # Hopcroft and Tarjan 1973, with own stack.
     n_edges = len(u)
     start = np.zeros(n_vertices + 1, np.int64)
     for e in range(n_edges):

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import make_whole, neighbour_lists
+from kcons.constraints.periodic.one_piece import make_whole, neighbour_lists, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
+from kcons.plan.independent_blocks import edge_blocks
 from kcons.topology.topology import connected, sorted_pairs
 
 #: Origin and unit axis of a motion at given positions; None where they are undefined.
@@ -32,7 +33,7 @@ class MoleculeGraph:
     bonds : ndarray of int, shape (n, 2)
         Those of the molecules that are kept; i < j, sorted.
     atoms : ndarray of int
-        All atoms of these molecules, molecule by molecule, each depth first: what lies beyond a bond is a stretch.
+        All atoms of these molecules, molecule by molecule; what lies beyond a bond stands together.
     molecules : list of ndarray of int
     """
 
@@ -45,65 +46,51 @@ class MoleculeGraph:
         kept[np.isin(label, label[atoms])] = True
         self.bonds = pairs[kept[pairs].all(axis=1)] if len(pairs) else pairs
         self._starts, self._ends = neighbour_lists(self.bonds, n_atoms)
-        self.label = label
-        self._walk(np.flatnonzero(kept))
+        order, parents = spanning_tree(self.bonds, n_atoms)
+        self._lay_out(order[kept[order]], parents[kept[order]], n_atoms)
 
     def neighbours(self, atom: int) -> IntArray:
         """Atoms bonded to one."""
         return self._ends[self._starts[atom] : self._starts[atom + 1]]
 
-    def _walk(self, kept: IntArray) -> None:
-        """Depth first through every molecule; a bond is a bridge if nothing beyond it leads back past it."""
-        ends, starts = self._ends.tolist(), self._starts.tolist()
-        self._begin: dict[int, int] = {}
-        self._end: dict[int, int] = {}
-        self._parent: dict[int, int] = {}
-        self._bridge: set[int] = set()  # the far atom of each
-        begin, parent = self._begin, self._parent
-        low: dict[int, int] = {}
-        order: list[int] = []
-        self.molecules: list[IntArray] = []
-        for root in kept.tolist():
-            if root in begin:
-                continue
-            first = len(order)
-            begin[root] = low[root] = first
-            parent[root] = -1
-            order.append(root)
-            stack = [(root, starts[root])]
-            while stack:
-                here, slot = stack[-1]
-                if slot < starts[here + 1]:
-                    stack[-1] = (here, slot + 1)
-                    there = ends[slot]
-                    if there not in begin:
-                        begin[there] = low[there] = len(order)
-                        parent[there] = here
-                        order.append(there)
-                        stack.append((there, starts[there]))
-                    elif there != parent[here]:
-                        low[here] = min(low[here], begin[there])
-                else:
-                    stack.pop()
-                    self._end[here] = len(order)
-                    above = parent[here]
-                    if above >= 0:
-                        low[above] = min(low[above], low[here])
-                        if low[here] > begin[above]:
-                            self._bridge.add(here)
-            self.molecules.append(np.array(order[first:], dtype=np.int64))
-        self.atoms = np.array(order, dtype=np.int64)
+    def _lay_out(self, order: IntArray, parents: IntArray, n_atoms: int) -> None:
+        """Put what hangs from an atom behind it, and find the bridges: bonds that are blocks of their own."""
+        parent, size = np.arange(n_atoms), np.ones(n_atoms, dtype=np.int64)
+        parent[order] = parents
+        tree = list(zip(order.tolist(), parents.tolist(), strict=True))
+        for atom, above in reversed(tree):
+            if atom != above:
+                size[above] += size[atom]
+        begin, free, used = np.zeros(n_atoms, dtype=np.int64), np.zeros(n_atoms, dtype=np.int64), 0
+        for atom, above in tree:
+            if atom == above:
+                begin[atom], used = used, used + size[atom]
+            else:
+                begin[atom] = free[above]
+                free[above] += size[atom]
+            free[atom] = begin[atom] + 1
+        self.atoms = order[np.argsort(begin[order])]
+        self._parent, self._begin, self._end = parent, begin, begin + size
+        self.molecules = [self._hanging(root) for root in self.atoms.tolist() if parent[root] == root]
+        i, j = self.bonds.T
+        block = edge_blocks(i, j, n_atoms) if len(self.bonds) else i
+        self._bridge = np.zeros(n_atoms, dtype=bool)  # by the far atom of each
+        self._bridge[np.where(parent[j] == i, j, i)[np.bincount(block)[block] == 1]] = True
+
+    def _hanging(self, atom: int) -> IntArray:
+        """An atom and all that hang from it."""
+        return self.atoms[self._begin[atom] : self._end[atom]]
 
     def molecule(self, atom: int) -> IntArray:
         """All atoms of the molecule of one of `atoms`."""
-        root = atom
-        while self._parent[root] >= 0:
-            root = self._parent[root]
-        return self.atoms[self._begin[root] : self._end[root]]
+        while self._parent[atom] != atom:
+            atom = int(self._parent[atom])
+        return self._hanging(atom)
 
     def bridges(self) -> list[tuple[int, int]]:
         """Bonds that are in no ring."""
-        return [(self._parent[k], k) for k in self.atoms.tolist() if k in self._bridge]
+        far = self.atoms[self._bridge[self.atoms]]
+        return list(zip(self._parent[far].tolist(), far.tolist(), strict=True))
 
     def bonded(self, j: int, k: int) -> bool:
         """Whether two atoms are."""
@@ -111,17 +98,15 @@ class MoleculeGraph:
 
     def beyond(self, j: int, k: int) -> IntArray | None:
         """Atoms on the side of k when the bond j-k is cut; None if there is no bond, or one in a ring."""
-        if self._parent[k] == j and k in self._bridge:
-            return self.atoms[self._begin[k] : self._end[k]]
-        if self._parent[j] == k and j in self._bridge:
-            whole = self.molecule(j)
-            return np.setdiff1d(whole, self.atoms[self._begin[j] : self._end[j]], assume_unique=True)
+        if self._parent[k] == j and self._bridge[k]:
+            return self._hanging(k)
+        if self._parent[j] == k and self._bridge[j]:
+            return np.setdiff1d(self.molecule(j), self._hanging(j), assume_unique=True)
         return None
 
     def whole(self, x: FloatArray, lattice: FloatArray | None) -> FloatArray:
         """Positions with every molecule in one piece: each atom in the image next to the one it was reached from."""
-        parents = [k if self._parent[k] < 0 else self._parent[k] for k in self.atoms.tolist()]
-        return make_whole(x, self.atoms, np.array(parents, dtype=np.int64), lattice)
+        return make_whole(x, self.atoms, self._parent[self.atoms], lattice)
 
 
 @dataclass(frozen=True)
