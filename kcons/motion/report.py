@@ -86,12 +86,12 @@ class Report:
         if len(self.conversions) > SHOWN:
             lines.append(f"converted: {len(self.conversions) - SHOWN} more groups")
         titles = f"{'clusters':>9}{'rows':>9}{'rank':>9}{'condition':>11}{'iterations':>12}"
-        lines.append(f"{'solver':<12}{titles}  for example")
+        lines.append(f"{'solver':<16}{titles}  for example")
         for k in self.kinds:
             condition = "-" if np.isnan(k.condition) else f"{k.condition:.3g}"
             iterations = k.iterations or "-"
             numbers = f"{k.clusters:>9}{k.rows:>9}{k.rank:>9}{condition:>11}{iterations:>12}"
-            lines.append(f"{k.solver:<12}{numbers}  {k.example}")
+            lines.append(f"{k.solver:<16}{numbers}  {k.example}")
         return "\n".join(lines)
 
 

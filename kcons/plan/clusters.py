@@ -19,7 +19,10 @@ LANES_ROWS = 6
 #: Fewer clusters alike than this are left to the sparse solver, which takes all shapes in one call.
 LANES_CLUSTERS = 8
 
-ShapeKind = Literal["water", "lanes", "chain", "sparse", "single", "mixed", "general"]
+#: Shapes have the names of the solvers that serve them.
+ShapeKind = Literal[
+    "RigidTriangles", "SmallClusters", "Chains", "SparseDistances", "SingleRows", "SparseRows", "GeneralClusters"
+]
 _NONE = np.zeros(0, np.int64)
 
 
@@ -30,18 +33,18 @@ class Shape:
     Attributes
     ----------
     kind : str
-        Key of the solver table in `kcons.plan`.
+        Which solver serves them.
     rows : ndarray of int64
-        Row numbers: (n_clusters, K) for 'water' and 'lanes', flat otherwise.
+        Row numbers: (n_clusters, K) for 'RigidTriangles' and 'SmallClusters', flat otherwise.
     clusters : int
     independent : bool
         True if the graph alone shows that no row depends on others (trees of distances).
     atoms : ndarray of int64
-        'water', 'lanes': (n_clusters, n_local); 'chain': atoms in path order, one path after another.
+        'RigidTriangles', 'SmallClusters': (n_clusters, n_local); 'Chains': atoms in path order, one path after another.
     pairs : ndarray of int64, shape (K, 2) or (n_rows, 2)
-        'lanes': local atoms of each row; 'sparse': atoms of each row.
+        'SmallClusters': local atoms of each row; 'SparseDistances': atoms of each row.
     starts : ndarray of int64
-        'chain': first atom of each path, and the end.
+        'Chains': first atom of each path, and the end.
     """
 
     kind: ShapeKind
@@ -164,16 +167,16 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
         chosen = sparse & (tree == independent)
         if chosen.any():
             rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
-            yield Shape("sparse", rows, int(chosen.sum()), independent, pairs=pairs[rows])
+            yield Shape("SparseDistances", rows, int(chosen.sum()), independent, pairs=pairs[rows])
     single = np.zeros(n_clusters, dtype=bool)
     single[labels[inside & (kinds == RowKind.FUNCTION)]] = True
     single &= n_rows == 1
     if constraint_set.images is not None:
         single &= ~anchored  # fixed atoms may be moved to another image, of which single rows know nothing
     others: tuple[tuple[ShapeKind, NDArray[np.bool_]], ...] = (
-        ("single", single),
-        ("mixed", compiled & ~distances_only & ~single),
-        ("general", ~compiled),
+        ("SingleRows", single),
+        ("SparseRows", compiled & ~distances_only & ~single),
+        ("GeneralClusters", ~compiled),
     )
     for kind, chosen in others:
         if chosen.any():
@@ -238,7 +241,7 @@ def _small_shapes(
             if triangle and not np.array_equal(local_pairs, [[0, 1], [0, 2], [1, 2]]):
                 triangle = False
             shape = Shape(
-                "water" if triangle else "lanes",
+                "RigidTriangles" if triangle else "SmallClusters",
                 rows[table[members]],
                 len(members),
                 bool(tree[numbers[chosen[one]]]),
@@ -258,7 +261,7 @@ def _small_shapes(
 def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shape:
     """Order the rows and atoms of open chains from one end to the other."""
     order, atoms, starts = plain_if_small(_walk, len(pairs))(pairs, n_atoms, clusters)
-    return Shape("chain", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
+    return Shape("Chains", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.plan.rank import rank_of_shape, ranked, small_enough
+from kcons.plan.rank import mark_dependent_rows, rank_of_shape, small_enough
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -63,11 +63,11 @@ class Plan:
     kinds : list of ClusterKind
     dependent : list of ndarray of int
         Rows of each cluster in which rows may depend on each other.
-    loose : ndarray of int or None
+    between_fixed_atoms : ndarray of int or None
         Rows between fixed atoms that motion of these may break.
     resting : tuple of ndarray of int and of positions, or None
         Rows between fixed atoms at rest, which another cell may break, and positions of the set-up.
-    late : ndarray of bool, shape (n_rows,)
+    eliminate_last : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
         For each solver, whether it takes positions that were made whole, without a cell (see `periodic.images`).
@@ -84,10 +84,10 @@ class Plan:
     driven: bool
     kinds: list[ClusterKind] = field(default_factory=list)
     dependent: list[IntArray] = field(default_factory=list)
-    loose: IntArray | None = None
+    between_fixed_atoms: IntArray | None = None
     resting: tuple[IntArray, FloatArray] | None = None
     whole: list[bool] = field(default_factory=list)
-    late: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+    eliminate_last: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     _places: FloatArray | None = None
 
     def asked_of(self, solver: int, request: Request) -> Request:
@@ -102,7 +102,7 @@ class Plan:
             self._places = self.constraint_set.target(0.0)[self.pinned_rows].reshape(-1, 3)
         return self._places
 
-    def check_loose_rows(self, x: FloatArray, time: float) -> None:
+    def check_rows_between_fixed_atoms(self, x: FloatArray, time: float) -> None:
         """Refuse rows between fixed atoms only that are not fulfilled; the others need no solver.
 
         Raises
@@ -110,13 +110,13 @@ class Plan:
         ContradictionError
             A position row is off at `x`, or a velocity row asks for another speed than that of the atoms.
         """
-        if self.loose is None:
+        if self.between_fixed_atoms is None:
             return
-        self._require_fulfilled(self.loose, x, time)
+        self._require_fulfilled(self.between_fixed_atoms, x, time)
         speed = self.constraint_set.velocity_target(x, time)
         v = np.zeros_like(x)
         v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
-        self.check_loose_rates(x, v, speed, time, "velocity")
+        self.check_rates_between_fixed_atoms(x, v, speed, time, "velocity")
 
     def check_cell(self) -> None:
         """Refuse the present cell where it breaks rows between fixed atoms at rest, which no solver sees.
@@ -143,23 +143,25 @@ class Plan:
                 atoms=self.named.row_atoms(row),
             )
 
-    def check_loose_rates(self, x: FloatArray, y: FloatArray, rates: FloatArray | None, time: float, what: str) -> None:
+    def check_rates_between_fixed_atoms(
+        self, x: FloatArray, y: FloatArray, rates: FloatArray | None, time: float, what: str
+    ) -> None:
         """Refuse rows between fixed atoms only whose A y, with the y of these atoms, is not `rates`.
 
         Raises
         ------
         ContradictionError
         """
-        if self.loose is None:
+        if self.between_fixed_atoms is None:
             return
-        jacobian = self.constraint_set.jacobian(x, time)[self.loose]
+        jacobian = self.constraint_set.jacobian(x, time)[self.between_fixed_atoms]
         fixed = np.zeros_like(y)
         fixed[self.pinned] = y[self.pinned]
-        wanted = np.zeros(len(self.loose)) if rates is None else rates[self.loose]
+        wanted = np.zeros(len(self.between_fixed_atoms)) if rates is None else rates[self.between_fixed_atoms]
         miss = np.abs(jacobian @ fixed.ravel() - wanted)
         bad = np.flatnonzero(~(miss <= 1e-10 * (np.abs(wanted) + abs(jacobian) @ np.abs(fixed.ravel()))))
         if len(bad):
-            row = int(self.loose[bad[0]])
+            row = int(self.between_fixed_atoms[bad[0]])
             raise ContradictionError(
                 f"row {self.named.row_name(row)} lies between fixed atoms, whose {what} does not follow it: off by "
                 f"{miss[bad[0]]:g}; remove it, free one of its atoms, or let the fixed atoms move with it",
@@ -240,17 +242,17 @@ def make_plan(
     driven = constraint_set.moving or not bool(constraint_set.holonomic.all())
     rank = len(pinned_rows)
     plan = Plan(constraint_set, named, [], labels, pinned, pinned_rows, inverse_masses, rank, driven)
-    plan.late = np.zeros(constraint_set.n_rows, np.bool_)
+    plan.eliminate_last = np.zeros(constraint_set.n_rows, np.bool_)
     loose = labels < 0
     loose[pinned_rows] = False
     if loose.any():
-        plan.loose = np.flatnonzero(loose)
+        plan.between_fixed_atoms = np.flatnonzero(loose)
         in_place = positions.copy()
         in_place[pinned] = plan.pinned_targets(constraint_set.target(time))
-        plan.check_loose_rows(in_place, time)
+        plan.check_rows_between_fixed_atoms(in_place, time)
         if not constraint_set.moving:
-            plan.resting = (plan.loose, in_place)
-            plan.loose = None
+            plan.resting = (plan.between_fixed_atoms, in_place)
+            plan.between_fixed_atoms = None
     whole_positions, placed = constraint_set.whole(positions), constraint_set.placed
     moved = None if placed is None else constraint_set.moved_places(positions[placed], whole_positions)
     for shape, whole in _shapes(constraint_set, labels, inverse_masses):
@@ -260,27 +262,31 @@ def make_plan(
         else:
             lattice = None if whole else constraint_set.lattice
             rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time, moved)
-        if shape.kind == "single" and rank < shape.rows.size:
-            shape = replace(shape, kind="mixed")
-        alone = shape.independent or shape.kind == "single"
+        if shape.kind == "SingleRows" and rank < shape.rows.size:
+            shape = replace(shape, kind="SparseRows")
+        alone = shape.independent or shape.kind == "SingleRows"
         clusters = [] if alone else _by_cluster(shape.rows.ravel(), labels)
-        if clusters and shape.kind in ("sparse", "mixed") and small_enough(clusters):
+        if clusters and shape.kind in ("SparseDistances", "SparseRows") and small_enough(clusters):
             # The pivots of an order that knows nothing of dependence say less.
-            rank = ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
-            if seen < rank and shape.kind == "mixed":
+            rank = mark_dependent_rows(constraint_set, clusters, inverse_masses, positions, time, plan.eliminate_last)
+            if seen < rank and shape.kind == "SparseRows":
                 # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
                 solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
         if rank < shape.rows.size:
             plan.dependent += clusters
-            if shape.kind in ("water", "lanes"):
+            if shape.kind in ("RigidTriangles", "SmallClusters"):
                 # The lanes have no cut for dependent rows; sparse elimination has.
                 flat = shape.rows.ravel()
                 ends = shape.atoms[:, shape.pairs].reshape(-1, 2)
-                shape = Shape("sparse", flat, shape.clusters, False, pairs=ends)
+                shape = Shape("SparseDistances", flat, shape.clusters, False, pairs=ends)
             if not isinstance(solver, GeneralClusters):
-                if shape.kind == "sparse" and not plan.late[shape.rows].any() and small_enough(clusters):
-                    ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
-                solver = solver_of(shape, constraint_set, inverse_masses, labels, time, plan.late)
+                if (
+                    shape.kind == "SparseDistances"
+                    and not plan.eliminate_last[shape.rows].any()
+                    and small_enough(clusters)
+                ):
+                    mark_dependent_rows(constraint_set, clusters, inverse_masses, positions, time, plan.eliminate_last)
+                solver = solver_of(shape, constraint_set, inverse_masses, labels, time, plan.eliminate_last)
         plan.solvers.append(solver)
         plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))
         plan.rank += rank
@@ -295,24 +301,28 @@ def solver_of(
     inverse_masses: FloatArray,
     labels: IntArray,
     time: float,
-    late: BoolArray | None = None,
+    eliminate_last: BoolArray | None = None,
 ) -> ClusterSolver:
     """The table: which solver serves which shape."""
     rows = shape.rows
-    if shape.kind == "general":
+    if shape.kind == "GeneralClusters":
         return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
-    if shape.kind == "single":
+    if shape.kind == "SingleRows":
         return SingleRows(constraint_set, rows, inverse_masses)
-    if shape.kind == "mixed":
-        return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
+    if shape.kind == "SparseRows":
+        return SparseRows(
+            constraint_set, rows, inverse_masses, None if eliminate_last is None else eliminate_last[rows]
+        )
     targets = constraint_set.target(time)[rows]
-    if shape.kind == "water":
+    if shape.kind == "RigidTriangles":
         return RigidTriangles(rows, shape.atoms, targets, inverse_masses[shape.atoms[0]])
-    if shape.kind == "lanes":
+    if shape.kind == "SmallClusters":
         return SmallClusters(rows, shape.atoms, shape.pairs, targets, inverse_masses[shape.atoms[0]])
-    if shape.kind == "chain":
+    if shape.kind == "Chains":
         return Chains(rows, shape.starts, shape.atoms, targets, inverse_masses[shape.atoms])
-    return SparseDistances(rows, shape.pairs, targets, inverse_masses, None if late is None else late[rows])
+    return SparseDistances(
+        rows, shape.pairs, targets, inverse_masses, None if eliminate_last is None else eliminate_last[rows]
+    )
 
 
 def _shapes(

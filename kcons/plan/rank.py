@@ -25,15 +25,15 @@ def small_enough(clusters: list[IntArray]) -> bool:
     return max(sizes, default=0) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL
 
 
-def ranked(
+def mark_dependent_rows(
     constraint_set: ConstraintSet,
     clusters: list[IntArray],
     inverse_masses: FloatArray,
     positions: FloatArray,
     time: float,
-    late: BoolArray,
+    eliminate_last: BoolArray,
 ) -> int:
-    """Independent rows of small clusters, by pivoted QR; marks in `late` what the best conditioned rows leave over."""
+    """Independent rows of small clusters, by pivoted QR; marks those that the best conditioned rows leave over."""
     from scipy.linalg import qr  # slow to import
 
     jacobian = constraint_set.jacobian(positions, time)
@@ -50,7 +50,7 @@ def ranked(
         diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
         # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
         left_over = ~independent(diagonal)
-        late[rows[order]] = left_over
+        eliminate_last[rows[order]] = left_over
         found += int(np.sum(~left_over))
     return found
 

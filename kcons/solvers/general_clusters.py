@@ -93,7 +93,7 @@ class GeneralClusters:
         0 for atoms of infinite mass.
     """
 
-    name = "general"
+    name = "GeneralClusters"
 
     def __init__(
         self, constraint_set: ConstraintSet, rows: IntArray, labels: IntArray, inverse_masses: FloatArray

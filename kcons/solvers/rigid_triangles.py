@@ -254,7 +254,7 @@ class RigidTriangles(SimdClusterSolver):
         Inverse masses of the three atoms; 0 for a pinned one.
     """
 
-    name = "water"
+    name = "RigidTriangles"
     _kernel = staticmethod(project_triangles)
 
     def __init__(self, rows: ArrayLike, atoms: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike) -> None:

@@ -55,7 +55,7 @@ class SingleRows(CalledSolver):
         0 for atoms of infinite mass.
     """
 
-    name = "single"
+    name = "SingleRows"
 
     def __init__(self, constraint_set: ConstraintSet, rows: IntArray, inverse_masses: FloatArray) -> None:
         self.rows = rows

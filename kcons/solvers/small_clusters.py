@@ -320,7 +320,7 @@ class SmallClusters(SimdClusterSolver):
         Inverse masses; 0 for a pinned atom.
     """
 
-    name = "lanes"
+    name = "SmallClusters"
 
     def __init__(
         self,

@@ -243,13 +243,13 @@ def test_multipliers_are_natural_and_those_of_fixed_atoms_zero(sample) -> None:
 
 #: Steps on which the plain Newton iteration of the fast solver fails and damped Newton does not.
 RESCUED = {
-    "water": (
+    "RigidTriangles": (
         np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.25, 0.97, 0]]),
         TRIANGLE,
         [4.2, 1.65, 3.2],
         [[0.38, 0.36, -0.25], [1.55, 0.25, 0.1], [-0.69, 0.74, 0.0]],
     ),
-    "lanes": (
+    "SmallClusters": (
         np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
         [(0, k) for k in range(1, 5)],
         [9.5, 1.35, 2.29, 1.14, 1.04],

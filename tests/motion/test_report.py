@@ -44,10 +44,10 @@ def test_report_says_it_all(extra: int) -> None:
     report = motion.report(x, v)
     assert (report.rows, report.rank, report.degrees_of_freedom) == (17, 16, 3 * len(x) - 16)
     assert [(k.solver, k.clusters, k.rows, k.rank) for k in report.kinds] == [
-        ("water", 1, 3, 3),
-        ("sparse", 1, 10, 9),
-        ("single", 1, 1, 1),
-        ("mixed", 1, 3, 3),
+        ("RigidTriangles", 1, 3, 3),
+        ("SparseDistances", 1, 10, 9),
+        ("SingleRows", 1, 1, 1),
+        ("SparseRows", 1, 3, 3),
     ]
     A = whole.jacobian(x).toarray()
     for kind, rows in zip(report.kinds, (range(3), range(3, 13), [16], range(13, 16)), strict=True):

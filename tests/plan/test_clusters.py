@@ -79,7 +79,7 @@ def test_labels_do_not_depend_on_the_order_of_rows() -> None:
 def test_triangles_of_any_orientation_are_water(order: tuple[int, ...]) -> None:
     pairs = [pair[::-1] if turned else pair for pair, turned in zip(TRIANGLE, order, strict=True)]
     (shape,) = shapes_of(copies(pairs[::-1], 3, 9), places(27), np.tile([16.0, 1, 1], 9))
-    assert shape.kind == "water" and shape.clusters == 9
+    assert shape.kind == "RigidTriangles" and shape.clusters == 9
     assert shape.atoms.shape == (9, 3) and shape.rows.shape == (9, 3)
     assert (shape.atoms % 3 == 0).any(axis=0).tolist().count(True) == 1  # oxygen in one place throughout
 
@@ -89,7 +89,7 @@ def test_lanes_hold_one_entry_a_kind_of_cluster() -> None:
     bonds = [(0, 1), (2, 0), (0, 3)]
     rows = copies(bonds, 4, 10)
     (shape,) = shapes_of(rows, places(40), np.tile([12.0, 1, 1, 1], 10))
-    assert shape.kind == "lanes" and shape.independent
+    assert shape.kind == "SmallClusters" and shape.independent
     for cluster_rows, atoms in zip(shape.rows, shape.atoms, strict=True):
         for row, pair in zip(cluster_rows, shape.pairs, strict=True):
             assert set(atoms[pair]) == set(rows.atoms[row])
@@ -98,7 +98,7 @@ def test_lanes_hold_one_entry_a_kind_of_cluster() -> None:
 def test_equal_graphs_with_other_masses_are_other_lanes() -> None:
     masses = np.concatenate([np.tile([16.0, 1, 1], 10), np.tile([16.0, 2, 2], 12)])
     shapes = shapes_of(copies(TRIANGLE, 3, 22), places(66), masses)
-    assert sorted((s.kind, s.clusters) for s in shapes) == [("water", 10), ("water", 12)]
+    assert sorted((s.kind, s.clusters) for s in shapes) == [("RigidTriangles", 10), ("RigidTriangles", 12)]
 
 
 @pytest.mark.parametrize("few", [LANES_CLUSTERS - 1, LANES_CLUSTERS])
@@ -111,7 +111,7 @@ def test_many_kinds_of_few_clusters_go_to_the_sparse_solver(few: int) -> None:
             first += 3
     shapes = shapes_of(held.Distance(pairs), places(first), np.array(masses))
     kinds = [s.kind for s in shapes]
-    assert kinds == (["sparse"] if few < LANES_CLUSTERS else ["lanes"] * 4)
+    assert kinds == (["SparseDistances"] if few < LANES_CLUSTERS else ["SmallClusters"] * 4)
     assert sum(s.clusters for s in shapes) == 4 * few
 
 
@@ -122,7 +122,7 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
     pairs = [(label[k], label[k + 1]) for k in range(2 * rows + 1) if k != rows]
     pairs = np.array(pairs)[rng.permutation(len(pairs))]
     shapes = shapes_of(held.Distance(pairs), places(len(label)))
-    assert {s.kind for s in shapes} == ({"lanes"} if rows <= LANES_ROWS else {"chain"})
+    assert {s.kind for s in shapes} == ({"SmallClusters"} if rows <= LANES_ROWS else {"Chains"})
     if rows > LANES_ROWS:
         (shape,) = shapes
         assert shape.clusters == 2 and shape.independent
@@ -145,7 +145,7 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
 )
 def test_other_graphs_are_sparse(pairs: list[tuple[int, int]], independent: bool) -> None:
     (shape,) = shapes_of(held.Distance(pairs), places(10))
-    assert shape.kind == "sparse" and shape.clusters == 1
+    assert shape.kind == "SparseDistances" and shape.clusters == 1
     assert shape.independent is independent
 
 
@@ -161,7 +161,7 @@ def test_other_graphs_are_sparse(pairs: list[tuple[int, int]], independent: bool
 )
 def test_anchored_clusters_are_sparse(pairs, fixed, independent) -> None:
     shapes = shapes_of([held.FixedAtoms(fixed), held.Distance(pairs)], places(4))
-    assert {s.kind for s in shapes} == {"sparse"}
+    assert {s.kind for s in shapes} == {"SparseDistances"}
     assert {s.independent for s in shapes} == {independent}
 
 
@@ -175,19 +175,19 @@ def test_mixed_and_general_rows() -> None:
         held.ImplicitSurface([14, 15], lambda r: r[:, 0] - 3.0, target=None),  # a function of two rows at once
     ]
     shapes = {s.kind: s for s in shapes_of(rows, places(16))}
-    assert set(shapes) == {"lanes", "single", "mixed", "general"}
-    assert shapes["mixed"].rows.tolist() == [0, 1, 2, 4, 5, 6] and shapes["mixed"].clusters == 3
-    assert shapes["single"].rows.tolist() == [7] and shapes["single"].clusters == 1
-    assert shapes["general"].rows.tolist() == [8, 9] and shapes["general"].clusters == 2
-    assert shapes["lanes"].rows.tolist() == [[3]]
+    assert set(shapes) == {"SmallClusters", "SingleRows", "SparseRows", "GeneralClusters"}
+    assert shapes["SparseRows"].rows.tolist() == [0, 1, 2, 4, 5, 6] and shapes["SparseRows"].clusters == 3
+    assert shapes["SingleRows"].rows.tolist() == [7] and shapes["SingleRows"].clusters == 1
+    assert shapes["GeneralClusters"].rows.tolist() == [8, 9] and shapes["GeneralClusters"].clusters == 2
+    assert shapes["SmallClusters"].rows.tolist() == [[3]]
 
 
 def test_functions_that_know_all_rows_at_once_are_called_for_all() -> None:
     def surface(atoms):
         return held.ImplicitSurface(atoms, lambda r: r[:, 2], lambda r: np.tile([0, 0, 1.0], (len(r), 1)), target=None)
 
-    assert [s.kind for s in shapes_of(surface([0, 1]), places(2))] == ["general"]
-    assert [s.kind for s in shapes_of(surface([0]), places(2))] == ["single"]
+    assert [s.kind for s in shapes_of(surface([0, 1]), places(2))] == ["GeneralClusters"]
+    assert [s.kind for s in shapes_of(surface([0]), places(2))] == ["SingleRows"]
 
 
 @pytest.mark.parametrize("seed", range(5))

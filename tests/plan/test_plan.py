@@ -13,7 +13,7 @@ from kcons.errors import ContradictionError, UnsupportedError
 from kcons.motion import Motion
 from kcons.plan import make_plan
 from kcons.plan.clusters import Shape
-from kcons.plan.rank import ORDERED_IN_ALL, ORDERED_ROWS, rank_of_small, ranked, small_enough
+from kcons.plan.rank import ORDERED_IN_ALL, ORDERED_ROWS, mark_dependent_rows, rank_of_small, small_enough
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -45,18 +45,18 @@ def lines(plan) -> list[tuple[str, int, int, int]]:
 @pytest.mark.parametrize(
     ("shape", "pairs", "times", "expected"),
     [
-        (WATER, all_pairs(3), 1, ("water", 1, 3, 3)),
-        (WATER, all_pairs(3), 50, ("water", 50, 150, 150)),
-        (WATER[:2], [(0, 1)], 9, ("lanes", 9, 9, 9)),
-        (WATER, [(0, 1), (0, 2)], 9, ("lanes", 9, 18, 18)),
-        (METHANE, [(0, k) for k in range(1, 5)], 9, ("lanes", 9, 36, 36)),
-        (TETRAHEDRON, all_pairs(4), 9, ("lanes", 9, 54, 54)),
-        (ZIGZAG, [(k, k + 1) for k in range(19)], 3, ("chain", 3, 57, 57)),
-        (HEXAGON, [(k, (k + 1) % 6) for k in range(6)], 9, ("lanes", 9, 54, 54)),
-        (METHANE, all_pairs(5), 4, ("sparse", 4, 40, 36)),  # rank-deficient
-        (OCTAHEDRON, all_pairs(6), 2, ("sparse", 2, 30, 24)),
-        (WATER[:2], [(0, 1), (1, 0)], 9, ("sparse", 9, 18, 9)),  # small, and rank-deficient
-        (WATER, [*all_pairs(3), (0, 1)], 9, ("sparse", 9, 36, 27)),
+        (WATER, all_pairs(3), 1, ("RigidTriangles", 1, 3, 3)),
+        (WATER, all_pairs(3), 50, ("RigidTriangles", 50, 150, 150)),
+        (WATER[:2], [(0, 1)], 9, ("SmallClusters", 9, 9, 9)),
+        (WATER, [(0, 1), (0, 2)], 9, ("SmallClusters", 9, 18, 18)),
+        (METHANE, [(0, k) for k in range(1, 5)], 9, ("SmallClusters", 9, 36, 36)),
+        (TETRAHEDRON, all_pairs(4), 9, ("SmallClusters", 9, 54, 54)),
+        (ZIGZAG, [(k, k + 1) for k in range(19)], 3, ("Chains", 3, 57, 57)),
+        (HEXAGON, [(k, (k + 1) % 6) for k in range(6)], 9, ("SmallClusters", 9, 54, 54)),
+        (METHANE, all_pairs(5), 4, ("SparseDistances", 4, 40, 36)),  # rank-deficient
+        (OCTAHEDRON, all_pairs(6), 2, ("SparseDistances", 2, 30, 24)),
+        (WATER[:2], [(0, 1), (1, 0)], 9, ("SparseDistances", 9, 18, 9)),  # small, and rank-deficient
+        (WATER, [*all_pairs(3), (0, 1)], 9, ("SparseDistances", 9, 36, 27)),
     ],
 )
 def test_table_for_distances(shape, pairs, times, expected) -> None:
@@ -71,13 +71,13 @@ def test_table_for_distances(shape, pairs, times, expected) -> None:
 @pytest.mark.parametrize(
     ("rows", "expected"),
     [
-        ([held.Distance([0, 1]), held.Angle([0, 1, 2])], ("mixed", 1, 2, 2)),
-        ([held.Sphere([0, 1, 2], [9.0, 0, 0])], ("single", 3, 3, 3)),
-        ([held.Distance([0, 1]), held.Plane([0, 1], [0, 0, 1.0])], ("mixed", 1, 3, 3)),
-        ([held.Angle([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
-        ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("mixed", 1, 4, 4)),
-        ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
-        ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("mixed", 1, 1, 1)),
+        ([held.Distance([0, 1]), held.Angle([0, 1, 2])], ("SparseRows", 1, 2, 2)),
+        ([held.Sphere([0, 1, 2], [9.0, 0, 0])], ("SingleRows", 3, 3, 3)),
+        ([held.Distance([0, 1]), held.Plane([0, 1], [0, 0, 1.0])], ("SparseRows", 1, 3, 3)),
+        ([held.Angle([[0, 1, 2], [2, 1, 0]])], ("SparseRows", 1, 2, 1)),
+        ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("SparseRows", 1, 4, 4)),
+        ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("SparseRows", 1, 2, 1)),
+        ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("SparseRows", 1, 1, 1)),
     ],
 )
 def test_table_for_other_rows(rows, expected) -> None:
@@ -87,11 +87,11 @@ def test_table_for_other_rows(rows, expected) -> None:
 @pytest.mark.parametrize(
     ("fixed", "pairs", "expected"),
     [
-        ([0], [(0, 1)], ("sparse", 1, 1, 1)),
-        ([0], [(0, 1), (0, 2)], ("sparse", 2, 2, 2)),
-        ([0, 3], [(0, 1), (1, 2), (2, 3)], ("sparse", 1, 3, 3)),
-        ([0, 1], [(0, 2), (1, 2), (0, 1)], ("sparse", 1, 2, 2)),  # the last row lies between fixed atoms
-        ([0, 1, 2], [(0, 3), (1, 3), (2, 3), (3, 4)], ("sparse", 1, 4, 4)),
+        ([0], [(0, 1)], ("SparseDistances", 1, 1, 1)),
+        ([0], [(0, 1), (0, 2)], ("SparseDistances", 2, 2, 2)),
+        ([0, 3], [(0, 1), (1, 2), (2, 3)], ("SparseDistances", 1, 3, 3)),
+        ([0, 1], [(0, 2), (1, 2), (0, 1)], ("SparseDistances", 1, 2, 2)),  # the last row lies between fixed atoms
+        ([0, 1, 2], [(0, 3), (1, 3), (2, 3), (3, 4)], ("SparseDistances", 1, 4, 4)),
     ],
 )
 def test_anchored_clusters(fixed, pairs, expected) -> None:
@@ -115,7 +115,7 @@ def test_dependent_rows_are_listed_cluster_by_cluster() -> None:
 def test_fulfilled_rows_between_fixed_atoms_are_dropped() -> None:
     plan = planned([held.FixedAtoms([0, 1]), held.Distance([[0, 1], [1, 2]])], WATER)
     assert plan.labels.tolist() == [-1] * 7 + [0]
-    assert plan.rank == 7 and plan.loose is None
+    assert plan.rank == 7 and plan.between_fixed_atoms is None
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_atoms_fixed_on_a_path_that_breaks_a_row_between_them() -> None:
         held.Distance([[0, 1], [1, 2]]),
     ]
     motion = Motion(ConstraintSet(rows, WATER, np.ones(3)), WATER)
-    assert motion.plan.loose is not None
+    assert motion.plan.between_fixed_atoms is not None
     motion.project_positions(WATER, WATER, time=0.0)
     x, v = WATER + 0.01, np.zeros((3, 3))
     kept = x.copy()
@@ -202,7 +202,7 @@ def test_a_bond_to_two_fixed_atoms_in_line_has_rank_one() -> None:
     rows = [held.FixedAtoms([0, 2]), held.LinearCombination([1, 0], [[1.0, 0, 0], [-1, 0, 0]])]
     rows.append(held.LinearCombination([1, 2], [[1.0, 0, 0], [-1, 0, 0]]))
     plan = planned(rows, x)
-    assert lines(plan) == [("mixed", 1, 2, 1)]
+    assert lines(plan) == [("SparseRows", 1, 2, 1)]
 
 
 def test_rank_is_that_of_the_dense_matrix() -> None:
@@ -226,7 +226,7 @@ def test_dependent_rows_are_eliminated_last():
         masses = rng.uniform(1.0, 20.0, 6)
         motion = Motion(ConstraintSet(held.Distance(pairs), x, masses), x)
         assert motion.rank == 12
-        assert motion.plan.late.sum() == 3
+        assert motion.plan.eliminate_last.sum() == 3
         lam = np.zeros(15)
         start = x + 1e-2 * rng.normal(size=x.shape)
         out = motion.project_positions(start, x, multipliers=lam)
@@ -242,9 +242,9 @@ def test_left_over_are_the_rows_that_are_conditioned_worst():
     x = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [5, 0, 0], [6, 0, 0], [5, 1, 0], [5, 0, 1]], float)
     pairs = [[i + base, j + base] for base in (0, 4) for i in range(4) for j in range(i)]
     rows = ConstraintSet([held.Distance(pairs)], x, np.ones(8))
-    late = np.zeros(12, bool)
-    assert ranked(rows, [np.arange(6), np.arange(6, 12)], np.ones(8), x, 0.0, late) == 11
-    assert late[:6].sum() == 1 and not late[6:].any()
+    eliminate_last = np.zeros(12, bool)
+    assert mark_dependent_rows(rows, [np.arange(6), np.arange(6, 12)], np.ones(8), x, 0.0, eliminate_last) == 11
+    assert eliminate_last[:6].sum() == 1 and not eliminate_last[6:].any()
 
 
 def test_many_small_clusters_are_counted_at_once():
@@ -253,7 +253,7 @@ def test_many_small_clusters_are_counted_at_once():
     straight = np.array([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 0, 0]])
     x = np.concatenate([water, water + 3.0, straight + 6.0])
     atoms = np.arange(9).reshape(3, 3)
-    shape = Shape("lanes", np.arange(9).reshape(3, 3), 3, False, atoms, np.array([[0, 1], [0, 2], [1, 2]]))
+    shape = Shape("SmallClusters", np.arange(9).reshape(3, 3), 3, False, atoms, np.array([[0, 1], [0, 2], [1, 2]]))
     assert rank_of_small(shape, np.ones(9), x, None) == 8
     wrapped = np.where(np.arange(9)[:, None] % 2, x + np.array([20.0, 0, 0]), x)
     lattice = np.stack([np.eye(3) * 20.0, np.eye(3) / 20.0])

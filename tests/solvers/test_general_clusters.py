@@ -62,7 +62,7 @@ def test_ten_thousand_particles_on_a_surface_are_one_batch() -> None:
     whole = ConstraintSet(row, x, rng.uniform(1, 9, n))
     motion = Motion(whole, x)
     (kind,) = motion.plan.kinds
-    assert (kind.solver, kind.clusters, kind.rows, kind.rank) == ("general", n, n, n)
+    assert (kind.solver, kind.clusters, kind.rows, kind.rank) == ("GeneralClusters", n, n, n)
     (solver,) = motion.plan.solvers
     assert len(solver._batches) == 1
     step = 0.02 * rng.normal(size=x.shape)

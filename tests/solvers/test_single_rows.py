@@ -100,7 +100,7 @@ def test_what_cannot_move_is_not_counted_or_moved():
     x = np.array([[2.0, 0, 0], [0, 0, 0.0], [0, 3.0, 0], [5.0, 5.0, 5.0]])
     rows = [FixedAtoms([0]), CenterDistance([0], [1]), Torus(2, [0, 0, 0], [0, 0, 1.0], 2.0)]
     motion = Motion(ConstraintSet(rows, x, [1.0, 2.0, 3.0, 4.0]), x)
-    assert [line.solver for line in motion.plan.kinds] == ["single"] and motion.rank == 5
+    assert [line.solver for line in motion.plan.kinds] == ["SingleRows"] and motion.rank == 5
     y = motion.project_positions(x + 0.1, x)
     assert np.array_equal(y[0], x[0])
     assert np.linalg.norm(y[1] - y[0]) == pytest.approx(2.0, abs=1e-15)

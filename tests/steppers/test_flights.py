@@ -104,7 +104,7 @@ def test_flights_are_those_of_dense_algebra(make, h) -> None:
 @pytest.mark.parametrize("make", [skate, pivoting_skate, wheel])
 def test_velocity_rows_at_rest_go_through_the_compiled_stage(make) -> None:
     system, state = make()
-    assert [solver.name for solver in system.motion.plan.solvers] == ["mixed"]
+    assert [solver.name for solver in system.motion.plan.solvers] == ["SparseRows"]
     assert system.packed is not None
     one = run(system, state, 0.02, 5)
     slow = make()[0]

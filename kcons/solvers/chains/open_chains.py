@@ -57,7 +57,7 @@ class Chains(SimdClusterSolver):
         Groups of eight lanes that a sweep goes through.
     """
 
-    name = "chain"
+    name = "Chains"
     _kernel = staticmethod(project)
 
     def __init__(

@@ -64,11 +64,11 @@ class SparseDistances(CalledSolver):
     lengths : ndarray, shape (n_rows,)
     inverse_masses : ndarray, shape (n_atoms,)
         0 for atoms of infinite mass.
-    late : ndarray of bool, shape (n_rows,), optional
+    eliminate_last : ndarray of bool, shape (n_rows,), optional
         Rows that depend on the others of their cluster, see `make_pattern`.
     """
 
-    name = "sparse"
+    name = "SparseDistances"
     ways = False, True
 
     def __init__(
@@ -77,14 +77,14 @@ class SparseDistances(CalledSolver):
         pairs: IntArray,
         lengths: FloatArray,
         inverse_masses: FloatArray,
-        late: NDArray[np.bool_] | None = None,
+        eliminate_last: NDArray[np.bool_] | None = None,
     ) -> None:
-        self._made_of = rows, pairs, lengths, inverse_masses, late
+        self._made_of = rows, pairs, lengths, inverse_masses, eliminate_last
         atoms, local = np.unique(pairs, return_inverse=True)
         local = local.reshape(pairs.shape)
         keep = inverse_masses[atoms][local] > 0
         row_start = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
-        pattern = make_pattern(row_start, local[keep].astype(np.int64), len(atoms), late)
+        pattern = make_pattern(row_start, local[keep].astype(np.int64), len(atoms), eliminate_last)
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
         numbered, atom_start, ends = plain_if_small(_number_atoms, len(pairs))(

@@ -65,7 +65,7 @@ class Pattern:
 
 
 def make_pattern(
-    row_start: IntArray, row_atoms: IntArray, n_atoms: int, late: NDArray[np.bool_] | None = None
+    row_start: IntArray, row_atoms: IntArray, n_atoms: int, eliminate_last: NDArray[np.bool_] | None = None
 ) -> Pattern:
     """Order the rows and find the pattern of their factors.
 
@@ -76,7 +76,7 @@ def make_pattern(
         through which rows are coupled: atoms of infinite mass are left out.
     n_atoms : int
         Number of atoms.
-    late : ndarray of bool, optional
+    eliminate_last : ndarray of bool, optional
         Rows to be eliminated after all others: those that depend on them, whose pivots then vanish to rounding. In
         another order the rows before them may be nearly dependent, and what is left of their pivots is no longer small.
 
@@ -85,9 +85,11 @@ def make_pattern(
     UnsupportedError
         So many rows share an atom that the factors would not fit into memory.
     """
-    late = np.zeros(len(row_start) - 1, np.bool_) if late is None else late
+    eliminate_last = np.zeros(len(row_start) - 1, np.bool_) if eliminate_last is None else eliminate_last
     size = int(np.sum(np.bincount(row_atoms) ** 2)) if len(row_atoms) else 0
-    position, struct_start, struct = plain_if_small(_minimum_degree, size)(row_start, row_atoms, n_atoms, late)
+    position, struct_start, struct = plain_if_small(_minimum_degree, size)(
+        row_start, row_atoms, n_atoms, eliminate_last
+    )
     sizes = np.diff(struct_start).astype(np.float64)
     updates = float(np.sum(sizes * (sizes - 1) / 2))
     if updates > MOST_UPDATES:
@@ -101,7 +103,7 @@ def make_pattern(
 
 
 @njit(cache=True)
-def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-untyped-def]
+def _minimum_degree(row_start, row_atoms, n_atoms, eliminate_last):  # type: ignore[no-untyped-def]
     """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""
     n = len(row_start) - 1
     atom_start, atom_rows = _rows_of_atoms(row_start, row_atoms, n_atoms)
@@ -127,13 +129,14 @@ def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-unt
                     count[k] += 1
         room[k] = count[k]
 
-    # Doubly linked buckets of rows by degree, then of late ones; first in, first out peels all ends of a tree evenly.
+    # Doubly linked buckets of rows by degree, then of those that come last; first in, first out peels all ends of a
+    # tree evenly.
     head = np.full(2 * n + 2, -1, np.int32)
     tail = np.full(2 * n + 2, -1, np.int32)
     following = np.full(n, -1, np.int32)
     preceding = np.full(n, -1, np.int32)
     for k in range(n):
-        _push(head, tail, following, preceding, count[k] + (n + 1) * late[k], k)
+        _push(head, tail, following, preceding, count[k] + (n + 1) * eliminate_last[k], k)
     position = np.full(n, -1, np.int64)
     struct_start = np.zeros(n + 1, np.int64)
     struct = np.empty(max(16, 4 * n), np.int32)
@@ -189,7 +192,7 @@ def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-unt
                     new += 1
             count[i] = new
             if new != old:
-                behind = (n + 1) * late[i]
+                behind = (n + 1) * eliminate_last[i]
                 _unlink(head, tail, following, preceding, old + behind, i)
                 _push(head, tail, following, preceding, new + behind, i)
                 if new + behind < lowest:

@@ -77,11 +77,11 @@ class SparseRows(CalledSolver):
         Row numbers, sorted; whole clusters only.
     inverse_masses : ndarray, shape (n_atoms,)
         0 for atoms of infinite mass.
-    late : ndarray of bool, shape (len(rows),), optional
+    eliminate_last : ndarray of bool, shape (len(rows),), optional
         Rows that depend on the others of their cluster, see `make_pattern`.
     """
 
-    name = "mixed"
+    name = "SparseRows"
     ways = False, True
 
     def __init__(
@@ -89,7 +89,7 @@ class SparseRows(CalledSolver):
         constraint_set: ConstraintSet,
         rows: IntArray,
         inverse_masses: FloatArray,
-        late: NDArray[np.bool_] | None = None,
+        eliminate_last: NDArray[np.bool_] | None = None,
     ) -> None:
         incidence = constraint_set.incidence[rows]
         start = incidence.indptr.astype(np.int64)
@@ -97,7 +97,7 @@ class SparseRows(CalledSolver):
         keep = inverse_masses[atoms] > 0
         counts = np.add.reduceat(keep, start[:-1]) if len(rows) else np.zeros(0, np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
-        pattern = make_pattern(starts, atoms[keep], constraint_set.n_atoms, late)
+        pattern = make_pattern(starts, atoms[keep], constraint_set.n_atoms, eliminate_last)
         order = pattern.order
         self.rows: IntArray = rows[order]
         widths = np.diff(start)[order]
@@ -111,7 +111,7 @@ class SparseRows(CalledSolver):
         # Row by row: its first entry, its first target, its first slot, its first parameter.
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:, 2] = pattern.start, pattern.target_start, slots
-        self._made_of = constraint_set, rows, inverse_masses, late
+        self._made_of = constraint_set, rows, inverse_masses, eliminate_last
         self._given = GivenRows(constraint_set, self.rows, 9 * int(widths.max(initial=0)) + 1)
         links[:-1, 3] = self._given.starts
         self.kernels, self.numbers = Kernels(_positions, _tangents, _apply), self._given.numbers

@@ -107,7 +107,7 @@ class PackedRows(NamedTuple):
 def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
-    if held.moving or plan.loose is not None or any(plan.whole):
+    if held.moving or plan.between_fixed_atoms is not None or any(plan.whole):
         return None
     if plan.driven and held.target(0.0)[~held.holonomic].any():
         return None
@@ -139,11 +139,11 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     if mixed and (held.images is not None or sum(len(each.rows) for each in mixed) > MOST_ROWS):
         return None
     # Solvers of their own, for the atoms of the whole system: those of the plan may be at work for another one.
-    called: list[Addressable] = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
+    called: list[Addressable] = [_solver_like(each, held, inverse_masses, plan.eliminate_last) for each in mixed]
     if len(others):
         pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64)
         numbers, lengths = np.arange(len(others)), held.target(0.0)[others]
-        called.append(SparseDistances(numbers, pairs, lengths, inverse_masses, plan.late[others]))
+        called.append(SparseDistances(numbers, pairs, lengths, inverse_masses, plan.eliminate_last[others]))
     if triangles is not None:
         called.append(triangles.packed())
     if chains is not None:
@@ -152,12 +152,12 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
 
 
 def _solver_like(
-    solver: ClusterSolver, held: ConstraintSet, inverse_masses: FloatArray, late: NDArray[np.bool_]
+    solver: ClusterSolver, held: ConstraintSet, inverse_masses: FloatArray, eliminate_last: NDArray[np.bool_]
 ) -> CalledSolver:
     rows = np.sort(solver.rows)
     if isinstance(solver, SingleRows):
         return SingleRows(held, rows, inverse_masses)
-    like = SparseRows(held, rows, inverse_masses, late[rows])
+    like = SparseRows(held, rows, inverse_masses, eliminate_last[rows])
     like.numbers[COUNT] = 1.0  # all positions here are the ends of flights
     return like
 

@@ -348,7 +348,7 @@ MUTANTS = [
     ),
     (
         "plan/rank.py",
-        "late[rows[order]] = left_over",
+        "eliminate_last[rows[order]] = left_over",
         "pass",
         "tests/plan/test_plan.py::test_dependent_rows_are_eliminated_last",
     ),

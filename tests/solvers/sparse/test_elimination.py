@@ -91,11 +91,11 @@ def test_few_rows_are_ordered_by_python_alike(monkeypatch) -> None:
         n, n_atoms = int(rng.integers(1, 25)), int(rng.integers(2, 25))
         members = [rng.choice(n_atoms, size=int(rng.integers(1, min(5, n_atoms + 1))), replace=False) for _ in range(n)]
         row_start, row_atoms = np.cumsum([0, *map(len, members)]), np.concatenate(members)
-        late = rng.random(n) < 0.2
+        eliminate_last = rng.random(n) < 0.2
         found = []
         for chosen in (lambda kernel, _: kernel, lambda kernel, _: kernel.py_func):
             monkeypatch.setattr(elimination, "plain_if_small", chosen)
-            pattern = make_pattern(row_start, row_atoms, n_atoms, late)
+            pattern = make_pattern(row_start, row_atoms, n_atoms, eliminate_last)
             triples = make_triples(pattern.start, pattern.columns, row_start, row_atoms, np.ones(n_atoms))
             found.append([*vars(pattern).values(), *triples])
         for one, two in zip(*found, strict=True):

@@ -169,10 +169,10 @@ def test_dependent_rows_may_miss_by_some_roundings(apart, converged):
     target = float(ConstraintSet(angle, x, np.ones(3)).target(0.0)[0])
     rows = [Distance([[0, 1]]), Angle([[0, 1, 2]], target), Angle([[2, 1, 0]], target * (1 + apart))]
     whole = ConstraintSet(rows, x, np.ones(3))
-    late = np.array([False, False, True])
+    eliminate_last = np.array([False, False, True])
     moved = x + 0.01 * np.random.default_rng(0).normal(size=x.shape)
     before = moved.copy()
-    outcome = SparseRows(whole, np.arange(3), np.ones(3), late).positions(Request(moved, x))
+    outcome = SparseRows(whole, np.arange(3), np.ones(3), eliminate_last).positions(Request(moved, x))
     assert outcome.converged == converged
     if converged:
         assert np.all(np.abs(whole.value(moved)) <= 4 * np.sqrt(3) * whole.tolerance(moved))
