@@ -21,15 +21,14 @@ from typing import Any
 
 from kcons.constraints import compilation as compilation  # before any kernel is declared
 from kcons.constraints.collective import CenterDistance, CenterOfMass, RadiusOfGyration
-from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.functions.custom import Custom, ImplicitSurface
-from kcons.constraints.functions.formula import Formula
-from kcons.constraints.functions.velocity_formula import VelocityFormula
+from kcons.constraints.constraint import FAMILIES, Constraint, RowKind
+from kcons.constraints.functions.custom import Custom, CustomVelocity, ImplicitSurface
+from kcons.constraints.functions.formula import Formula, VelocityFormula
 from kcons.constraints.internal import Angle, Dihedral, Distance, DistanceDifference
 from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
 from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
 from kcons.constraints.target import MovingTarget
-from kcons.constraints.velocity import CustomVelocity, KnifeEdge, LinearVelocity, Rolling
+from kcons.constraints.velocity import KnifeEdge, LinearVelocity, Rolling
 from kcons.errors import InputError
 
 __all__ = [
@@ -63,13 +62,6 @@ __all__ = [
     "from_dict",
 ]
 
-_PUBLIC = [globals()[name] for name in __all__ if name in globals()]
-FAMILIES: dict[str, type[Constraint]] = {
-    each.family: each
-    for each in _PUBLIC
-    if isinstance(each, type) and issubclass(each, Constraint) and each is not Constraint
-}
-
 
 def from_dict(data: Mapping[str, Any]) -> Constraint:
     """Rebuild what `Constraint.todict` wrote.
@@ -77,7 +69,7 @@ def from_dict(data: Mapping[str, Any]) -> Constraint:
     Raises
     ------
     InputError
-        If the family is unknown or an entry is missing, unknown or of the wrong shape.
+        If the family is unknown or an entry is missing or unknown.
     """
     try:
         family = FAMILIES[data["family"]]

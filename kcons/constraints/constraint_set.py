@@ -373,7 +373,7 @@ def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> N
     start = 0
     held = np.zeros(len(x), dtype=bool)
     for item in given:
-        if item.family == "FixedAtoms":
+        if item.fixes_atoms:
             held[item.atoms[item.atoms < len(x)]] = True
     for item in given:
         atoms = item.atoms
@@ -456,7 +456,7 @@ def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]
     if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
         return same
     same = np.all(item.atoms == wanted.atoms[k], axis=1)
-    if wanted.family == "Distance":
+    if wanted.holds_length:
         same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
     for data in item.per_row:
         ours, theirs = getattr(item, data), getattr(wanted, data)[k]

@@ -68,7 +68,7 @@ def found_as_given(items: Sequence[Constraint], found: Sequence[bool], time: flo
     time : float
     """
     result = list(items)
-    numbers = [n for n, item in enumerate(items) if item.family == "Distance" and not item.moving]
+    numbers = [n for n, item in enumerate(items) if item.holds_length and not item.moving]
     if not any(found[n] for n in numbers) or all(found[n] for n in numbers):
         return result
     pairs = np.concatenate([np.sort(items[n].atoms, axis=1) for n in numbers])

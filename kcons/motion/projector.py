@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_multipliers, check_out, finite_number, refuse_other
+from kcons.constraints.arguments import as_array, check_out, finite_number, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -206,7 +206,7 @@ class Projector:
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
             inv_dt = 1.0 / float(dt)  # type: ignore[arg-type]
         if multipliers is not None:
-            check_multipliers(multipliers, self.constraint_set.n_rows)
+            check_out(multipliers, (self.constraint_set.n_rows,), "multipliers")
         if type(time) is not float or not isfinite(time):
             time = finite_number(time, "time")
         reference_time = time if reference_time is None else finite_number(reference_time, "reference_time")
@@ -258,7 +258,7 @@ class Projector:
         if out is not None:
             check_out(out, self._shape)
         if multipliers is not None:
-            check_multipliers(multipliers, self.constraint_set.n_rows)
+            check_out(multipliers, (self.constraint_set.n_rows,), "multipliers")
         self.cell()
         atoms = self._atoms
         if atoms is None:

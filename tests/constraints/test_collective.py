@@ -104,7 +104,7 @@ def test_bad_groups_are_refused(make, message):
 
 def test_undefined_gradients_are_refused():
     x = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, -1.0, 0]])
-    with pytest.raises(SingularGeometryError, match=r"two centres of row 0.*coincide"):
+    with pytest.raises(SingularGeometryError, match=r"two centers of row 0.*coincide"):
         ConstraintSet([CenterDistance([0, 1], [2, 3])], x, np.ones(5))
     with pytest.raises(SingularGeometryError, match=r"all atoms of row 0.*coincide"):
         ConstraintSet([RadiusOfGyration([3, 4])], x, np.ones(5))

@@ -177,7 +177,7 @@ def test_dihedral_over_collinear_atoms_is_refused(three):
 
 def test_coincident_atoms_are_named():
     x = np.array([[1.0, 2, 3], [1, 2, 3], [0, 0, 1], [0, 1, 0]])
-    with pytest.raises(SingularGeometryError, match=r"atoms 0 and 1 coincide: distance gradient undefined \(row 1\)"):
+    with pytest.raises(SingularGeometryError, match=r"atoms 0 and 1 coincide: distance gradient undefined \(row 1"):
         ConstraintSet([Distance([[2, 3], [0, 1]])], x, np.ones(4))
     with pytest.raises(SingularGeometryError, match="atoms 0 and 1 coincide: gradient of row 0, Angle"):
         ConstraintSet([Angle([[0, 1, 2]])], x, np.ones(4))

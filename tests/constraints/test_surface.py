@@ -105,11 +105,11 @@ def test_moving_radius_enters_the_right_hand_sides():
 @pytest.mark.parametrize(
     ("item", "point", "message"),
     [
-        (Sphere(0, [1.0, 2.0, 3.0]), [1.0, 2.0, 3.0], "atom 0 lies at the centre of the sphere.*row 0"),
+        (Sphere(0, [1.0, 2.0, 3.0]), [1.0, 2.0, 3.0], "atom 0 lies at the center of the sphere.*row 0"),
         (Cylinder(0, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]), [0.0, 0.0, 3.0], "atom 0 lies on the axis of the cylinder"),
         (Torus(0, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2.0), [0.0, 0.0, 1.0], "atom 0 lies on the axis or on the core"),
         (Torus(0, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2.0), [2.0, 0.0, 0.0], "atom 0 lies on the axis or on the core"),
-        (Ellipsoid(0, [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]), [0.0, 0.0, 0.0], "atom 0 lies at the centre of the ellipsoid"),
+        (Ellipsoid(0, [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]), [0.0, 0.0, 0.0], "atom 0 lies at the center of the ellipsoid"),
     ],
 )
 def test_points_without_a_gradient_are_refused(item, point, message):
@@ -127,7 +127,7 @@ def test_points_without_a_gradient_are_refused(item, point, message):
         (lambda: Sphere([0, 1], [[0.0, 0.0, 0.0]] * 3), r"center has shape \(3, 3\)"),
         (lambda: Sphere(0, [np.inf, 0.0, 0.0]), "center of row 0 is not finite"),
         (lambda: Torus(0, [0.0] * 3, [0.0, 0.0, 1.0], -2.0), "major_radius -2 is not positive"),
-        (lambda: Ellipsoid(0, [0.0] * 3, [1.0, -1.0, 1.0]), "semi-axes must be positive"),
+        (lambda: Ellipsoid(0, [0.0] * 3, [1.0, -1.0, 1.0]), "semi_axes -1 is not positive"),
         (lambda: Ellipsoid(0, [0.0] * 3, [1.0] * 3, 2 * np.eye(3)), "columns of rotation are not orthonormal"),
         (lambda: Line([0, 1], [[0.0] * 3] * 3, [0.0, 0.0, 1.0]), r"point has shape \(3, 3\); give \(3,\) or \(2, 3\)"),
         (lambda: Line(0, [0.0, np.nan, 0.0], [0.0, 0.0, 1.0]), "point is not finite"),

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from kcons.constraints.vectors import cross, dot, first_true, norm, unit
+from kcons.constraints.arguments import unit
+from kcons.constraints.vectors import cross, dot, first_true, norm
 from kcons.errors import InputError
 
 

@@ -119,7 +119,7 @@ def test_directions_that_do_not_exist():
         (lambda: KnifeEdge([0, 1], [2], [0.0, 0.0, 1.0]), "give one pair a row"),
         (lambda: Rolling(0, 1, 0.0, [1.0, 0.0, 0.0]), "radius 0 is not positive"),
         (lambda: Rolling(0, 1, 1.0, [0.0, 0.0, 1.0]), "heading is normal to the ground"),
-        (lambda: CustomVelocity([0], [[1.0, 0.0, 0.0]]), "must be a function; see LinearVelocity"),
+        (lambda: CustomVelocity([0], [[1.0, 0.0, 0.0]]), "coefficients is .*; give a function of r"),
         (lambda: CustomVelocity([0], lambda r: r, time_step=0.0), "time_step is 0.0; give a positive number"),
         (
             lambda: CustomVelocity([0], lambda r: r[0]).gradient(np.ones((1, 1, 3)), 0.0),

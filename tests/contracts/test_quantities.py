@@ -13,7 +13,18 @@ from openmm import Vec3, unit
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities
 from kcons.constraints import FAMILIES, Angle, CustomVelocity, Dihedral, Distance, MovingTarget, Sphere, from_dict
-from kcons.constraints.arguments import ANGLE, ANY, ARGUMENTS, DIRECTION, LENGTH, MD_UNITS, NUMBER, SPEED, TIME
+from kcons.constraints.arguments import (
+    ANGLE,
+    ANY,
+    DIRECTION,
+    HELD,
+    LENGTH,
+    MD_UNITS,
+    NUMBER,
+    SPEED,
+    TIME,
+    rules_of,
+)
 from kcons.errors import InputError
 
 nm, angstrom, fs = unit.nanometer, unit.angstrom, unit.femtosecond
@@ -104,7 +115,8 @@ WRONG = {LENGTH: unit.kelvin, ANGLE: nm, SPEED: nm, TIME: nm, NUMBER: nm}
 
 
 def kind_of(family, name):
-    return family.held if name == "target" else ARGUMENTS[name]
+    kind = rules_of(family.__init__.__wrapped__)[name][0]
+    return family.held if kind is HELD else kind
 
 
 def measured(family):

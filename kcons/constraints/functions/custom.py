@@ -1,28 +1,40 @@
-"""Coordinates given by Python functions: implicit surfaces and any collective variable."""
+"""Rows given by Python functions, or by functions that Numba has compiled."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from functools import cache
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, TAKES_TIME, atom_array, check_call, lent, numbers, positive
+from kcons.constraints.arguments import (
+    ANY,
+    LENGTH,
+    TAKES_TIME,
+    Duration,
+    FloatArray,
+    atom_column,
+    check_call,
+    lent,
+    numbers,
+    positive,
+    unit,
+)
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
     WRONG,
-    FloatArray,
     Target,
     contradiction,
+    exact_step,
     first_derivative,
     first_derivative_4,
     nearest_image,
     second_derivative,
 )
+from kcons.constraints.velocity import VelocityRows
 from kcons.errors import InputError
 
 _FLOAT = np.dtype(np.float64)
@@ -30,8 +42,57 @@ _FLOAT = np.dtype(np.float64)
 _PLACES = (1, -1, 2, -2)
 _DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
 
+_Length: TypeAlias = Annotated[float | None, LENGTH, positive]
+_Period: TypeAlias = Annotated[float | None, ANY, positive]
 
-class FunctionRows(Constraint):
+
+class PythonRows(Constraint, base=True):
+    """Rows of functions, called once a row; what is not given is taken by differences."""
+
+    held = ANY
+    time_dependent: bool
+
+    @property
+    def moving(self) -> bool:
+        return super().moving or self.time_dependent
+
+    @property
+    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+        """The functions that kernels call where Numba has compiled all of them: value and gradient, or coefficients."""
+        raise NotImplementedError
+
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        """Gradient, or coefficients, of row `k` alone, shape (width, 3), at an `r` that cannot be changed."""
+        raise NotImplementedError
+
+    def _time(self, time: float) -> tuple[float, ...]:
+        return (time,) if self.time_dependent else ()
+
+    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
+        """Results of a user's function for all rows, shape (n_rows, *shape)."""
+        out = np.empty((self.n_rows, *shape))
+        for k in range(self.n_rows):
+            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
+            out[k] = self._checked(found, k, name, shape)
+        return out
+
+    def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
+        """What a function returned for row `k`, as float64 of that shape."""
+        if type(found) is float and not shape:
+            return found
+        if type(found) not in (np.ndarray, np.float64) or found.dtype is not _FLOAT:
+            found = numbers(found, f"{self.row_name(k)}: {name}")
+        if found.shape != shape:
+            raise InputError(
+                f"{self.family}: {name} returned shape {found.shape} for row {k}; it must return "
+                f"{shape if shape else 'one number'}",
+                item=name,
+                atoms=self.atoms[k].tolist(),
+            )
+        return found
+
+
+class FunctionRows(PythonRows, base=True):
     """Rows whose coordinate and gradient are Python functions.
 
     What is not given is taken by central differences: the gradient from four values a coordinate, order four, at steps
@@ -40,11 +101,9 @@ class FunctionRows(Constraint):
     (about ten digits); time derivatives by eighth-order formulas with step `time_step`.
     """
 
-    held = ANY
     kind = RowKind.FUNCTION
-    #: Whether the functions take one row at a time.
-    by_row: ClassVar[bool] = True
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
+    singular = "{row}: value and gradient must be finite, and the gradient not zero; move the atoms"
 
     def __init__(
         self,
@@ -59,35 +118,26 @@ class FunctionRows(Constraint):
         time_step: float,
     ) -> None:
         super().__init__(atoms, target)
-        for name, given in (("function", function), ("gradient", gradient)):
-            if not callable(given) and (given is not None or name == "function"):
-                raise InputError(f"{self.family}: {name} must be a function, not {given!r:.60}", item=name)
         timed = bool(time_dependent) or time_derivatives is not None
         last = ("t",) if timed else ()
-        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME)
+        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME, needed=True)
         check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
         check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
         check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
-        if length is not None:
-            positive(length, f"{self.family}: length")
         self.function = function
         self.gradient_function = gradient
         self.hessian_vector = hessian_vector
         self.time_derivatives = time_derivatives
         self.time_dependent = timed
         self.length = length
-        self.time_step = positive(time_step, f"{self.family}: time_step")
+        self.time_step = time_step
 
     @property
-    def moving(self) -> bool:
-        return super().moving or self.time_dependent
+    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+        return self.function, self.gradient_function
 
-    @abstractmethod
-    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        """Results of a user's function for all rows, shape (n_rows, *shape)."""
-
-    def _time(self, time: float) -> tuple[float, ...]:
-        return (time,) if self.time_dependent else ()
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        return self.measure(r, time), self.gradient(r, time)
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         return self._call(self.function, "function", (), r, *self._time(time))
@@ -118,7 +168,6 @@ class FunctionRows(Constraint):
         return found if isinstance(found, float) else float(self._checked(found, k, "function", ()))
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
-        """Gradient of row `k` alone, shape (width, 3); for kernels."""
         if self.gradient_function is None:
             return self._differenced_row(k, r, time)
         found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
@@ -134,21 +183,6 @@ class FunctionRows(Constraint):
         if self.period is not None:
             values = nearest_image(values - values[0], self.period)
         return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
-
-    def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
-        """What a function returned for row `k`, as float64 of that shape."""
-        if type(found) is float and not shape:
-            return found
-        if type(found) not in (np.ndarray, np.float64) or found.dtype is not _FLOAT:
-            found = numbers(found, f"{self.row_name(k)}: {name}")
-        if found.shape != shape:
-            raise InputError(
-                f"{self.family}: {name} returned shape {found.shape} for row {k}; it must return "
-                f"{shape if shape else 'one number'}",
-                item=name,
-                atoms=self.atoms[k].tolist(),
-            )
-        return found
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         if self.hessian_vector is None:
@@ -184,10 +218,6 @@ class FunctionRows(Constraint):
         mixed = first_derivative(lambda t: _contract(self.gradient(r, t), v), time, h) if v.any() else 0.0
         return rate, 2 * mixed + second
 
-    def scale(self, time: float = 0.0) -> FloatArray:
-        # The unit of the function is unknown: the set takes the size of the positions.
-        return np.zeros(self.n_rows)
-
     def _length(self, r: FloatArray) -> FloatArray:
         """Length over which the coordinate varies: as given, the spread of the atoms, or 1."""
         if self.length is not None:
@@ -199,19 +229,11 @@ class FunctionRows(Constraint):
         return np.where(spread > 0, spread, 1.0)
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        super().check(r, time, first_row)
         if self.n_rows == 0:
             return
-        value, slope = self.measure(r, time), self.gradient(r, time)
+        slope = self.gradient(r, time)
         size = np.sqrt(_contract(slope, slope))
-        self.refuse_singular(
-            ~(np.isfinite(value) & np.isfinite(size) & (size > 0)),
-            first_row,
-            lambda k, row: (
-                f"{row}: value {value[k]:g} and norm of the gradient {size[k]:g} at atoms "
-                f"{self.atoms[k, :6].tolist()}; the gradient must be finite and not zero. Move the atoms, or use "
-                "another coordinate"
-            ),
-        )
         # A wrong derivative would give wrong motion without any other sign.
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
@@ -329,9 +351,7 @@ class ImplicitSurface(FunctionRows):
     Raises
     ------
     InputError
-        Results of the wrong shape; when put into a set, a gradient or Hessian that contradicts the function.
-    SingularGeometryError
-        When put into a set, a gradient that is zero or not finite.
+        When put into a set, a gradient or Hessian that contradicts the function.
 
     Examples
     --------
@@ -348,9 +368,7 @@ class ImplicitSurface(FunctionRows):
     True
     """
 
-    family = "ImplicitSurface"
     row_width = 1
-    by_row = False
 
     def __init__(
         self,
@@ -362,13 +380,17 @@ class ImplicitSurface(FunctionRows):
         *,
         time_dependent: bool = False,
         time_derivatives: Callable[..., Any] | None = None,
-        length: float | None = None,
-        time_step: float = 0.02,
+        length: _Length = None,
+        time_step: Duration = 0.02,
     ) -> None:
-        column = atom_array(atoms, self.family).reshape(-1, 1)
+        column = atom_column(atoms, self.family)
         super().__init__(
             column, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
         )
+
+    @property
+    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+        return (None,)  # they take all rows at once
 
     @property
     def kind(self) -> RowKind:  # type: ignore[override]
@@ -432,12 +454,8 @@ class Custom(FunctionRows):
     Raises
     ------
     InputError
-        Results of the wrong shape; when put into a set, a gradient or Hessian that contradicts the function.
-    SingularGeometryError
-        When put into a set, a gradient that is zero or not finite.
+        When put into a set, a gradient or Hessian that contradicts the function.
     """
-
-    family = "Custom"
 
     def __init__(
         self,
@@ -450,22 +468,125 @@ class Custom(FunctionRows):
         *,
         time_dependent: bool = False,
         translation_invariant: bool = False,
-        period: float | None = None,
-        length: float | None = None,
-        time_step: float = 0.02,
+        period: _Period = None,
+        length: _Length = None,
+        time_step: Duration = 0.02,
     ) -> None:
         super().__init__(
             atoms, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
         )
         self.translation_invariant = bool(translation_invariant)
-        self.period = None if period is None else positive(period, "Custom: period")
+        self.period = period
 
-    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        out = np.empty((self.n_rows, *shape))
+
+class CustomVelocity(PythonRows, VelocityRows):
+    """A row whose coefficients are a function, called once a row.
+
+    Parameters
+    ----------
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row.
+    coefficients : callable
+        ``coefficients(r) -> (width, 3)`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``. It must
+        depend on nothing else. Where Numba has compiled it, kernels call it without Python.
+    derivative : callable, optional
+        ``derivative(r, v) -> (width, 3)``, the time derivative of the coefficients along the motion; with
+        `time_dependent`, ``(r, v, t)``, and the explicit time derivative included. Without it the coefficients
+        are differenced along the motion, order four: about eleven digits.
+    target : float, array_like, callable of time, or MovingTarget
+        What the row is held at, 0 by default.
+    time_dependent : bool
+        Whether the functions take the time as their last argument.
+    translation_invariant : bool
+        Whether only differences of positions count; then minimum images apply in periodic cells.
+    length, time_step : float
+        Differences are taken at steps of at most 1e-3 `length`, and, with `time_dependent`, of `time_step`.
+    """
+
+    singular = "{row}: the coefficients are zero or not finite; move the atoms"
+    functions: ClassVar[tuple[str, ...]] = ("coefficients", "derivative")
+
+    def __init__(
+        self,
+        atoms: ArrayLike,
+        coefficients: Callable[..., Any],
+        derivative: Callable[..., Any] | None = None,
+        target: Target = 0.0,
+        *,
+        time_dependent: bool = False,
+        translation_invariant: bool = False,
+        length: _Length = 1.0,
+        time_step: Duration = 1e-3,
+    ) -> None:
+        super().__init__(atoms, target)
+        last = ("t",) if time_dependent else ()
+        check_call("CustomVelocity: coefficients", coefficients, ("r", *last), TAKES_TIME, needed=True)
+        check_call("CustomVelocity: derivative", derivative, ("r", "v", *last), TAKES_TIME)
+        self.coefficients = coefficients
+        self.derivative = derivative
+        self.time_dependent = bool(time_dependent)
+        self.translation_invariant = bool(translation_invariant)
+        self.length = length
+        self.time_step = time_step
+
+    @property
+    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+        return (self.coefficients,)
+
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        shape = (self.width, 3)
+        return np.zeros(self.n_rows), self._call(self.coefficients, "coefficients", shape, r, *self._time(time))
+
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        found = self.coefficients(lent(r), *self._time(time))
+        return np.asarray(self._checked(found, k, "coefficients", (self.width, 3)))
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        bent = [self._changes(k, r[k], v[k], time) for k in range(self.n_rows)]
+        return _contract(np.array(bent).reshape(v.shape), v)
+
+    def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        """Rate of the coefficients of row `k` along v."""
+        if self.derivative is not None:
+            found = self.derivative(lent(r), lent(v), *self._time(time))
+            return np.asarray(self._checked(found, k, "derivative", r.shape))
+        speed = float(np.sqrt(np.sum(v * v)))
+        if speed == 0:
+            return np.zeros_like(r)
+        step = 1e-3 * self.length / speed
+        if self.time_dependent:
+            step = exact_step(min(step, self.time_step), time)
+        return first_derivative_4(lambda s: self.row_gradient(k, r + s * v, time + s), 0.0, step)
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        super().check(r, time, first_row)
+        if self.derivative is None:
+            return
+        # A wrong derivative would give wrong motion without any other sign.
+        along = self.length * unit(np.random.default_rng(0).normal(size=(self.width, 3)), "along")
         for k in range(self.n_rows):
-            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
-            out[k] = self._checked(found, k, name, shape)
-        return out
+            self._check_derivative(k, r[k], along, 0.01, time, first_row)
+            if self.time_dependent:
+                self._check_derivative(k, r[k], np.zeros_like(along), self.time_step, time, first_row)
+
+    def _check_derivative(
+        self, k: int, r: FloatArray, v: FloatArray, time_step: float, time: float, first_row: int
+    ) -> None:
+        found = contradiction(
+            lambda s: self._changes(k, r + s * v, v, time + s),
+            lambda s: self.row_gradient(k, r + s * v, time + s),
+            0.0,
+            time_step,
+        )
+        if found is not None:
+            atom, axis = divmod(found.number, 3)
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: derivative gives {found.given:.6g} for {'xyz'[axis]} of its "
+                f"atom {self.atoms[k, atom]}, but differences of the coefficients give {found.found:.6g}; correct it, "
+                "or leave it out",
+                item="derivative",
+                atoms=self.atoms[k].tolist(),
+            )
 
 
 @cache

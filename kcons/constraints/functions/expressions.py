@@ -305,7 +305,7 @@ class Code:
         ``row(r, p, t, out)`` for `kcons.solvers.sparse.row_functions`, to be compiled.
     first : callable
         Value and gradient of all rows: of the coordinates, the time and the parameters, an array each. Of velocities
-        their coefficients.
+        of where a flight ends: of the coordinates in its middle, the way, the time and the parameters.
     second : callable
         v^T (d2q/dr2) v, dq/dt and 2 (d2q/dr dt) . v + d2q/dt2, of the coordinates, the velocities, the time and the
         parameters. Of velocities v . (d coefficients/dt).
@@ -434,22 +434,19 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
         return "\n".join([f"def {name}({', '.join(arguments)}):", *lines, f"    return ({shown},)\n"])
 
     # Of velocities: of where a flight ends, see `kcons.solvers.sparse.row_functions`.
-    used = "flight" if linear else "first"
+    ends = [part + bent / 2 for part, bent in zip(slope, steep, strict=True)] if linear else slope
     places = [f"r[{k}]" for k in range((6 if linear else 3) * width)] + ["t"]
     places += [f"p[{k}]" for k in range(len(parameters))]
-    row = ["def row(r, p, t, out):", f"    found = {used}({', '.join(places)})"]
+    row = ["def row(r, p, t, out):", f"    found = first({', '.join(places)})"]
     row += [f"    out[{k}] = found[{k}]" for k in range(3 * width + 1)]
     names = ", ".join(sorted({*FUNCTIONS, "copysign"} - {"abs"}))
     head = f"# Written by kcons for {formula!r}.\nfrom math import {names}\n\nimport numba\n"
     flags = '@numba.njit(fastmath={"contract", "arcp", "nsz"}, error_model="numpy")'
-    ahead = [part + bent / 2 for part, bent in zip(slope, steep, strict=True)]
-    flight = flags + "\n" + function("flight", [*axes, *speeds, "t", *parameters], [value, *ahead])
     return "\n\n".join(
         [
             head,
             f"INVARIANT, MOVING = {invariant}, {value.has(t)}",
-            flags + "\n" + function("first", [*axes, "t", *parameters], slope if linear else [value, *slope]),
-            *([flight] if linear else []),
+            flags + "\n" + function("first", [*axes, *(speeds if linear else []), "t", *parameters], [value, *ends]),
             function("second", [*axes, *speeds, "t", *parameters], second),
             "\n".join(row) + "\n",
         ]

@@ -178,10 +178,10 @@ MUTANTS = [
         "tests/solvers/sparse/test_row_values.py::test_rows_with_a_period_miss_by_the_shorter_way",
     ),
     (
-        "solvers/sparse/row_functions.py",
+        "constraints/internal.py",
         "hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)",
         "hb = -(hx * gx + hy * gy + hz * gz) / (b2 * size)",
-        "tests/solvers/sparse/test_row_values.py::test_rows_equal_their_constraints",
+        "tests/constraints/test_constraint.py::test_gradient_and_curvature_by_taylor_remainder[Dihedral-0]",
     ),
     (
         "solvers/sparse/row_values.py",
@@ -197,10 +197,10 @@ MUTANTS = [
         "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
     ),
     (
-        "solvers/sparse/row_functions.py",
+        "constraints/surface.py",
         "f, g = h / (rho * q), up / q",
         "f, g = h / rho, up / q",
-        "tests/solvers/test_single_rows.py::test_rows_agree_with_the_dense_solver[Torus-open]",
+        "tests/constraints/test_constraint.py::test_gradient_and_curvature_by_taylor_remainder[Torus-0]",
     ),
     (
         "solvers/sparse/row_functions.py",
