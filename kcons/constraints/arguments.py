@@ -109,7 +109,7 @@ def kept(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
+def check_out(out: FloatArray, shape: tuple[int, ...], item: str = "out") -> None:
     """Refuse arrays that results cannot be written into.
 
     Raises
@@ -464,8 +464,8 @@ def rules_of(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
     for name in list(inspect.signature(function).parameters)[1:]:
         hint = hints.get(name)
         said = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)  # or None
-        kind, *rules = (*getattr(said, "__metadata__", ()), NUMBER)
-        found[name] = (kind, *rules[:-1]) if isinstance(kind, Kind) else (NUMBER, kind, *rules[:-1])
+        told: tuple[Any, ...] = getattr(said, "__metadata__", ())
+        found[name] = told if told and isinstance(told[0], Kind) else (NUMBER, *told)
     return found
 
 

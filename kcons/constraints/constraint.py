@@ -89,7 +89,7 @@ class Constraint:
     #: ... of the atoms of one row in the same order, of its `parameters`, ``p[0]``, ... and of the time t. Written with
     #: + - * /, ``numpy.sqrt`` and the like, so that it can be compiled, and takes arrays of many rows and complex
     #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). See `VelocityRows` for those.
-    row: ClassVar[Callable[[Any, Any, Any, Any], None] | None] = None
+    row: Any = None
     #: How many of the parameters, the first ones, are the same in all rows of an object: numbers of atoms and the like.
     alike: int = 0
     #: Atoms a row, where the family fixes it.
@@ -110,6 +110,8 @@ class Constraint:
     singular: ClassVar[str] = "{row}: its gradient is undefined; move the atoms"
     #: Whether the coordinate depends on the masses of its atoms.
     uses_masses: ClassVar[bool] = False
+    #: Whether the same atoms in reverse order name the same coordinate.
+    reversible: ClassVar[bool] = False
     #: Whether rows fix all of an atom, three rows each, so that it moves as with infinite mass.
     fixes_atoms: ClassVar[bool] = False
     #: Whether the target is a position, so that replicas of the atoms take theirs from where they are.

@@ -44,6 +44,7 @@ class Distance(Constraint):
 
     positive = "target"
     row_width = 2
+    reversible = True
     translation_invariant = True
     kind = RowKind.DISTANCE
     singular = "atoms {atoms} coincide: distance gradient undefined ({row}); move them apart"
@@ -248,6 +249,7 @@ class Angle(Constraint):
     """
 
     row_width = 3
+    reversible = True
     held = ANGLE
     translation_invariant = True
     kind = RowKind.ANGLE
@@ -306,6 +308,7 @@ class Dihedral(Constraint):
     """
 
     row_width = 4
+    reversible = True
     held = ANGLE
     translation_invariant = True
     period = 2 * np.pi

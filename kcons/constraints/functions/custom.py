@@ -51,13 +51,14 @@ class PythonRows(Constraint, base=True):
 
     held = ANY
     time_dependent: bool
+    length: Any
 
     @property
     def moving(self) -> bool:
         return super().moving or self.time_dependent
 
     @property
-    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+    def called(self) -> tuple[Any, ...]:
         """The functions that kernels call where Numba has compiled all of them: value and gradient, or coefficients."""
         raise NotImplementedError
 
@@ -160,7 +161,7 @@ class Custom(PythonRows):
         self.length, self.time_step = length, time_step
 
     @property
-    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+    def called(self) -> tuple[Any, ...]:
         return self.function, self.gradient_function
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
@@ -370,7 +371,7 @@ class ImplicitSurface(Custom):
         length: _Length = None,
         time_step: Duration = 0.02,
     ) -> None:
-        given = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
+        given: dict[str, Any] = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
         column = atom_column(atoms, self.family)
         super().__init__(column, function, gradient, hessian_vector, target, time_derivatives, **given)
 
@@ -380,7 +381,7 @@ class ImplicitSurface(Custom):
         return RowKind.FUNCTION if self.n_rows == 1 else RowKind.INTERPRETED
 
     @property
-    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+    def called(self) -> tuple[Any, ...]:
         return (None,)
 
     def row_value(self, k: int, r: FloatArray, time: float) -> float:
@@ -440,7 +441,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         *,
         time_dependent: bool = False,
         translation_invariant: bool = False,
-        length: _Length = 1.0,
+        length: Annotated[float, LENGTH, positive] = 1.0,
         time_step: Duration = 1e-3,
     ) -> None:
         super().__init__(atoms, target)
@@ -455,7 +456,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         self.time_step = time_step
 
     @property
-    def called(self) -> tuple[Callable[..., Any] | None, ...]:
+    def called(self) -> tuple[Any, ...]:
         return (self.coefficients,)
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
