@@ -18,6 +18,8 @@ from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import Target
 from kcons.errors import InputError
 
+__all__ = ["CenterDistance", "CenterOfMass", "RadiusOfGyration"]
+
 
 class MassWeighted(Constraint, base=True):
     """Rows that need the masses of their atoms: their parameters are the width and a weight for each atom."""

@@ -18,6 +18,8 @@ from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
 from kcons.errors import InputError
 
+__all__ = ["Angle", "Dihedral", "Distance", "DistanceDifference"]
+
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
 COLLINEAR = 1e-7
 #: Fixed dihedrals beyond are degrees that were taken for radian.

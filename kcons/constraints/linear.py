@@ -13,6 +13,8 @@ from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import MovingTarget, Target
 from kcons.errors import InputError
 
+__all__ = ["FixedAtoms", "LinearCombination", "LinearRelation"]
+
 
 class LinearRows(Constraint, base=True):
     """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3), which are their parameters.

@@ -30,6 +30,8 @@ from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import Target
 from kcons.errors import InputError
 
+__all__ = ["Cylinder", "Ellipsoid", "Line", "Plane", "Sphere", "Torus"]
+
 _VECTOR = (3,)
 
 

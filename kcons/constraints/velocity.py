@@ -19,6 +19,8 @@ from kcons.constraints.target import Target
 from kcons.constraints.vectors import dot, norm
 from kcons.errors import InputError
 
+__all__ = ["KnifeEdge", "LinearVelocity", "Rolling"]
+
 _VECTOR = (3,)
 
 

@@ -37,6 +37,8 @@ from kcons.constraints.target import (
 from kcons.constraints.velocity import VelocityRows
 from kcons.errors import InputError
 
+__all__ = ["Custom", "CustomVelocity", "ImplicitSurface"]
+
 _FLOAT = np.dtype(np.float64)
 #: Places of a first derivative, in steps, and the weights of the values there.
 _PLACES = (1, -1, 2, -2)

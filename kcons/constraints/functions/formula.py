@@ -24,6 +24,8 @@ from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, un
 from kcons.constraints.target import Target
 from kcons.errors import InputError
 
+__all__ = ["Formula", "VelocityFormula"]
+
 
 class Formula(Constraint):
     """A formula of the coordinates of a few atoms, differentiated exactly and compiled.
