@@ -44,7 +44,7 @@ IntArray = NDArray[np.int64]
 _COMPLEX_STEP = 2.0**-100
 
 #: Rows of more atoms are compiled where others are taken at once, since loops over atoms are then long.
-WIDE = 32
+WIDE = 6
 
 #: All families by name.
 FAMILIES: dict[str, type[Constraint]] = {}

@@ -185,22 +185,22 @@ class Custom(PythonRows):
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         if self.gradient_function is None:
-            displaced, step = _displaced(r[None], self._length(r[None]))
-            values = np.array([self.row_value(k, place, time) for place in lent(displaced[:, 0])])
-            return self._differences(values[:, None], step)[0]
+            step = 1e-3 * float(self._length(r[None])[0])
+            places = lent(r + step * _along(self.width))  # the function may keep what it sees
+            values = self._from_the_first(np.array([self.row_value(k, place, time) for place in places]))
+            return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
         found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
         return np.asarray(self._checked(found, k, "gradient", r.shape))
 
     def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
-        displaced, step = _displaced(r, self._length(r))
-        return self._differences(np.array([self.measure(places, time) for places in displaced]), step)
+        step = 1e-3 * self._length(r)
+        places = r + step[:, None, None] * _along(self.width)[:, None]
+        values = self._from_the_first(np.array([self.measure(place, time) for place in places]))
+        slope = np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(-1, self.n_rows) / step
+        return np.ascontiguousarray(slope.T).reshape(r.shape)
 
-    def _differences(self, values: FloatArray, step: FloatArray) -> FloatArray:
-        """Gradients from the values at the places of `_displaced`, shape (12 width, n)."""
-        if self.period is not None:
-            values = nearest_image(values - values[0], self.period)
-        slope = np.tensordot(_DIFFERENCE, values.reshape(4, 3 * self.width, -1), 1) / step
-        return np.ascontiguousarray(slope.T).reshape(-1, self.width, 3)
+    def _from_the_first(self, values: FloatArray) -> FloatArray:
+        return values if self.period is None else nearest_image(values - values[0], self.period)
 
     def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
         """Differenced change of the value along a direction of unit length."""
@@ -519,14 +519,8 @@ class CustomVelocity(PythonRows, VelocityRows):
 
 @cache
 def _along(width: int) -> FloatArray:
-    """Displacements of `_PLACES` by coordinates, shape (12 width, 1, width, 3)."""
-    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, 1, width, 3)
-
-
-def _displaced(r: FloatArray, length: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where a function is taken for its gradient at `r`, shape (n, width, 3), and the steps, shape (n,)."""
-    step = 1e-3 * length
-    return r + step[:, None, None] * _along(r.shape[1]), step
+    """Displacements of `_PLACES` by coordinates, shape (12 width, width, 3)."""
+    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, width, 3)
 
 
 def _contract(a: FloatArray, b: FloatArray) -> FloatArray:
