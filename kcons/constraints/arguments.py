@@ -96,14 +96,14 @@ def out_of_range(values: FloatArray) -> tuple[int, str] | None:
     return int(first[0]) if len(first) else 0, said
 
 
-def lent(array: FloatArray) -> FloatArray:
+def read_only_view(array: FloatArray) -> FloatArray:
     """The same numbers, for a function of the user: it can read them and not change them."""
     view = array.view()
     view.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
     return view
 
 
-def kept(array: NDArray[Any]) -> NDArray[Any]:
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
     """The array itself, which nobody can change from now on."""
     array.setflags(write=False)
     return array
@@ -132,7 +132,7 @@ def atom_array(atoms: Any, item: str) -> NDArray[Any]:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"{item}: rows name different numbers of atoms, {_shown(atoms)}; use one object for each number",
+            f"{item}: rows name different numbers of atoms, {_value_text(atoms)}; use one object for each number",
             item="atoms",
         ) from None
 
@@ -229,7 +229,7 @@ def finite_number(value: Any, item: str) -> float:
     refuse_units(value, item)
     found = _float(value)
     if not math.isfinite(found):
-        raise InputError(f"{item} is {_shown(value)}; give a finite number", item=item.rpartition(": ")[2])
+        raise InputError(f"{item} is {_value_text(value)}; give a finite number", item=item.rpartition(": ")[2])
     return found
 
 
@@ -241,7 +241,7 @@ def _float(value: Any) -> float:
         return math.nan
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """A value in a message: of whole numbers of thousands of digits, which Python does not print, the kind."""
     try:
         return f"{value!r:.80}"
@@ -259,7 +259,7 @@ def positive(value: float, item: str) -> float:
     """
     number = math.nan if isinstance(value, str | bytes | bool) else _float(value)
     if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{item} is {_shown(value)}; give a positive number", item=item.rpartition(": ")[2])
+        raise InputError(f"{item} is {_value_text(value)}; give a positive number", item=item.rpartition(": ")[2])
     return number
 
 
@@ -300,7 +300,7 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
         good = False
     if not good or isinstance(value, bool):
         bounds = f", {least} or more" if most is None else f" from {least} to {most}"
-        raise InputError(f"{item} is {_shown(value)}; give a whole number{bounds}", item=item)
+        raise InputError(f"{item} is {_value_text(value)}; give a whole number{bounds}", item=item)
     return found
 
 
@@ -408,12 +408,12 @@ def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
         raise InputError(f"{item} has units that are not those of openmm.unit; give plain numbers", item=item)
     found = {dimension.name: power for dimension, power in values.unit.iter_base_dimensions() if power}
     if kind.exponents is not None and found != dict(kind.exponents) and (found or kind is not ANGLE):
-        raise InputError(f"{item} is {shown(values)}; give it in {kind.words}", item=item)
+        raise InputError(f"{item} is {quantity_text(values)}; give it in {kind.words}", item=item)
     matters = kind is not DIRECTION and not set(found) <= {"angle"}
     return values.value_in_unit_system(system), matters
 
 
-def shown(values: Any) -> str:
+def quantity_text(values: Any) -> str:
     """The beginning of a Quantity in words, on one line."""
     words = " ".join(str(values).split())
     return words if len(words) <= 60 else f"{words[:50]} ..."
@@ -423,7 +423,7 @@ def refuse_units(values: Any, item: str) -> None:
     """Raise `InputError` for Quantities where nobody knows which units the other numbers are in."""
     if has_units(values):
         raise InputError(
-            f"{item} has units ({shown(values)}), and only kcons.openmm knows what the other numbers are in; "
+            f"{item} has units ({quantity_text(values)}), and only kcons.openmm knows what the other numbers are in; "
             "give plain numbers in the units of the run",
             item=item,
         )

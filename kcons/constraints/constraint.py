@@ -29,10 +29,10 @@ from kcons.constraints.arguments import (
     Kind,
     atom_array,
     checked,
-    kept,
     numbers,
     out_of_range,
     plain_target,
+    read_only,
 )
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
@@ -132,7 +132,7 @@ class Constraint:
     #: Rows that take their atoms in the images of the set's tree, and how many cells their atoms lie from these,
     #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.periodic.images`.
     whole: NDArray[np.bool_] | None = None
-    windings: IntArray | None = None
+    cell_offsets: IntArray | None = None
 
     def __init_subclass__(cls, base: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -145,7 +145,7 @@ class Constraint:
             cls.__init__ = checked(cls.__init__)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
-        self.atoms: IntArray = kept(_atom_table(atoms, type(self).__name__, self.row_width))
+        self.atoms: IntArray = read_only(_atom_table(atoms, type(self).__name__, self.row_width))
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
@@ -168,12 +168,12 @@ class Constraint:
             if wrong is not None:
                 row, said = wrong
                 raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
-            setattr(self, name, kept(np.array(array, order="C")))
+            setattr(self, name, read_only(np.array(array, order="C")))
 
     def __setstate__(self, own: dict[str, Any]) -> None:
         for value in own.values():
             if isinstance(value, np.ndarray):
-                kept(value)
+                read_only(value)
         self.__dict__.update(own)
 
     def _settle(self) -> None:
@@ -353,7 +353,7 @@ class Constraint:
         if not self.uses_masses:
             return self
         copy = self.with_target(self.target)
-        copy.masses = kept(np.array(masses, dtype=np.float64, order="C"))
+        copy.masses = read_only(np.array(masses, dtype=np.float64, order="C"))
         return copy
 
     def with_target(self, target: Target) -> Self:
@@ -370,15 +370,15 @@ class Constraint:
         """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
         copy = self.with_target(None)
-        copy.atoms = kept(self.atoms[rows])
+        copy.atoms = read_only(self.atoms[rows])
         for name in self.per_row:
-            setattr(copy, name, kept(getattr(self, name)[rows]))
+            setattr(copy, name, read_only(getattr(self, name)[rows]))
         if self.masses is not None:
-            copy.masses = kept(self.masses[rows])
+            copy.masses = read_only(self.masses[rows])
         copy.whole = None if self.whole is None else self.whole[rows]
-        copy.windings = None if self.windings is None else self.windings[rows]
+        copy.cell_offsets = None if self.cell_offsets is None else self.cell_offsets[rows]
         if isinstance(self.target, np.ndarray):
-            copy.target = kept(self.target[rows])
+            copy.target = read_only(self.target[rows])
         elif self.target is not None:
             copy.target = _selected(self.target, rows, self.n_rows, self.period)
         return copy
@@ -386,7 +386,7 @@ class Constraint:
     def renumbered(self, new_index: IntArray) -> Self:
         """Copy with atom a replaced by new_index[a]."""
         copy = self.with_target(self.target)
-        copy.atoms = kept(np.asarray(new_index, dtype=np.int64)[self.atoms])
+        copy.atoms = read_only(np.asarray(new_index, dtype=np.int64)[self.atoms])
         return copy
 
     def row_name(self, row: int) -> str:

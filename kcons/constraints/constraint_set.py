@@ -14,11 +14,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import finite_number, kept, numbers, refuse_other
+from kcons.constraints.arguments import finite_number, numbers, read_only, refuse_other
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import find_images
-from kcons.constraints.periodic.in_cell import InCell, contiguous, joined, whole_bodies
+from kcons.constraints.periodic.in_cell import PeriodicRows, contiguous, joined, whole_bodies
 from kcons.constraints.target import FloatArray, MovingTarget, nearest_image
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError
@@ -38,7 +38,7 @@ class Residuals(NamedTuple):
     sizes: FloatArray
 
 
-class ConstraintSet(InCell):
+class ConstraintSet(PeriodicRows):
     """All that is held in one system.
 
     Parameters
@@ -409,7 +409,7 @@ def _rate_at(c: Constraint, time: float) -> FloatArray:
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:
     copy = item.with_target(item.target)
-    copy.atoms = kept(np.searchsorted(atoms, item.atoms))
+    copy.atoms = read_only(np.searchsorted(atoms, item.atoms))
     return copy
 
 

@@ -70,7 +70,7 @@ def unusable(
 
 def _coincident(constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, row: int) -> KconsError | None:
     item, k = constraint_set.locate(row)
-    if item.family != "Distance":
+    if not item.holds_length:
         return None
     r = constraint_set.gather(item.select([k]), x)[0]
     if np.linalg.norm(r[1] - r[0]) > 0:

@@ -71,7 +71,7 @@ class Projector:
     @property
     def fixed_atoms(self) -> IntArray:
         """Those that `FixedAtoms` hold."""
-        held = [c.atoms.ravel() for c in self.constraint_set.constraints if c.family == "FixedAtoms"]
+        held = [c.atoms.ravel() for c in self.constraint_set.constraints if c.fixes_atoms]
         return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)
 
     def took(self, iterations: int) -> None:

@@ -141,7 +141,7 @@ def make_report(
 
 def _inverse_masses(constraint_set: ConstraintSet) -> FloatArray:
     """1/m of the atoms that rows touch, 0 for fixed atoms, shape (n_atoms,)."""
-    fixed = [c.atoms.ravel() for c in constraint_set.constraints if c.family == "FixedAtoms"]
+    fixed = [c.atoms.ravel() for c in constraint_set.constraints if c.fixes_atoms]
     movable = np.setdiff1d(constraint_set.touched, np.concatenate(fixed)) if fixed else constraint_set.touched
     inverse = np.zeros(constraint_set.n_atoms)
     inverse[movable] = 1.0 / constraint_set.masses[movable]

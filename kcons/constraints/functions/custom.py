@@ -17,9 +17,9 @@ from kcons.constraints.arguments import (
     FloatArray,
     atom_column,
     check_call,
-    lent,
     numbers,
     positive,
+    read_only_view,
     unit,
 )
 from kcons.constraints.constraint import Constraint, RowKind
@@ -75,7 +75,7 @@ class PythonRows(Constraint, base=True):
         """Results of a user's function for all rows, shape (n_rows, *shape)."""
         out = np.empty((self.n_rows, *shape))
         for k in range(self.n_rows):
-            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
+            found = function(*(read_only_view(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
             out[k] = self._checked(found, k, name, shape)
         return out
 
@@ -186,7 +186,7 @@ class Custom(PythonRows):
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         if self.gradient_function is None:
             step = 1e-3 * float(self._length(r[None])[0])
-            places = lent(r + step * _along(self.width))  # the function may keep what it sees
+            places = read_only_view(r + step * _along(self.width))  # the function may keep what it sees
             values = self._from_the_first(np.array([self.row_value(k, place, time) for place in places]))
             return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
         found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
@@ -393,7 +393,7 @@ class ImplicitSurface(Custom):
         return np.asarray(self.gradient(r[None], time)[0])
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        found = function(*(lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
+        found = function(*(read_only_view(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
         if name == "time_derivatives":
             found = np.stack([np.broadcast_to(numbers(part, name), (self.n_rows,)) for part in found], axis=-1)
         result = numbers(found, f"ImplicitSurface: {name}")
@@ -466,7 +466,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         return np.zeros(self.n_rows), self._call(self.coefficients, "coefficients", shape, r, *self._time(time))
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
-        found = self.coefficients(lent(r), *self._time(time))
+        found = self.coefficients(read_only_view(r), *self._time(time))
         return np.asarray(self._checked(found, k, "coefficients", (self.width, 3)))
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
@@ -476,7 +476,7 @@ class CustomVelocity(PythonRows, VelocityRows):
     def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         """Rate of the coefficients of row `k` along v."""
         if self.derivative is not None:
-            found = self.derivative(lent(r), lent(v), *self._time(time))
+            found = self.derivative(read_only_view(r), read_only_view(v), *self._time(time))
             return np.asarray(self._checked(found, k, "derivative", r.shape))
         speed = float(np.sqrt(np.sum(v * v)))
         if speed == 0:

@@ -19,7 +19,7 @@ from kcons.errors import InputError
 MOST_STRAIN = 0.1
 
 
-class InCell:
+class PeriodicRows:
     """Rows of a set in its cell, and the images they mean; `ConstraintSet` is what it holds.
 
     Attributes
@@ -272,8 +272,8 @@ class InCell:
         plain = ~item.whole
         if plain.any():
             r[plain] = lined_up(r[plain], self.lattice)
-        if item.windings is not None:
-            r[item.whole] += item.windings[item.whole] @ self.lattice[0]
+        if item.cell_offsets is not None:
+            r[item.whole] += item.cell_offsets[item.whole] @ self.lattice[0]
         return r
 
     def _one_piece(self, item: Constraint, r: FloatArray, together: FloatArray) -> FloatArray:
