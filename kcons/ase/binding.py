@@ -189,7 +189,7 @@ def shared(given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["conve
             return bound
     bound = bind(given, atoms, degenerate)
     motion = bound.motion
-    plain = motion.constraint_set.images is None and all(item.windings is None for item in bound.given)
+    plain = motion.constraint_set.images is None and all(item.cell_offsets is None for item in bound.given)
     if plain and not motion.conversions and all(item.target is not None for item in given):
         _recent.known.append((given, degenerate, bound))
     return bound
@@ -295,7 +295,7 @@ def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:
 def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
     masses = np.repeat(motion.masses, 3).reshape(-1, 3)
     for item in motion.constraint_set.constraints:
-        if item.family == "FixedAtoms":
+        if item.fixes_atoms:
             masses[item.atoms.ravel()] = np.inf
     inverse_masses = 1.0 / masses
     masses[np.isinf(masses)] = 0.0

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.arguments import HELD, check_call, has_units, numbers, out_of_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import check_call, has_units, kept, numbers, out_of_range, positive
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -102,7 +102,7 @@ class MovingTarget:
         return True
 
 
-Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
+Target: TypeAlias = Annotated[float | ArrayLike | MovingTarget | TimeFunction | None, HELD]
 
 
 def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:
@@ -142,7 +142,7 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
     wrong = out_of_range(array)
     if wrong is not None:
         raise InputError(f"the target of row {wrong[0]} is {wrong[1]}", item="target")
-    return kept(np.array(np.broadcast_to(array, (rows,)), order="C"))
+    return read_only(np.array(np.broadcast_to(array, (rows,)), order="C"))
 
 
 # -- derivatives that a user gave, and central differences for those that were not given --------------

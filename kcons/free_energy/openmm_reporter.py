@@ -136,7 +136,7 @@ class HeldCoordinatesReporter:
         rows = carried
         touched = np.unique(np.concatenate([row.atoms.ravel() for row in rows]))
         refuse_virtual_sites(system, touched, masses)
-        named = {(min(pair), max(pair)) for row in rows if row.family == "Distance" for pair in row.atoms.tolist()}
+        named = {(min(pair), max(pair)) for row in rows if row.holds_length for pair in row.atoms.tolist()}
         for item in constraints_about(system, touched):
             other = np.array([tuple(sorted(pair)) not in named for pair in item.atoms.tolist()])
             if other.any():

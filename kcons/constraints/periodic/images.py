@@ -12,14 +12,14 @@ set-up:
   the images found there.
 
 Rows with a place in space are neither: they take all of their atoms as they are stored. What solvers get is made
-whole, so that these rows take off by how much (`InCell.moved`).
+whole, so that these rows take off by how much (`PeriodicRows.moved`).
 
 A link of the tree that no constant distance holds is *loose*: its image is unambiguous only as long as it is
 shorter than half the cell. `Images.make_whole` reports how near the worst one is, and `Images.refuse_loose_links`
 raises before it flips.
 
 A framework that closes upon itself through the boundary (a sheet, a polymer) has rows whose images differ from
-those of the tree by whole cells, the same at all times: `Constraint.windings`.
+those of the tree by whole cells, the same at all times: `Constraint.cell_offsets`.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def find_images(
     Returns
     -------
     constraints : list of Constraint
-        Copies that know which of their rows are whole, and the windings of these.
+        Copies that know which of their rows are whole, and the cell_offsets of these.
     images : Images or None
         None if all rows are plain.
 
@@ -177,7 +177,7 @@ def find_images(
     _accept_small_pieces(tables, n_atoms, half_width)
     if not tables or all(table.plain_at_once for table in tables):
         return given, None
-    ties = [item for item in ties if item.family == "Distance" and not item.moving and item.n_rows]
+    ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
     others = [_Links(_unmarked(item), 0, x, lattice, half_width, time) for item in ties]
     held = [t for t in [*tables, *others] if t.held]
     keys = np.sort(np.concatenate([t.keys(n_atoms)[t.short] for t in held] or [np.zeros(0, np.int64)]))
@@ -227,10 +227,10 @@ class _Links:
         nearest = minimum_image(raw, lattice)
         self.lengths = np.linalg.norm(nearest, axis=2)
         #: Held at one length for good.
-        self.held = item.family == "Distance" and not item.moving
+        self.held = item.holds_length and not item.moving
         self.whole: BoolArray = np.zeros(item.n_rows, np.bool_)
         self.unsure: BoolArray = np.zeros(item.n_rows, np.bool_)
-        self.windings = np.zeros((item.n_rows, item.width, 3), np.int64)
+        self.cell_offsets = np.zeros((item.n_rows, item.width, 3), np.int64)
         if self.held:
             if item.target is None:
                 # Until the tree is known: the length found may be that of another image.
@@ -289,10 +289,10 @@ class _Links:
         differs = cells.any(axis=2)
         self._long = np.linalg.norm(apart, axis=2)[:, 0] >= NEARLY * self.half_width
         for k, (before, after) in enumerate(self.links):
-            self.windings[:, after] = self.windings[:, before] + cells[:, k]
+            self.cell_offsets[:, after] = self.cell_offsets[:, before] + cells[:, k]
         if item.target is not None and item.holonomic:
             # The target tells which of the two is meant.
-            other = r + self.windings @ lattice[0]
+            other = r + self.cell_offsets @ lattice[0]
             with np.errstate(all="ignore"):
                 closing = np.abs(self._sigma(other)) < 0.5 * np.abs(self._sigma(r))
         else:
@@ -323,10 +323,10 @@ class _Links:
         if self._local is not None:
             closing = closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
         if self.held and self.item.target is None:
-            self._refuse_doubtful(self.windings.any(axis=(1, 2)) & ~closing, held)
+            self._refuse_doubtful(self.cell_offsets.any(axis=(1, 2)) & ~closing, held)
         if self.held:
-            self.whole |= self.unsure & ~closing & (self.windings.any(axis=(1, 2)) | self._long)
-        self.windings[~closing] = 0
+            self.whole |= self.unsure & ~closing & (self.cell_offsets.any(axis=(1, 2)) | self._long)
+        self.cell_offsets[~closing] = 0
 
     def _refuse_doubtful(self, beside: BoolArray, held: sp.csr_array) -> None:
         """Lengths that are to be found, of rows that may as well close through the boundary as span a body.
@@ -346,13 +346,13 @@ class _Links:
             )
 
     def marked(self, needed: BoolArray) -> Constraint:
-        """A copy that knows its whole rows, and the windings of all rows whose atoms are made whole."""
-        self.windings[~needed] = 0
-        if not self.whole.any() and not self.windings.any():
+        """A copy that knows its whole rows, and the cell_offsets of all rows whose atoms are made whole."""
+        self.cell_offsets[~needed] = 0
+        if not self.whole.any() and not self.cell_offsets.any():
             return self.item
         copy = self.item.with_target(self.item.target)
         copy.whole = self.whole
-        copy.windings = self.windings if self.windings.any() else None
+        copy.cell_offsets = self.cell_offsets if self.cell_offsets.any() else None
         return copy
 
 
@@ -373,7 +373,7 @@ def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: flo
 
 def _unmarked(item: Constraint) -> Constraint:
     copy = item.with_target(item.target)
-    copy.whole = copy.windings = None
+    copy.whole = copy.cell_offsets = None
     return copy
 
 
@@ -396,7 +396,7 @@ def _tree(
     length = np.concatenate([o[1] for o in offered])
     held, distance = (
         np.concatenate([np.full(len(o[2]), kind) for kind, o in zip(kinds, offered, strict=True)])
-        for kinds in ([t.held for t in tables], [t.item.family == "Distance" for t in tables])
+        for kinds in ([t.held for t in tables], [t.item.holds_length for t in tables])
     )
     unknown = np.isnan(length)
     apart = x[pair[unknown, 1]] - x[pair[unknown, 0]]
@@ -441,14 +441,12 @@ def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: 
             break
         first += item.n_rows
     atoms = [int(a) for a in pair]
-    what = (
-        f"target {length:g}" if item.family == "Distance" else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
-    )
+    what = f"target {length:g}" if item.holds_length else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
     raise InputError(
         f"row {row}, {item.row_name(row - first)}: {what} is not shorter than half the box ({half_width:g}), and no "
         "shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
         "the atoms so that neighbours in the row are neighbours in space",
-        item="target" if item.family == "Distance" else "positions",
+        item="target" if item.holds_length else "positions",
         atoms=atoms,
     )
 

@@ -35,7 +35,7 @@ class GreatCircles:
                 atoms.append(item.atoms[:, 0])
                 centers.append(np.broadcast_to(item.center, (item.n_rows, 3)))
                 radii.append(item.target_at(0.0))
-            elif item.family == "FixedAtoms":
+            elif item.fixes_atoms:
                 resting.append(np.unique(item.atoms))
             else:
                 return None

@@ -78,7 +78,7 @@ MUTANTS = [
         "constraints/periodic/in_cell.py",
         "change = change[self.lattice[1].any(axis=0)]",
         "change = change[:]",
-        "tests/constraints/periodic/test_in_cell.py::test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
+        "tests/constraints/periodic/test_images.py::test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
     ),
     (
         "constraints/periodic/in_cell.py",
