@@ -16,14 +16,22 @@ A stepper never changes its input. Where it raises, nothing has happened.
 """
 
 from kcons.steppers.adaptive.extrapolation import Extrapolation
-from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4
-from kcons.steppers.geodesic import Geodesic
 from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
-from kcons.steppers.rattle import Rattle
 from kcons.steppers.reversibility_check import ReversibilityCheck
-from kcons.steppers.runge_kutta_nystrom import BlanesMoan4, BlanesMoan6, BlanesMoan6a, RungeKuttaNystrom
 from kcons.steppers.running import Observer, Trajectory, run
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import (
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Composition,
+    Geodesic,
+    KahanLi6,
+    Rattle,
+    RungeKuttaNystrom,
+    Splitting,
+    Suzuki4,
+    Yoshida4,
+)
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper
 

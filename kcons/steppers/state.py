@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, TypeAlias
 from weakref import ReferenceType, ref
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import as_array, check_call, finite_array, finite_number, lent, numbers, refuse_other
 from kcons.constraints.constraint import IntArray
@@ -25,8 +25,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
 from kcons.steppers.stages.compiled_operations import beyond, check_finite
 from kcons.steppers.stages.friction import Friction
-from kcons.steppers.stages.great_circles import GreatCircles
-from kcons.steppers.stages.packed_system import PackedSystem
+from kcons.steppers.stages.packed_system import PackedSystem, more_tables, spheres_of, tables_without_rows
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -494,16 +493,25 @@ class System:
         return out, v
 
     @cached_property
-    def packed(self) -> PackedSystem | None:
-        """What compiled steps know of the system; None where the engine makes them, operation by operation."""
+    def _more_tables(self) -> tuple[NDArray[Any], ...]:
         held = self._free_of_origin
         atoms = np.zeros(0, dtype=np.int64) if held is None else np.append(self.anchor, held)
-        return PackedSystem.of(self.motion, self.weights, atoms, self.far)
+        return more_tables(self.weights, atoms, self.far, self.great_circles)
 
     @cached_property
-    def great_circles(self) -> GreatCircles | None:
-        """Exact constrained flight; None unless every row keeps one atom on a resting sphere (or at rest)."""
-        return GreatCircles.of(self.motion)
+    def packed(self) -> PackedSystem | None:
+        """What compiled steps know of the system; None where its rows are left to the engine."""
+        return PackedSystem.of(self.motion, *self._more_tables)
+
+    @cached_property
+    def tables_without_rows(self) -> FloatArray:
+        """What they know then."""
+        return tables_without_rows(*self._more_tables)
+
+    @cached_property
+    def great_circles(self) -> FloatArray | None:
+        """Center and radius of each atom, see `spheres_of`; None unless all rows keep one on a resting sphere."""
+        return spheres_of(self.motion)
 
     @cached_property
     def anchor(self) -> int:

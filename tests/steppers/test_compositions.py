@@ -10,7 +10,7 @@ from stepper_systems import rotor, skate, system_of
 from kcons.constraints import LinearVelocity, MovingTarget, Sphere
 from kcons.errors import InputError
 from kcons.steppers import Composition, KahanLi6, Rattle, Suzuki4, Yoshida4, run
-from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4, YOSHIDA_4
+from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4, YOSHIDA_4
 
 #: Coarser with velocity rows, where a projection takes ten milliseconds.
 STEPS = {4: [16, 32], 6: [8, 16]}

@@ -15,7 +15,7 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.steppers.adaptive.tolerated import EPS, FAILED, ToTolerance, landed, rms
-from kcons.steppers.geodesic import Geodesic
+from kcons.steppers.splitting import Geodesic
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper, require_stepper
 

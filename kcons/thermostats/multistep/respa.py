@@ -8,10 +8,10 @@ from typing import Any
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
-from kcons.steppers.compositions import SUZUKI_4
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate
 from kcons.steppers.program import Row
+from kcons.steppers.splitting import SUZUKI_4
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
