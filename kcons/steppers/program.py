@@ -108,7 +108,7 @@ class Program:
         if self._numbers is None:
             table = np.zeros((len(self.rows), WIDTH))
             for line, row in zip(table, self.rows, strict=True):
-                line[:ADDRESS] = row[1 : 1 + ADDRESS]
+                line[:ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
                 line[ADDRESS] = 0 if row.verb != CALL else address_of(row.function, FUNCTION)
             self._numbers = table.ravel()
         return self._numbers

@@ -184,7 +184,7 @@ class NoseHooverChain(Interpreted):
         directions = open_directions(system.motion, state.positions, state.time)
         return momentum_share(system.masses, state.velocities, directions) > AT_REST
 
-    def turned(self, state: State) -> State:
+    def time_reversed(self, state: State) -> State:
         """With the velocities of the links turned round, as those of a state that was `reversed` are."""
         if not carried(state, 2 * self.length + 1, "this NoseHooverChain"):
             return state
