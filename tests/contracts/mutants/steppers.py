@@ -120,7 +120,7 @@ MUTANTS = [
         "steppers/interpreter.py",
         "self.made += 1\n        self.number += 1",
         "self.made += 1",
-        "tests/steppers/test_splitting.py::test_errors_name_the_step",
+        "tests/steppers/test_interpreter.py::test_errors_name_the_step",
     ),
     (
         "steppers/interpreter.py",
@@ -130,9 +130,9 @@ MUTANTS = [
     ),
     (
         "steppers/interpreter.py",
-        "return True\n        if self.low is not None:\n            self.low.fill(0.0)",
-        "return True",
-        "tests/steppers/test_splitting.py::test_a_march_by_the_engine_is_the_same_to_the_last_bit",
+        "if self.low is not None:\n                    self.low.fill(0.0)\n                self._next_step()",
+        "self._next_step()",
+        "tests/steppers/test_interpreter.py::test_steps_in_kernels_are_those_of_the_engine",
     ),
     (
         "steppers/program.py",
@@ -156,7 +156,7 @@ MUTANTS = [
         "steppers/stages/compiled_operations.py",
         "            if pairs:\n                low[:] = 0.0",
         "            if False:\n                low[:] = 0.0",
-        "tests/steppers/test_splitting.py::test_the_same_to_the_last_bit",
+        "tests/steppers/test_interpreter.py::test_steps_in_kernels_are_those_of_the_engine",
     ),
     (
         "thermostats/langevin.py",
