@@ -144,6 +144,12 @@ MUTANTS = [
         "steppers/program.py",
         "met[verb] += 1",
         "pass",
+        "tests/thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part",
+    ),
+    (
+        "thermostats/langevin.py",
+        "numbers[PART] += 1.0",
+        "pass",
         "tests/thermostats/multistep/test_respa.py::test_each_exchange_of_a_step_has_noise_of_its_own",
     ),
     (
@@ -160,7 +166,7 @@ MUTANTS = [
     ),
     (
         "thermostats/langevin.py",
-        "noise += (1.0 - keep) * kept",
+        "noise += (1.0 - math.exp(-thermostat.friction * dt)) * kept",
         "noise += kept",
         "tests/thermostats/test_langevin.py::test_momentum_is_left_alone_where_asked",
     ),
