@@ -167,6 +167,12 @@ class Interpreter:
         Whether they have ended far from the origin, from where the next ones have to begin anew.
     """
 
+    __slots__ = (
+        *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
+        *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
+        "far",
+    )
+
     #: Whether forces are those of the System's function, all at once.
     simple = True
 
