@@ -108,10 +108,17 @@ class Failures:
         if row < 0:
             return ConvergenceError(f"the {what} projection did not converge", residual=outcome.residual)
         name, atoms = self._label(row)
+        with np.errstate(all="ignore"):
+            undefined = not np.isfinite(self._rows.jacobian(x)[[row]].data).all()
+        if undefined:
+            return SingularGeometryError(
+                f"the gradient of row {name} is undefined at these positions; move its atoms off the singular point",
+                rows=[row],
+                atoms=atoms,
+            )
         return ConvergenceError(
             f"the {what} projection leaves a residual of {outcome.residual:.3g} in row {name}: the rows contradict "
-            "each other at these positions (A A+ b differs from b), or a gradient is undefined there. Remove or change "
-            "one of the rows, or move its atoms off the singular point",
+            "each other at these positions (A A+ b differs from b). Remove or change one of the rows",
             residual=outcome.residual,
             iterations=outcome.iterations,
             row=row,
