@@ -209,22 +209,28 @@ STEPPERS: dict[str, type[steppers.Stepper]] = {
 USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
 _ON_ARRAYS = """\
-from kcons import Motion, State, System$run
+from kcons import Motion, State, System, run
 from kcons.comparison import test_systems
-from kcons.steppers import $stepper
+$imports
 
 test_system = $made_by
 motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions
 system = System(motion, test_system.potential.forces)  # a function of positions and time
 start = State(test_system.positions, test_system.velocities)
 """
-_BY_STEPPER = _ON_ARRAYS.replace("$run", ", run") + "end = run(system, start, $step, $steps, stepper=$stepper())\n"
-_BY_EXTRAPOLATION = (
-    _ON_ARRAYS.replace("$run", "").replace("$stepper", "Extrapolation")
-    + """\
+
+
+def lines_on_arrays(imports: str, last: str) -> str:
+    """Lines of Python that build a System, with $made_by, and the last ones."""
+    return _ON_ARRAYS.replace("$imports", imports).replace(", run", ", run" if "run(" in last else "") + last
+
+
+_BY_EXTRAPOLATION = lines_on_arrays(
+    "from kcons.steppers import Extrapolation",
+    """\
 for end in Extrapolation($step).states(system, start, until=test_system.horizon):
     pass  # each state is the end of a step
-"""
+""",
 )
 _BY_DYNAMICS = """\
 from ase import units
@@ -260,7 +266,10 @@ def _nothing_held(system: TestSystem, dt: float) -> Run:
 
 
 def _code_of_stepper(stepper: str, system: TestSystem) -> str:
-    return (_BY_DYNAMICS if system.units.energy == "eV" else _BY_STEPPER).replace("$stepper", stepper)
+    if system.units.energy == "eV":
+        return _BY_DYNAMICS.replace("$stepper", stepper)
+    last = f"end = run(system, start, $step, $steps, stepper={stepper}())\n"
+    return lines_on_arrays(f"from kcons.steppers import {stepper}", last)
 
 
 def _without_step(kind: type[steppers.Stepper]) -> Callable[[float], steppers.Stepper]:
