@@ -111,7 +111,7 @@ def test_time_steps_are_sorted_coarse_first():
     np.testing.assert_allclose(np.array(system.time_steps) / units.fs, [10.0, 5.0, 2.5])
 
 
-@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "bead-rotating"])
+@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "breathing"])
 def test_shortened_system_has_its_solution_at_its_own_horizon(name):
     half = small(name).shortened(2)
     assert half.horizon == small(name).horizon / 2
@@ -121,7 +121,7 @@ def test_shortened_system_has_its_solution_at_its_own_horizon(name):
 
 
 def test_a_moving_constraint_is_followed_in_time():
-    system = small("bead-rotating")
+    system = small("breathing")
     state = end(system, system.time_steps[-1])
     assert system.residuals(state.positions, state.velocities, system.horizon) < (1e-12, 1e-12)
     assert system.residuals(state.positions, state.velocities)[0] > 0.1

@@ -135,7 +135,6 @@ def test_solution_stays_on_the_constraints(name):
         ("rotor", 2, {}, "rotor is one rigid body; it cannot be built at size 2"),
         ("triple-pendulum", 0, {}, "triple-pendulum is one pendulum"),
         ("butane", 3, {}, "one molecule"),
-        ("bead-torus", 2, {}, "one bead"),
         ("chain", 4, {"forces": "x"}, "chain takes no options, not forces"),
         ("dumbbells", 3, {}, "cannot be built at size 3"),
         ("slab", 0, {}, "at least one molecule"),
