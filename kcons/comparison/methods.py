@@ -595,9 +595,9 @@ def in_openmm(
 ) -> None:
     """Register an integrator as `_in_openmm` takes it."""
     each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
-    options = {"refuses": _bonds_in_openmm, "force_evaluations": each} | options
-    if options.get("kind", "trajectory") == "trajectory":
-        options["code"] = partial(_lines_in_openmm, integrator, given, tolerance, how)
+    more: dict[str, Any] = {"refuses": _bonds_in_openmm, "force_evaluations": each} | options
+    if more.get("kind", "trajectory") == "trajectory":
+        more["code"] = partial(_lines_in_openmm, integrator, given, tolerance, how)
     add_method(
         name,
         partial(_in_openmm, integrator, given, tolerance, how),
