@@ -603,7 +603,7 @@ def in_openmm(
         partial(_in_openmm, integrator, given, tolerance, how),
         title=f"OpenMM {title}",
         engine="OpenMM",
-        **options,
+        **more,
     )
 
 
