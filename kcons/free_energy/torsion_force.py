@@ -15,6 +15,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray, nearest_image
+from kcons.constraints.vectors import cross, dot, norm
 
 #: A trial turn in radian, what it may change of other rows, and by which factor a bond may change before it is broken.
 _TRIAL, _SAME, _BROKEN = 0.3, 1e-8, 1.5
@@ -47,19 +48,21 @@ class RigidTurn(NamedTuple):
         e = self._direction(x)
         r = x[self.group] - x[self.axis[1]]
         result = x.copy()
-        result[self.group] += np.sin(angle) * np.cross(e, r) + (1 - np.cos(angle)) * (np.outer(r @ e, e) - r)
+        result[self.group] += np.sin(angle) * cross(e, r) + (1 - np.cos(angle)) * (np.outer(r @ e, e) - r)
         return result
 
-    def force(self, x: FloatArray, f: FloatArray) -> float:
-        """dU/dphi of the turn; NaN where a bond of the group is broken, by a box for example."""
+    def force(self, x: FloatArray, f: FloatArray) -> FloatArray:
+        """dU/dphi of the turn, of one or several configurations; NaN where a bond of the group is broken, by a box for
+        example."""
         i, j = self.bonds.T
-        if (((x[i] - x[j]) ** 2).sum(axis=1) > (_BROKEN * self.lengths) ** 2).any():
-            return float("nan")
-        return float(-self._direction(x) @ np.cross(x[self.group] - x[self.axis[1]], f[self.group]).sum(axis=0))
+        broken = (((x[..., i, :] - x[..., j, :]) ** 2).sum(axis=-1) > (_BROKEN * self.lengths) ** 2).any(axis=-1)
+        arms = x[..., self.group, :] - x[..., self.axis[1:], :]
+        torque = cross(arms, f[..., self.group, :]).sum(axis=-2)
+        return np.where(broken, np.nan, -dot(self._direction(x), torque))
 
     def _direction(self, x: FloatArray) -> FloatArray:
-        e: FloatArray = x[self.axis[1]] - x[self.axis[0]]
-        return e / np.linalg.norm(e)
+        e: FloatArray = x[..., self.axis[1], :] - x[..., self.axis[0], :]
+        return e / norm(e)[..., None]
 
 
 def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None:
