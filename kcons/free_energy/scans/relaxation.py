@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +15,6 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError
 from kcons.free_energy.scans.model_hessian import Internals
-from kcons.free_energy.scans.one_thread import one_thread
 from kcons.motion.motion import Motion
 
 #: Energy in eV and forces in eV/angstrom at positions, shape (n_atoms, 3).
@@ -29,6 +32,30 @@ ROUNDING = 1e-6
 MEMORY = 40
 #: Rounds in which a step is bent so that internal coordinates change as they would along it.
 BENDINGS = 4
+
+
+@cache
+def _libraries() -> Any:
+    """The BLAS libraries that are loaded; None without threadpoolctl."""
+    if find_spec("threadpoolctl") is None:
+        return None
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep BLAS to one thread inside: threads that share a small matrix wait for each other longer than they compute.
+
+    With few cores, or other work on them, a hundred times as long. A calculator has the threads that its user chose.
+    """
+    libraries = _libraries()
+    if libraries is None:
+        yield
+        return
+    with libraries.limit(limits=1):
+        yield
 
 
 @dataclass(frozen=True, eq=False)

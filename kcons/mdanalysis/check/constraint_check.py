@@ -41,6 +41,8 @@ from kcons.topology.rows_by_name import HeldRows
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
 GRID_FRAMES, GRID_ATOMS = 5, 1000
+#: Positions, of all frames together, up to which one process is quickest: of files that need no unpacking, of others.
+ALONE = {"DCD": 5_000_000, "": 500_000}
 
 
 class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
@@ -413,7 +415,7 @@ def check_trajectory(
     format, topology_format : str, optional
         Formats of the files, as MDAnalysis names them; by default what their names tell.
     workers : int
-        How many processes read at the same time.
+        How many processes read at the same time, unless one is done before others would have started.
     **options
         What is held besides, such as select, rigid_water and rigid_residues, for `kcons.mdanalysis.constraints_of`;
         all others for `ConstraintCheck`.
@@ -464,7 +466,8 @@ def check_trajectory(
             f"{constraints.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
             "whose faces molecules may be cut, or a topology with bonds"
         )
-    if workers > 1:
+    few = ALONE.get(format_of(universe.trajectory), ALONE[""])
+    if workers > 1 and universe.trajectory.n_frames * len(universe.atoms) > few:
         chosen |= {"backend": "multiprocessing", "n_workers": workers}
     return check.run(**chosen).check
 
