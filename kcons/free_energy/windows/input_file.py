@@ -279,11 +279,8 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         )
     structure: Any = tables.get("structure")
     sampling, entries = tables["sampling"], tables["coordinate"]
-    for name, found, how in (
-        ("structure", structure, "[structure] with file = ..."),
-        ("coordinate", entries, "[[coordinate]]"),
-    ):
-        if not found:
+    for name, how in (("structure", "[structure] with file = ..."), ("coordinate", "[[coordinate]]")):
+        if not tables.get(name):
             raise InputError(f"the input file has no {name}; write {how}", item=name)
     coordinates: dict[str, Constraint] = {}
     for entry in entries:

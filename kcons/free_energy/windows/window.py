@@ -294,11 +294,11 @@ class Held:
 
     def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
         """The coordinates moved at a constant rate from time 0 on."""
-        rows = []
-        for item, a, b in zip(self.coordinates.values(), begin, end, strict=True):
-            rate = (b - a) / duration
-            rows.append(item.with_target(MovingTarget(lambda t, a=a, rate=rate: a + rate * t)))  # type: ignore[misc]
-        return rows
+        rows = zip(self.coordinates.values(), begin, end, strict=True)
+        return [
+            item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
+            for item, a, b in rows
+        ]
 
     @property
     def knows_place(self) -> bool:
