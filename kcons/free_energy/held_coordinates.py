@@ -179,10 +179,10 @@ class HeldCoordinates:
         own = np.searchsorted(self._rows.starts, self._order[-len(self) :], side="right") - 1
         self._own = {k: slice(*self._rows.starts[k : k + 2]) for k in set(own.tolist())}
         # Where each number of the gradients stands in the dense ones, whose rows are in the order of results.
-        row, width = np.argsort(self._order), 3 * len(self.atoms)
-        pairs = zip(self._rows.starts, self._rows.constraints, strict=False)
-        rows_of = [row[start + np.arange(c.n_rows), None, None] * width + 3 * c.atoms[:, :, None] for start, c in pairs]
-        self._places = np.concatenate([(first + np.arange(3)).ravel() for first in rows_of])
+        line, width = np.argsort(self._order), 3 * len(self.atoms)
+        every = zip(self._rows.starts, self._rows.constraints, strict=False)
+        first = [line[start + np.arange(c.n_rows), None, None] * width + 3 * c.atoms[:, :, None] for start, c in every]
+        self._places = np.concatenate([(place + np.arange(3)).ravel() for place in first])
         here = x[self.atoms]
         near = 1e-3 * np.random.default_rng(1).normal(size=here.shape) * np.ptp(here, axis=0).max()
         # Beside a structure so symmetric that a gradient vanishes, too.
@@ -222,20 +222,20 @@ class HeldCoordinates:
             A coordinate has come to depend on the other constraints.
         """
         shape = (self._source.n_atoms, 3)
-        whole = [as_array(array, shape, item)[None] for array, item in zip((x, v, f), _ITEMS, strict=True)]
-        return self._samples(*whole, [time])[0]
+        whole = np.stack([as_array(array, shape, item) for array, item in zip((x, v, f), _ITEMS, strict=True)])
+        return self._samples(whole[:, None], [time])[0]
 
     def samples(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, times: Sequence[float]) -> list[Sample]:
         """As `sample`, of n configurations in one cell, shape (n, n_atoms, 3): each costs a tenth of one alone."""
-        shape = (len(times), self._source.n_atoms, 3)
-        whole = [as_array(array, shape, item) for array, item in zip((x, v, f), _ITEMS, strict=True)]
+        whole = np.array([x, v, f], dtype=np.float64)
         at_once = 1 if self._rows.moving else AT_ONCE
         parts = [slice(k, k + at_once) for k in range(0, len(times), at_once)]
-        return [each for part in parts for each in self._samples(*(array[part] for array in whole), times[part])]
+        return [each for part in parts for each in self._samples(whole[:, part], times[part])]
 
-    def _samples(self, x: FloatArray, v: FloatArray, f: FloatArray, times: Sequence[float]) -> list[Sample]:
-        n, d, rows, order, time = len(x), len(self), self._rows, self._order, times[0]
-        here, speed, force = packed = np.stack([array[:, self.atoms] for array in (x, v, f)])
+    def _samples(self, whole: FloatArray, times: Sequence[float]) -> list[Sample]:
+        """Of positions, velocities and forces, shape (3, n, n_atoms, 3)."""
+        n, d, rows, order, time = len(times), len(self), self._rows, self._order, times[0]
+        here, speed, force = packed = whole[:, :, self.atoms]
         if not np.isfinite(packed).all():
             which, k, first = np.argwhere(~np.isfinite(packed).all(axis=3))[0].tolist()
             item, atom = _ITEMS[which], int(self.atoms[first])
@@ -257,15 +257,15 @@ class HeldCoordinates:
         if self._averages:
             mean = (respond @ (bent[:, 1 + d * d :].sum(axis=1) - traces)[:, :, None])[:, :, 0]
         values = np.zeros((n, rows.n_rows))
-        for k, columns in self._own.items():
+        for k, mine in self._own.items():
             r = gathered[k]
-            values[:, columns] = self._copied(k, n).measure(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1)
+            values[:, mine] = self._copied(k, n).measure(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1)
         value = values[:, order[-d:]]
         off = np.abs(nearest_image(value - rows.target(time)[order[-d:]], self.periods)).max(axis=1)
         turned = np.full((n, d), np.nan)
         for k, turn in enumerate(self._turns):
             if turn is not None:
-                turned[:, k] = turn.force(x, f)
+                turned[:, k] = turn.force(whole[0], whole[2])
         gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ metric.shares.swapaxes(1, 2))
         columns = (value, moving, moving - still, metric.log_det_z.tolist(), gradient, off.tolist(), turned, mean)
         return [Sample(*each) for each in zip(times, *columns, strict=True)]
@@ -373,7 +373,7 @@ class _Metric(NamedTuple):
     M^-1.
     """
 
-    log_det_z: float
+    log_det_z: FloatArray
     respond: FloatArray
     shares: FloatArray
     directions: FloatArray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from os import PathLike
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -164,11 +164,11 @@ class Series:
             g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data["seconds"])
             series = cls([str(name) for name in data["names"]], data["periods"], g, seconds)
             d = len(series.names)
-            columns = [data[f].reshape(-1) if f in _NUMBERS else data[f].reshape(-1, d) for f in Sample._fields]
+            columns: list[Any] = [
+                data[f].reshape(-1).tolist() if f in _NUMBERS else data[f].reshape(-1, d) for f in Sample._fields
+            ]
             for row in zip(*columns, strict=True):
-                series.append(
-                    Sample(*(float(v) if f in _NUMBERS else v for f, v in zip(Sample._fields, row, strict=True)))
-                )
+                series.append(Sample(*row))
         except FileNotFoundError:
             raise
         except Exception as error:  # a damaged archive raises whatever its bytes lead to

@@ -26,20 +26,13 @@ class RigidTurn(NamedTuple):
 
     Such a turn changes no bond and no angle, and has no divergence, so that dF/dphi is the weighted mean of the torque
     against it (Ciccotti, Lelievre and Vanden-Eijnden, Commun. Pure Appl. Math. 61, 371, 2008, for any such field).
-
-    Attributes
-    ----------
-    axis : ndarray of int, shape (2,)
-        A turn about the line from the first to the second by a positive angle makes the torsion larger.
-    group : ndarray of int, shape (n,)
-        The atoms that move.
-    bonds : ndarray of int, shape (b, 2)
-        Those of the group, to the axis and of the axis.
-    lengths : ndarray, shape (b,)
     """
 
+    #: Two atoms: a turn about the line from the first to the second by a positive angle makes the torsion larger.
     axis: IntArray
+    #: The atoms that move.
     group: IntArray
+    #: Those of the group, to the axis and of the axis, shape (b, 2), and their lengths.
     bonds: IntArray
     lengths: FloatArray
 
@@ -91,14 +84,7 @@ def rigid_turn(
 ) -> RigidTurn | None:
     """The smaller group of one torsion; None of another coordinate, or where the middle bond is missing or in a ring.
 
-    Parameters
-    ----------
-    coordinate : Constraint
-        One row.
-    bonds : ndarray of int, shape (n, 2)
-    x : ndarray, shape (n_atoms, 3)
-    lattice : ndarray, shape (2, 3, 3), optional
-        In which bonds have their lengths, also where a box has cut them.
+    Bonds have their lengths in the lattice, also where a box has cut them.
     """
     if coordinate.family != "Dihedral":
         return None
@@ -122,16 +108,7 @@ def leaves_the_rest(
 ) -> bool:
     """Whether a turn changes its coordinate by its angle, no other row of the set, and not det(A M^-1 A^T) of `others`.
 
-    Parameters
-    ----------
-    turn : RigidTurn
-    row : int
-        Of the coordinate in `everything`.
-    everything : ConstraintSet
-    others : ndarray of int
-        The other rows of the clusters of the coordinates.
-    x : ndarray, shape (n_atoms, 3)
-    time : float
+    `row` is that of the coordinate in the set, `others` the other rows of the clusters of the coordinates.
     """
     there = turn.turned(x, _TRIAL)
     change = everything.measure(there, time) - everything.measure(x, time)

@@ -60,25 +60,14 @@ def one_thread() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Relaxed:
-    """A minimum on constraints.
-
-    Attributes
-    ----------
-    positions : ndarray, shape (n_atoms, 3)
-    energy : float
-        In eV.
-    largest : float
-        The largest force along the constraints that is left on an atom, in eV/angstrom.
-    memory : ndarray, shape (m, 2, n)
-        Moves and changes of the slopes along the internal coordinates: what was learned of the curvature.
-    evaluations : int
-        Calls of energy and forces.
-    """
+    """A minimum on constraints, its energy in eV, and the largest force along them that is left, in eV/angstrom."""
 
     positions: FloatArray
     energy: float
     largest: float
+    #: Moves and changes of the slopes along internal coordinates, (m, 2, n): what was learned of the curvature.
     memory: FloatArray
+    #: Calls of energy and forces.
     evaluations: int
 
 
@@ -108,16 +97,7 @@ class _Place:
 
 
 class Descent:
-    """Quasi-Newton steps on constraints, in internal coordinates.
-
-    Parameters
-    ----------
-    motion : Motion
-    evaluate : callable
-    internals : Internals
-    memory : ndarray, shape (m, 2, n), optional
-        That of a relaxation nearby.
-    """
+    """Quasi-Newton steps on constraints, in internal coordinates."""
 
     def __init__(self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: FloatArray | None) -> None:
         self.motion, self.evaluate, self.internals = motion, evaluate, internals

@@ -42,32 +42,19 @@ _NONE = -9
 
 @dataclass
 class Attempt:
-    """One relaxation.
-
-    Attributes
-    ----------
-    number : int
-    point : tuple of int
-    source : int or None
-        The attempt whose structure it began from; None for the structure that was given.
-    positions : ndarray, shape (n_atoms, 3)
-    energy, largest : float
-        In eV; the largest force left on an atom, in eV/angstrom.
-    evaluations : int
-    error : str or None
-        Why it failed.
-    memory, terms
-        What was learned of the curvature, see `relaxation`.
-    """
+    """One relaxation, of energy in eV and the largest force left on an atom in eV/angstrom."""
 
     number: int
     point: Point
+    #: The attempt whose structure it began from; None for the structure that was given.
     source: int | None
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     energy: float = float("nan")
     largest: float = float("nan")
     evaluations: int = 0
+    #: Why it failed.
     error: str | None = None
+    #: What was learned of the curvature, see `relaxation`.
     memory: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 0)))
     terms: list[tuple[int, ...]] = field(default_factory=list)
 
@@ -84,12 +71,7 @@ class Attempt:
 
     @classmethod
     def load(cls, path: Path, number: int) -> Attempt:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        UnreadableError
-        """
+        """Read what `save` wrote."""
         try:
             with path.open("rb") as file:
                 data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
@@ -103,23 +85,7 @@ class Attempt:
 
 
 class Attempts:
-    """A folder of attempts; without a folder nothing is kept.
-
-    Parameters
-    ----------
-    folder : path, or None
-    atoms : ase.Atoms
-    grid : Grid
-    held : sequence of Constraint
-    settings : mapping
-
-    Raises
-    ------
-    OccupiedError
-        The folder has another scan in it, or other files of these names.
-    InputError
-        Coordinates that cannot be written to a file.
-    """
+    """A folder of attempts, which must not have another scan in it; without a folder nothing is kept."""
 
     def __init__(
         self,
@@ -148,13 +114,7 @@ class Attempts:
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """Make the folder, and keep others out of it.
-
-        Raises
-        ------
-        OccupiedError
-            Another scan writes there.
-        """
+        """Make the folder, and keep other scans out of it."""
         if self._results is None:
             yield
             return
@@ -172,13 +132,7 @@ class Attempts:
         return Attempt.load(self._file(number), number) if there else None
 
     def kept(self, number: int, point: Point, source: int | None) -> Attempt | None:
-        """The attempt of an earlier run that began so; None if there is none.
-
-        Raises
-        ------
-        UnreadableError
-            Its file is damaged, or of another scan.
-        """
+        """The attempt of an earlier run that began so; None if there is none."""
         found = self.tried(number)
         if found is not None and (found.point, found.source) != (point, source):
             raise UnreadableError(f"{self._file(number)} is of another scan; take another folder", item="folder")

@@ -237,28 +237,17 @@ def approach_of(approach: ArrayLike, names: Sequence[str]) -> FloatArray:
 
 @dataclass
 class Held:
-    """The rows of a window over the structure that all windows start from.
+    """The rows of a window over the structure that all windows start from."""
 
-    Parameters
-    ----------
-    coordinates : mapping of str to Constraint
-        One row each.
-    others : sequence of Constraint
-        What is held beside them, targets found at `positions` where they were left open.
-    positions, masses, cell
-        Of the initial structure.
-    bonds : ndarray of int, shape (n, 2)
-        Of the molecules.
-    turning : ndarray of int, shape (n, 2), or None
-        Those by which groups are turned, of all particles that have a mass; None where something is held otherwise.
-    """
-
+    #: One row each.
     coordinates: Mapping[str, Constraint]
+    #: What is held beside them, targets found at `positions` where they were left open.
     others: list[Constraint]
     positions: FloatArray
     masses: FloatArray
     cell: FloatArray | None
     pbc: Any
+    #: Of the molecules, shape (n, 2), and those by which groups may be turned; None where something is held otherwise.
     bonds: IntArray
     turning: IntArray | None
 

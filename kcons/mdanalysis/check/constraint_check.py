@@ -209,25 +209,23 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
         """Frames to look at, at least one, counted from the beginning."""
-        numbers: Sequence[int]
-        count, name = self._trajectory.n_frames, self.asked.names[0]
-        if chosen["frames"] is None:
+        count, name, given = self._trajectory.n_frames, self.asked.names[0], chosen["frames"]
+        if given is None:
             if chosen["step"] == 0:
                 raise InputError("step is 0; give another whole number", item="step")
-            numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
-        else:
-            asked = np.asarray(chosen["frames"])
-            if asked.dtype == bool and asked.shape == (count,):
-                asked = np.flatnonzero(asked)
-            if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
-                raise InputError(
-                    f"frames are {chosen['frames']!r:.60}; give whole numbers, or True and False for each of the "
-                    f"{count} frames; for a slice start, stop and step",
-                    item="frames",
-                )
-            for frame in asked[(asked < -count) | (asked >= count)]:
-                raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
-            numbers = (asked % count).tolist()
+            given = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
+        asked = np.asarray(given)
+        if asked.dtype == bool and asked.shape == (count,):
+            asked = np.flatnonzero(asked)
+        if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
+            raise InputError(
+                f"frames are {given!r:.60}; give whole numbers, or True and False for each of the {count} frames; for "
+                "a slice start, stop and step",
+                item="frames",
+            )
+        for frame in asked[(asked < -count) | (asked >= count)]:
+            raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
+        numbers: list[int] = (asked % max(count, 1)).tolist()
         if not len(numbers):
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
