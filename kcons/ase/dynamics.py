@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from operator import is_
 from typing import Any, Literal
 
 import numpy as np
@@ -14,21 +15,7 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
-from kcons.ase.binding import (
-    FORCES_ONLY,
-    Answers,
-    Binding,
-    Company,
-    applied_energy,
-    applied_forces,
-    bind,
-    company,
-    in_step,
-    name_step,
-    refuse_fewer,
-    same_company,
-    surroundings,
-)
+from kcons.ase.binding import FORCES_ONLY, Binding, Company, applied_forces, bind, company, same_company
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
@@ -43,6 +30,8 @@ from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed, require_stepper
+from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, NoseHooverChain
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL
 from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: Steps longer than this are asked about: 20 fs, above which no motion of molecules at room temperature is followed.
@@ -51,7 +40,8 @@ LONGEST = 20.0 * units.fs * (1 + 1e-12)
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 FAR = 128.0
 
-_FLOAT = np.dtype(np.float64)
+#: Arrays of atoms that calculators read.
+_READ = ("numbers", "initial_charges", "initial_magmoms")
 
 
 class ConstrainedDynamics(MolecularDynamics):
@@ -139,12 +129,12 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell: tuple[bytes, ...] = ()
-        self._answers = Answers(atoms, self._calculators)
+        self._asked: tuple[Any, ...] = ()  # calculators, and where each keeps what it found
         self._size = len(atoms)
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
-        with _changed_only_if_all_is_well(atoms):
+        with changed_only_if_all_is_well(atoms):
             self._prepare(atoms, timestep, state)
             # Files last: to open one for writing ends what an older run left there.
             steps, logfile = self.nsteps, kwargs.pop("logfile", None)
@@ -162,7 +152,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if state is not None:
             refuse_other(state, State, "state", "a kcons.State, such as State.load(file) or the state of another run")
             self._resume(state)
-        self._answers.note()
+        self._asked = self._calculators_now()
         self._start(self._systems())
         self._begin()
 
@@ -278,7 +268,7 @@ class ConstrainedDynamics(MolecularDynamics):
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
         system.follow(after, self._state)
-        self._answers.note()
+        self._asked = self._calculators_now()
         if after.barostat is not None:
             self._cell = surroundings(self.atoms)
 
@@ -288,19 +278,24 @@ class ConstrainedDynamics(MolecularDynamics):
             state = self._start(self._systems())
             with in_step(self.nsteps):
                 self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
-            self._answers.note()
+            self._asked = self._calculators_now()
 
     def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        if last is not None and self._answers.changed(last, self._force, self.nsteps + 1):
-            last = self._state = replace(last, forces=None, thermostat=self._thermostat_after_change(last))
+        asked = self._calculators_now()
+        if last is not None and not all(map(is_, asked, self._asked)):
+            # Another calculator, or one that was reset or asked elsewhere since: it is asked again.
+            last = replace(last, forces=None)
+            if asked[0] is not self._asked[0] or isinstance(self.stepper, HamiltonianMonteCarlo):
+                last = replace(last, thermostat=self._thermostat_after_change(last))
+            self._state, self._asked = last, asked
         cell = surroundings(atoms)
         same = last is not None and cell == self._cell
         if last is not None and same:
-            if _same(x, last.positions, p, self._momenta):
+            if equal_pairs(x, last.positions, p, self._momenta):
                 if last.step == self.nsteps and last.time == self.time:
                     return last
                 remainder = last.time_remainder if last.time == self.time else 0.0
@@ -343,8 +338,20 @@ class ConstrainedDynamics(MolecularDynamics):
             self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        """What a thermostat goes on with where somebody moved the atoms."""
-        return None
+        """What a thermostat goes on with where somebody moved the atoms: the isokinetic one begins anew."""
+        if last is None or last.thermostat is None or isinstance(self.stepper, Isokinetic):
+            return None
+        if not isinstance(self.stepper, NoseHooverChain | HamiltonianMonteCarlo):
+            return last.thermostat
+        held = last.thermostat.copy()  # at which the chain sees that momenta may be new
+        if isinstance(self.stepper, HamiltonianMonteCarlo):
+            held[POTENTIAL] = math.nan  # to be asked for again
+        return held
+
+    def _calculators_now(self) -> tuple[Any, ...]:
+        """The calculators, and where each keeps what it found last: another object after other questions."""
+        calculators = (self.atoms.calc, *self._calculators)
+        return (*calculators, *(getattr(each, "results", None) for each in calculators))
 
     # -- the system -----------------------------------------------------------------------------
 
@@ -418,17 +425,6 @@ def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:
     return rows
 
 
-def _same(x: FloatArray, y: FloatArray, p: FloatArray, q: FloatArray) -> bool:
-    """Whether x is y and p is q, to the last bit."""
-    if _plain(x) and _plain(p):
-        return bool(equal_pairs(x, y, p, q))
-    return bool((x == y).all() and (p == q).all())
-
-
-def _plain(values: Any) -> bool:
-    return values.dtype is _FLOAT and values.flags.c_contiguous
-
-
 @njit(cache=True, nogil=True)
 def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
     """Whether x == x0 and p == p0."""
@@ -466,17 +462,12 @@ def put(
     x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
     masses, divisors = weights
     momenta, v = np.empty_like(velocities), np.empty_like(velocities)
-    if _plain(x) and _plain(p):
-        write_back(positions, velocities, masses, divisors, x, p, momenta, v)
-    else:
-        np.multiply(velocities, masses, out=momenta)
-        v[...] = np.where(masses != 0.0, momenta / divisors, velocities)
-        x[...], p[...] = positions, momenta
+    write_back(positions, velocities, masses, divisors, x, p, momenta, v)
     return momenta, v
 
 
 @contextmanager
-def _changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
+def changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
     """Put the atoms back where something is refused."""
     before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
     try:
@@ -499,3 +490,52 @@ def _array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
     if array.shape != (n_atoms, 3) or not np.isfinite(array).all():
         raise InputError(f"{item} must be finite, of shape ({n_atoms}, 3), not {array.shape}", item=item)
     return array
+
+
+def applied_energy(atoms: Atoms, only_forces: bool) -> float:
+    """The energy of which forces and stress are derivatives; with that of ASE objects where these add forces."""
+    energy = float(atoms.get_potential_energy(apply_constraint=only_forces))
+    found = getattr(atoms.calc, "results", {})
+    free = found.get("free_energy")
+    # Where electrons have a temperature, "energy" is extrapolated to zero; both may be infinite.
+    if free is not None and "energy" in found and free != found["energy"]:
+        energy += float(free - found["energy"])
+    return energy
+
+
+@contextmanager
+def in_step(number: int) -> Iterator[None]:
+    """Errors are noted to belong to this step."""
+    try:
+        yield
+    except Exception as error:
+        name_step(error, number)
+        raise
+
+
+def name_step(error: BaseException, number: int) -> None:
+    """Note in an error which step it belongs to."""
+    if getattr(error, "step", None) is None:
+        with suppress(AttributeError):
+            error.step = number  # type: ignore[attr-defined]
+        error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
+
+
+def surroundings(atoms: Atoms) -> tuple[bytes, ...]:
+    """The cell, first, what calculators read of atoms beside their positions, and what ASE objects add to forces."""
+    parts = [atoms.cell.array.tobytes(), atoms.pbc.tobytes()]
+    parts += [atoms.arrays[name].tobytes() for name in _READ if name in atoms.arrays]
+    parts += [repr(item.todict()).encode() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+    return tuple(parts)
+
+
+def refuse_fewer(before: int, now: int, rows: Sequence[Constraint], friction: ArrayLike, stepper: Any) -> int:
+    """Refuse fewer atoms than before where something was given by their numbers; returns how many there are now."""
+    by_number = rows or np.ndim(friction) or getattr(stepper, "atoms", None) is not None
+    if now < before and by_number:
+        raise InputError(
+            f"{before - now} of {before} atoms were removed, and constraints, friction or indices that the dynamics "
+            "was given name atoms by their numbers, which are others now; make a new one",
+            item="atoms",
+        )
+    return now

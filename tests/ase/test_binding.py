@@ -409,7 +409,9 @@ def test_a_second_object_of_kcons_says_how_to_make_one():
 
 
 class Settings(Field):
-    """A field whose stiffness `set` changes, without forgetting what it found, as calculators of ASE do."""
+    """A field whose stiffness `set` changes."""
+
+    discard_results_on_any_change = True
 
     def __init__(self, **settings):
         super().__init__()
