@@ -16,7 +16,7 @@ from ase.calculators.mixing import SumCalculator
 from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY
-from kcons.ase.dynamics import FAR, ConstrainedDynamics, changed_only_if_all_is_well, in_step, put
+from kcons.ase.dynamics import FAR, ConstrainedDynamics, changed_only_if_all_is_well, in_step
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
@@ -104,9 +104,10 @@ class ThermostattedDynamics(ConstrainedDynamics):
         finally:  # forces were asked for elsewhere too
             arrays["positions"][...], arrays["momenta"][...] = state.positions, momenta
         if begun.velocities is not state.velocities:
-            momenta, v = put(self.atoms, self._weights, state.positions, begun.velocities)
-            begun = replace(begun, velocities=v)
-        self._momenta, self._state = momenta, begun
+            begun = replace(begun, velocities=self._put(state.positions, begun.velocities))
+        else:
+            self._momenta = momenta
+        self._state = begun
 
     @property
     def _mover(self) -> Stepper:
@@ -657,7 +658,7 @@ def draw_velocities(
             zero_momentum=zero_momentum,
             kinetic_energy=wanted,
         )
-        momenta = v * held._weights[0]
+        momenta = v * held._masses
     finally:
         atoms.set_momenta(momenta, apply_constraint=False)
 

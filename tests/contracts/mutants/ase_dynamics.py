@@ -88,8 +88,8 @@ MUTANTS = [
     ),
     (
         "ase/dynamics.py",
-        "if now < before and by_number:",
-        "if False:",
+        "if now < before and (self._more",
+        "if False and (self._more",
         "tests/ase/test_binding.py::test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
     ),
     (
