@@ -169,10 +169,8 @@ class IsokineticDynamics(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator and with momenta; draw them with `draw_velocities(..., zero_momentum=True)`.
-    timestep : float
-        In ASE's unit of time.
+    atoms, timestep, **kwargs
+        As for `ConstrainedLangevin`; atoms with momenta (`draw_velocities(..., zero_momentum=True)`).
     temperature_K : float, optional
         None keeps the kinetic energy that the atoms have.
     order : {2, 4, 6}
@@ -185,8 +183,6 @@ class IsokineticDynamics(ThermostattedDynamics):
         Whether total momentum is conserved, and takes degrees of freedom. 'auto' asks the calculator for forces at
         one to three shifted places at the start; with forces that add up to nothing only roughly (plane waves, particle
         mesh), say which.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -234,11 +230,8 @@ class ConstrainedLangevin(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator.
-    timestep : float
-        In ASE's unit of time.
-    temperature_K : float
+    atoms, timestep, temperature_K, **kwargs
+        As for `ConstrainedDynamics`, and `restart` and `barostat`, see `ThermostattedDynamics`.
     friction : float
         In inverse units of ASE's time, for example 0.01/units.fs.
     rng : int or numpy.random.Generator, optional
@@ -248,8 +241,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
         Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -282,11 +273,9 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator and with momenta (`draw_velocities(..., zero_momentum=True)`).
-    timestep : float
-        In ASE's unit of time; may be negative.
-    temperature_K : float
+    atoms, timestep, temperature_K, **kwargs
+        As for `ConstrainedLangevin`; atoms with momenta (`draw_velocities(..., zero_momentum=True)`). The time step may
+        be negative.
     tdamp : float
         Time constant of the chain in ASE's unit of time, as for `ase.md.nose_hoover_chain`: masses are kT tdamp^2.
         About a hundred time steps.
@@ -294,8 +283,6 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         Links of the chain.
     momentum : {'auto', 'conserved', 'free'}
         As for `IsokineticDynamics`.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -333,26 +320,17 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator whose forces are the gradient of its energy.
-    timestep : float
-        In ASE's unit of time; `tune` finds one.
-    temperature_K : float
+    atoms, timestep, temperature_K, rng, fixcm, **kwargs
+        As for `ConstrainedLangevin`; forces of the calculator are the gradient of its energy, and `tune` finds a time
+        step.
     steps : int or (int, int)
         Time steps of a proposal; with two numbers drawn between them.
     stepper : Stepper, optional
         A reversible and symplectic one: `Rattle` by default; for many atoms `BlanesMoan4`.
     keep : float
         The part of the velocities that a proposal keeps, from 0 to less than 1.
-    rng : int or numpy.random.Generator, optional
-        A seed, or a generator from which one is drawn; None takes one from the operating system. It can be read as
-        `seed`. A run continued from a trajectory needs another seed; with `restart` the random numbers go on.
-    fixcm : bool
-        Total momentum stays as it is, and takes degrees of freedom.
     tolerance : float
         Largest difference of a time step taken back.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -431,19 +409,14 @@ class MultipleTimeSteps(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With momenta (`draw_velocities`).
-    timestep : float
-        The large step, in ASE's unit of time.
+    atoms, timestep, temperature_K, rng, **kwargs
+        As for `ConstrainedLangevin`; the time step is the large one.
     fast, slow : ASE calculator
     fast_steps : int
         Small steps in a large one, 2 or more.
-    temperature_K : float
     friction : float
         In inverse units of ASE's time, for example 0.005/units.fs; above 0 with spheres.
     bath : {'langevin', 'spheres'}
-    seed : int or numpy.random.Generator, optional
-        Of the noise; None takes one from the operating system. It can be read as `seed`.
     difference : bool
         `slow` is the calculator of the whole energy, and the slow forces are what it gives more than `fast`.
     spheres : {'split', 'axes', 'cluster', 'global'}
@@ -456,8 +429,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
     slow_kicks : {'ends', 'middle'}
         With 'middle' the atoms are halfway between two slow kicks at the end of a step, where averages are better; what
         is logged there costs a call of `slow`.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -480,7 +451,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         friction: float,
         fast_steps: int,
         bath: Literal["langevin", "spheres"] = "langevin",
-        seed: int | np.random.Generator | None = None,
+        rng: int | np.random.Generator | None = None,
         difference: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -492,7 +463,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         for name in set(signature(*kinds.values()).parameters) & set(kwargs):
             raise InputError(f"{name} is no option with bath={bath!r}; leave it out", item=name)
         #: Seed of the noise.
-        self.seed = seed_from(seed, "seed")
+        self.seed = seed_from(rng)
         steps = {"slow": 1, "fast": fast_steps}
         make = partial(kind, friction=friction, seed=self.seed, steps=steps, **options)
         make(_thermal(temperature_K))  # what it refuses comes before calculators are called

@@ -490,7 +490,7 @@ def test_other_questions_to_the_calculator_change_nothing():
 def test_each_calculator_of_several_time_steps(changed):
     def made(atoms, fast, slow):
         return MultipleTimeSteps(
-            atoms, FS, fast=fast, slow=slow, temperature_K=300, friction=0.01 / FS, fast_steps=2, seed=1
+            atoms, FS, fast=fast, slow=slow, temperature_K=300, friction=0.01 / FS, fast_steps=2, rng=1
         )
 
     atoms, _ = water()
