@@ -145,11 +145,12 @@ class Constraints(FixConstraint):
         bound = make(given, atoms, self.degenerate)
         if bound.owner() is None:
             bound.owner = ref(self)
-        if make is bind:  # for another cell alone: rows, and objects that know them, stay
+        if make is bind:  # for another cell alone: rows, and what knows them, stay
             bound.given = self.constraints
+        else:
+            self._forget(atoms)
         self.constraints = bound.given
         self._repeated, self._binding = None, bound
-        self._forget(atoms)
         return bound
 
     def _forget(self, atoms: Atoms) -> None:

@@ -199,12 +199,7 @@ def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[i
 
 
 def require_on_surface(
-    held: ConstraintSet,
-    x: FloatArray,
-    time: float = 0.0,
-    *,
-    why: str = _OFF_AT_START,
-    by_class: bool = False,
+    held: ConstraintSet, x: FloatArray, time: float = 0.0, *, why: str = _OFF_AT_START, by_class: bool = False
 ) -> None:
     """Refuse positions that are off the constraints, or not finite there, and say `why`.
 

@@ -356,8 +356,15 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
     ) -> None:
         #: Seed of the random numbers.
         self.seed = seed_from(rng)
-        options = {"stepper": stepper, "keep": keep, "conserve_momentum": fixcm, "tolerance": tolerance}
-        make = partial(HamiltonianMonteCarlo, steps=steps, seed=self.seed, **options)
+        make = partial(
+            HamiltonianMonteCarlo,
+            steps=steps,
+            seed=self.seed,
+            stepper=stepper,
+            keep=keep,
+            conserve_momentum=fixcm,
+            tolerance=tolerance,
+        )
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
     @property
@@ -622,12 +629,7 @@ def draw_velocities(
                 count -= len(open_directions(system.motion, atoms.positions))
             wanted = 0.5 * count * thermal or None
         v = thermal_velocities(
-            system,
-            atoms.positions,
-            thermal,
-            generator_of(rng),
-            zero_momentum=zero_momentum,
-            kinetic_energy=wanted,
+            system, atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum, kinetic_energy=wanted
         )
         momenta = v * held._masses
     finally:

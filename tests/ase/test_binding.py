@@ -24,17 +24,7 @@ from ase.md.langevin import Langevin
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import FIRE
-from ase_systems import (
-    FS,
-    Field,
-    Free,
-    loose_waters,
-    off,
-    rigid,
-    slip,
-    state,
-    water,
-)
+from ase_systems import FS, Field, Free, loose_waters, off, rigid, slip, state, water
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -45,13 +35,7 @@ from kcons.ase import (
     constrain,
     rigid_water,
 )
-from kcons.constraints import (
-    Angle,
-    CenterDistance,
-    Distance,
-    LinearVelocity,
-    Sphere,
-)
+from kcons.constraints import Angle, CenterDistance, Distance, LinearVelocity, Sphere
 from kcons.errors import (
     ContradictionError,
     ConvergenceError,
@@ -271,12 +255,7 @@ def nan_at(atom):
         (Atoms("OH", np.eye(3)[:2], masses=[16, 0]), Distance([0, 1]), InputError, "atom 1 has mass 0"),
         (Atoms("OH"), Distance([0, 1]), SingularGeometryError, "atoms 0 and 1 coincide"),
         (Atoms("OH", np.eye(3)[:2], cell=[2.5] * 3, pbc=True), Distance([0, 1], 1.5), InputError, "half the box"),
-        (
-            molecule("H2O"),
-            [Distance([0, 1], 0.9), Distance([1, 0], 1.0)],
-            ContradictionError,
-            "different targets",
-        ),
+        (molecule("H2O"), [Distance([0, 1], 0.9), Distance([1, 0], 1.0)], ContradictionError, "different targets"),
         (molecule("H2O"), [FixAtoms([0])], InputError, "from_ase_constraints"),
     ],
 )

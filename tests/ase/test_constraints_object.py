@@ -13,30 +13,12 @@ from ase.calculators.tip3p import TIP3P
 from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase_systems import (
-    FS,
-    Free,
-    loose_waters,
-    off,
-    random,
-    rigid,
-    row_of_dumbbells,
-    slip,
-)
+from ase_systems import FS, Free, loose_waters, off, random, rigid, row_of_dumbbells, slip
 
 from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
 from kcons.ase.topology import bonds_of
-from kcons.constraints import (
-    CenterDistance,
-    Dihedral,
-    Distance,
-    FixedAtoms,
-)
-from kcons.errors import (
-    ContradictionError,
-    InfeasibleError,
-    InputError,
-)
+from kcons.constraints import CenterDistance, Dihedral, Distance, FixedAtoms
+from kcons.errors import ContradictionError, InfeasibleError, InputError
 
 # -- dynamics and optimisation ----------------------------------------------------------------------
 

@@ -16,16 +16,7 @@ from ase.io import read
 from ase.io.trajectory import Trajectory
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase_systems import (
-    FS,
-    Field,
-    equal,
-    off,
-    rigid,
-    slip,
-    state,
-    water,
-)
+from ase_systems import FS, Field, equal, off, rigid, slip, state, water
 
 from kcons.ase import (
     ConstrainedDynamics,

@@ -141,8 +141,7 @@ ALL = pytest.mark.parametrize("kind", ["isokinetic", "langevin", "nose-hoover", 
 
 
 @pytest.mark.parametrize(
-    ("calc", "fixed", "g"),
-    [(Waves, [], 18), (Pairs, [], 15), (Pairs, [0], 15), (Waves, [0, 1, 2], 12)],
+    ("calc", "fixed", "g"), [(Waves, [], 18), (Pairs, [], 15), (Pairs, [0], 15), (Waves, [0, 1, 2], 12)]
 )
 def test_isokinetic_holds_the_right_kinetic_energy(calc, fixed, g):
     """2K = (g - 1) kT with g by hand: 27 coordinates less 9 rows, less conserved momenta, less fixed atoms."""

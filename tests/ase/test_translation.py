@@ -30,11 +30,7 @@ from ase.constraints import (
 from ase.db import connect
 from ase.io import read, write
 from ase.md.verlet import VelocityVerlet
-from ase_systems import (
-    loose_waters,
-    off,
-    rigid,
-)
+from ase_systems import loose_waters, off, rigid
 
 from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (

@@ -15,18 +15,7 @@ from ase.md.langevin import Langevin
 from ase.md.nptberendsen import Inhomogeneous_NPTBerendsen, NPTBerendsen
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.optimize import BFGS
-from ase_systems import (
-    FS,
-    TEMPERATURE,
-    Free,
-    dumbbells,
-    follow,
-    mean_and_error,
-    off,
-    pressure,
-    random,
-    water_gas,
-)
+from ase_systems import FS, TEMPERATURE, Free, dumbbells, follow, mean_and_error, off, pressure, random, water_gas
 
 from kcons.ase import ConstrainedCalculator, constrain, rigid_water
 from kcons.constraints import Distance, Plane
