@@ -106,7 +106,10 @@ def plain_if_small(kernel: Any, size: int) -> Any:
 
 
 _PACKAGE = Path(__file__).parents[1]
-_HAS_KERNELS = re.compile(r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b", re.M)
+_HAS_KERNELS = re.compile(
+    r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b|^# Compiled into kernels",
+    re.MULTILINE,
+)
 _IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 
 

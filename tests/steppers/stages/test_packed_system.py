@@ -25,8 +25,8 @@ from kcons.constraints import (
 )
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
-from kcons.motion.local_projections import MANY_ITERATIONS
 from kcons.motion.motion import Motion
+from kcons.solvers.tolerances import MANY_ITERATIONS
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,
