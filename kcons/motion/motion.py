@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import (
     as_array,
-    check_multipliers,
     check_out,
     check_pairs,
     finite_number,
@@ -260,7 +259,7 @@ class Motion:
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
             inv_dt = 1.0 / float(dt)  # type: ignore[arg-type]
         if multipliers is not None:
-            check_multipliers(multipliers, self.constraint_set.n_rows)
+            check_out(multipliers, (self.constraint_set.n_rows,), "multipliers")
         if type(time) is not float or not isfinite(time):
             time = finite_number(time, "time")
         reference_time = time if reference_time is None else finite_number(reference_time, "reference_time")
@@ -312,7 +311,7 @@ class Motion:
         if out is not None:
             check_out(out, self._shape)
         if multipliers is not None:
-            check_multipliers(multipliers, self.constraint_set.n_rows)
+            check_out(multipliers, (self.constraint_set.n_rows,), "multipliers")
         self.cell()
         atoms = self._atoms
         if atoms is None:

@@ -39,7 +39,7 @@ MUTANTS = [
         "tests/solvers/sparse/test_row_functions.py::test_rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
     ),
     (
-        "solvers/sparse/row_functions.py",
+        "constraints/velocity.py",
         "half = 0.5 * (bx * gx",
         "half = -0.5 * (bx * gx",
         "tests/solvers/sparse/test_row_functions.py::test_gradients_of_rows_of_velocities[KnifeEdge]",
