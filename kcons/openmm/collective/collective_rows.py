@@ -43,8 +43,7 @@ from kcons.openmm.collective.rows_in_context import TOLERANCE, RowsInContext
 from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import virtual_sites
-from kcons.steppers.compositions import Composition
-from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Composition, Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator

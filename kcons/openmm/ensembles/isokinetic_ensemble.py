@@ -28,10 +28,8 @@ from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion, warn_of_barostat
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
-from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
 from kcons.thermostats.freedom import atom_numbers, warn_of_conserved_momenta
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that

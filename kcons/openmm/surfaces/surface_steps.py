@@ -10,7 +10,7 @@ from __future__ import annotations
 from kcons.openmm.integrator.steps import ConstantEnergy, Step, declare_guards, see_who_moved, use
 from kcons.openmm.surfaces.closed_forms import QuadricRows
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
-from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Rattle
 
 
 def surface_step(step: Step) -> bool:

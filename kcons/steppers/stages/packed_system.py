@@ -1,4 +1,4 @@
-"""All that is held by one system as the table that compiled steps read, where kernels know all of it.
+"""What compiled steps know of a system: 1/m, spheres, how far is far, and its rows where kernels know all of them.
 
 The tables are those of `solvers.called_solvers`: rigid triangles, chains and rows of all kinds that are at rest, each
 with its solver, behind one array of numbers.
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import Motion
 from kcons.solvers.called_solvers import Addressable, CalledSolver, pack_solver_tables, set_lattice
@@ -30,51 +31,37 @@ MOST_ROWS = 96
 #: Chains have a kernel of their own, which costs as much as that for all shapes on so many rows, and so many more a
 #: slot of eight lanes; where others are held so that both are called, on more.
 CHAIN_ROWS, CHAIN_ROWS_BESIDES, ROWS_A_SLOT = 20, 40, 2
-#: No number of iterations.
-_UNKNOWN = -1.0
 
 
 class PackedSystem:
-    """What compiled steps know of one system: its rows and the cell, 1/m, and how far from the origin is far.
+    """All rows of a system and its cell as the tables of compiled steps.
 
     Parameters
     ----------
     motion : Motion
     found : PackedRows
-        All its rows, from `packed_rows`, with the rest of `made_of` behind them.
-    made_of : tuple
-        What `of` was given.
+        From `packed_rows`.
+    more : tuple of ndarray
+        What is behind the rows, see `more_tables`.
     """
 
-    def __init__(self, motion: Motion, found: PackedRows, made_of: tuple[Any, ...]) -> None:
-        self.motion = motion
+    def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
+        self.motion, self._more = motion, more
         self._tables, self._called = found
-        self._made_of = made_of
         self._cell, self._sources = motion.cell, motion.sources
         self._lattice = motion.lattice
-        #: Those that the engine was told of last.
-        self.iterations = _UNKNOWN
+        #: Those that the engine was told of last; -1: of none.
+        self.iterations = -1.0
         set_lattice(self._tables, self._lattice)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).of, self._made_of  # addresses are of no use elsewhere
+        return type(self).of, (self.motion, *self._more)  # addresses are of no use elsewhere
 
     @classmethod
-    def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> PackedSystem | None:
-        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows.
-
-        Parameters
-        ----------
-        motion : Motion
-        weights : ndarray, shape (n_atoms, 3)
-            1/m.
-        held : ndarray of int
-            Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
-        far : float
-            The system is far if the first is this many times farther from the origin than from any other.
-        """
-        found = packed_rows(motion, weights.ravel(), held, np.array([far]))
-        return None if found is None else cls(motion, found, (motion, weights, held, far))
+    def of(cls, motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
+        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows."""
+        found = packed_rows(motion, *more)
+        return None if found is None else cls(motion, found, more)
 
     @property
     def tables(self) -> FloatArray:
@@ -95,6 +82,55 @@ class PackedSystem:
         self.iterations = iterations
         if iterations >= 0:
             self.motion.took(int(iterations))
+
+
+def more_tables(
+    weights: FloatArray, held: IntArray, far: float, spheres: FloatArray | None
+) -> tuple[NDArray[Any], ...]:
+    """What is behind the rows in the tables.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (n_atoms, 3)
+        1/m.
+    held : ndarray of int
+        Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
+    far : float
+        The system is far if the first is this many times farther from the origin than from any other.
+    spheres : ndarray, shape (n_atoms, 4), or None
+        From `spheres_of`.
+    """
+    return weights.ravel(), held, np.array([far]), np.zeros(0) if spheres is None else spheres.ravel()
+
+
+def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
+    """The tables where all rows are left to the engine."""
+    none = np.zeros((0, 2), dtype=np.int64)
+    return packed(None, None, none, np.zeros(0), np.zeros(0), none[:, 0], np.zeros((0, 3)), *more)
+
+
+def spheres_of(motion: Motion) -> FloatArray | None:
+    """Center and radius of each atom where all rows keep one atom on a resting sphere, or at rest; otherwise None.
+
+    The radius of atoms that are free is 0, of those at rest -1.
+    """
+    found, none = np.zeros((motion.n_atoms, 4)), np.zeros(0, dtype=np.int64)
+    held, resting = [none], [none]
+    for item in motion.constraint_set.constraints:
+        if item.moving:
+            return None
+        if isinstance(item, Sphere):
+            held.append(item.atoms[:, 0])
+            found[held[-1], :3], found[held[-1], 3] = item.center, item.target_at(0.0)
+        elif item.family == "FixedAtoms":
+            resting.append(item.atoms.ravel())
+        else:
+            return None
+    atoms, still = np.concatenate(held), np.concatenate(resting)
+    if not len(atoms) or len(np.unique(atoms)) != len(atoms) or np.isin(atoms, still).any():
+        return None
+    found[still, 3] = -1.0
+    return found
 
 
 class PackedRows(NamedTuple):

@@ -120,7 +120,7 @@ MUTANTS = [
         "steppers/interpreter.py",
         "self.made += 1\n        self.number += 1",
         "self.made += 1",
-        "tests/steppers/test_splitting.py::test_errors_name_the_step",
+        "tests/steppers/test_interpreter.py::test_errors_name_the_step",
     ),
     (
         "steppers/interpreter.py",
@@ -130,9 +130,9 @@ MUTANTS = [
     ),
     (
         "steppers/interpreter.py",
-        "return True\n        if self.low is not None:\n            self.low.fill(0.0)",
-        "return True",
-        "tests/steppers/test_splitting.py::test_a_march_by_the_engine_is_the_same_to_the_last_bit",
+        "if self.low is not None:\n                    self.low.fill(0.0)\n                self._next_step()",
+        "self._next_step()",
+        "tests/steppers/test_interpreter.py::test_steps_in_kernels_are_those_of_the_engine",
     ),
     (
         "steppers/program.py",
@@ -143,6 +143,12 @@ MUTANTS = [
     (
         "steppers/program.py",
         "met[verb] += 1",
+        "pass",
+        "tests/thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part",
+    ),
+    (
+        "thermostats/langevin.py",
+        "numbers[PART] += 1.0",
         "pass",
         "tests/thermostats/multistep/test_respa.py::test_each_exchange_of_a_step_has_noise_of_its_own",
     ),
@@ -156,11 +162,11 @@ MUTANTS = [
         "steppers/stages/compiled_operations.py",
         "            if pairs:\n                low[:] = 0.0",
         "            if False:\n                low[:] = 0.0",
-        "tests/steppers/test_splitting.py::test_the_same_to_the_last_bit",
+        "tests/steppers/test_interpreter.py::test_steps_in_kernels_are_those_of_the_engine",
     ),
     (
         "thermostats/langevin.py",
-        "noise += (1.0 - keep) * kept",
+        "noise += (1.0 - math.exp(-thermostat.friction * dt)) * kept",
         "noise += kept",
         "tests/thermostats/test_langevin.py::test_momentum_is_left_alone_where_asked",
     ),

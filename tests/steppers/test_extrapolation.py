@@ -11,15 +11,17 @@ from stepper_attempts import attempts, counted, end_of, system_of_test
 from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
 from stepper_systems import gravity, growing_rod, rotor, skate, spherical_pendulum, system_of
 
+from kcons import run
 from kcons.comparison import compare, test_systems
 from kcons.constraints import Distance, FixedAtoms
+from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import (
     Extrapolation,
     Geodesic,
     Rattle,
     State,
 )
-from kcons.steppers.adaptive.extrapolation import _Table
+from kcons.steppers.extrapolation import _Table
 from tests.contracts import test_reference_orders as references
 
 
@@ -35,8 +37,8 @@ class Columns:
         state = system.with_forces(state)
         table = _Table(self.scheme, system, state, dt, 1.0)
         for n in range(1, self.columns + 1):
-            table._add(n)
-        return self.scheme._landed(system, state, table, None)
+            table.add(n)
+        return table.landed(None)
 
 
 # -- order and errors ---------------------------------------------------------------------------
@@ -202,7 +204,7 @@ def test_hopeless_attempts_end_early() -> None:
     system, times = counted(free)
     state = system.initial_state(np.zeros((2, 3)))
     scheme = Extrapolation(1e-12)
-    aim = scheme._first_columns()
+    aim = 8
     table = _Table(scheme, system, system.with_forces(state), 5.0, 1.0)
     times.clear()
     assert not table.fill(aim)
@@ -276,8 +278,8 @@ def test_one_evaluation_at_the_end_of_a_step_serves_all_lines_of_the_next(monkey
     system, state = spherical_pendulum()
     system, times = counted(system)
     lines: list[int] = []
-    add = _Table._add
-    monkeypatch.setattr(_Table, "_add", lambda table, n: lines.append(n) or add(table, n))
+    add = _Table.add
+    monkeypatch.setattr(_Table, "add", lambda table, n: lines.append(n) or add(table, n))
     for base in (Rattle(), StepByStep()):
         times.clear()
         lines.clear()
@@ -331,3 +333,44 @@ def test_far_from_the_origin() -> None:
     states = list(Extrapolation(1e-12, speed=1.0).states(system, away, 4.0))
     assert states[0].remainder is None and states[-1].remainder is not None
     assert np.abs(turned(states[-1]) - ends[0][:3]).max() < 1e-10
+
+
+# -- what is refused, and where steps end --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "item"),
+    [
+        *(({"tolerance": bad}, "tolerance") for bad in (0.0, -1e-3, 9e-15, np.nan, np.inf)),
+        *(({item: bad}, item) for item in ("length", "speed") for bad in (0.0, -1.0, np.nan, np.inf)),
+    ],
+)
+def test_bad_numbers(options, item) -> None:
+    with pytest.raises(InputError, match=f"{item} is .*; give a") as raised:
+        Extrapolation(**options)
+    assert raised.value.item == item
+
+
+def test_what_is_refused_before_any_step() -> None:
+    """Where `states` is called, not where its first state is asked for; `run` says that it is to be called."""
+    system, state = spherical_pendulum()
+    for until in (np.nan, np.inf, "1", None):
+        with pytest.raises(InputError, match="until is"):
+            Extrapolation().states(system, state, until)
+    with pytest.raises(InputError, match=r"it chooses its own steps: .* states\("):
+        run(system, state, 0.1, 3, stepper=Extrapolation())
+    for first in (0.0, -0.1, np.nan):
+        with pytest.raises(InputError, match="first_step is"):
+            Extrapolation().states(system, state, 1.0, first_step=first)
+    with pytest.raises(UnsupportedError, match="Extrapolation knows no thermostats"):
+        Extrapolation().states(system, replace(state, thermostat=np.zeros(2)), 1.0)
+
+
+def test_the_end_is_met_exactly_and_no_step_before_it_is_tiny() -> None:
+    system, state = spherical_pendulum()
+    assert list(Extrapolation().states(system, state, 0.0)) == []
+    for until in (0.1, 1.0 / 3.0, 2.0, -0.7):
+        states = list(Extrapolation(1e-8).states(system, state, until))
+        assert states[-1].time == until and states[-1].time_remainder == 0.0
+        sizes = np.abs(np.diff([0.0, *(s.time for s in states)]))
+        assert sizes[-1] > 0.45 * sizes[-2:].max()
