@@ -33,10 +33,10 @@ from kcons.openmm.callback_rows.callbacks import (
     hands_over_all,
 )
 from kcons.openmm.collective.coordinates import free_groups
-from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.part import NEAR, Part, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import require_context, virtual_sites
+from kcons.openmm.integrator.system_checks import refuse_agents, require_context, virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
@@ -78,7 +78,6 @@ class CarriedConstraints(Part):
     """
 
     evaluates = lands_last = True
-    written = (*Part.written, "_early", "_begins_early")
     _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
@@ -193,7 +192,7 @@ class CarriedConstraints(Part):
         require_context(context)
         system = context.getSystem()
         self._check_system(system, Precision.of(context))
-        refuse_agents(system, self.motion.constraint_set, context.getMolecules)
+        refuse_movers(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
         self._tell_of_rounding(x)
         miss = self._worst(x, v if velocities else None, time)
@@ -233,16 +232,16 @@ class CarriedConstraints(Part):
                     "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
                 )
 
-    def take_place(self, program: Program, context: openmm.Context) -> None:
+    def attach(self, program: Program, context: openmm.Context) -> None:
         """A State or checkpoint that was loaded is where its own steps ended, the engine is not."""
         self._engine.stand_at(self._state(context)[0])
 
-    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+    def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
         """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
         x, v, time = self._state(context)
         return self._worst(x, v if velocities else None, time)
 
-    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
+    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Violation | None:
         held = self.motion.sources[0]
         found = held.residuals(x, v, time)
         near, slow = self._engine.passage.limits
@@ -253,13 +252,13 @@ class CarriedConstraints(Part):
             self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
         if self._engine.rounded(x):
             allowed += 2.0**-22 * reach * self._slopes
-        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
         if miss is not None or found.rates is None or found.speeds is None:
             return miss
         size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
         # What is taken from v where it is carried together with x: all there is of a body at rest.
         lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
-        return Miss.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
+        return Violation.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
 
     def _tell_of_rounding(self, x: FloatArray) -> None:
         """Warn once of coordinates so large that their rounding adds noise to the velocities."""
@@ -366,11 +365,6 @@ class CarriedConstraints(Part):
         #: Where a step may end without a projection, the solve for positions must tell of failures itself.
         self._early = self.lean or getattr(program.integrator, "scheme", None) is None
         self._begins_early = getattr(getattr(program.integrator, "ensemble", None), "stays_tangent", False)
-
-    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
-        """Times, stages and lengths of drifts are those of the integrator that makes steps."""
-        super().serve(integrator, notes)
-        self._engine.follow(integrator, self.lean)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""
@@ -490,42 +484,9 @@ def refuse_single_precision(precision: Precision, force: openmm.PythonForce | No
         )
 
 
-def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
-    """Refuse barostats and other forces that move particles off the rows between steps."""
-    bound = next((item for item in held.constraints if not item.translation_invariant), None)
-    for force in system.getForces():
-        name = type(force).__name__
-        if isinstance(force, openmm.CMMotionRemover) and bound is not None:
-            raise UnsupportedError(
-                f"{name} shifts all velocities, but {bound!r} ties atoms to a place, and momentum is not conserved; "
-                "remove that force (createSystem(..., removeCMMotion=False))"
-            )
-        if "Barostat" not in name:
-            continue
-        if bound is not None:
-            raise UnsupportedError(
-                f"{name} moves molecules, but {bound!r} ties atoms to a place; run at constant volume, or hold "
-                "differences of positions only"
-            )
-        rigid = getattr(force, "getScaleMoleculesAsRigid", None)
-        if rigid is not None and not rigid():
-            raise UnsupportedError(f"{name} scales atoms one by one; call setScaleMoleculesAsRigid(True)")
-        row = _row_between(held, molecules())
-        if row is not None:
-            raise UnsupportedError(
-                f"{name} moves molecules apart, but row {held.row_name(row)} holds atoms of two of them; let them "
-                "count as one molecule by hold(system, ..., join=True), or run at constant volume"
-            )
-
-
-def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
-    """A row with atoms of several molecules."""
-    label = np.zeros(held.n_atoms, dtype=np.int64)
-    for k, atoms in enumerate(molecules):
-        label[list(atoms)] = k
-    for item, start in zip(held.constraints, held.starts, strict=False):
-        of = label[item.atoms]
-        apart = (of != of[:, :1]).any(axis=1)
-        if apart.any():
-            return int(start + np.argmax(apart))
-    return None
+def refuse_movers(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
+    """Refuse barostats and a CMMotionRemover that would move particles off the rows."""
+    bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
+    starts = zip(held.constraints, held.starts, strict=False)
+    rows = [(item.atoms, lambda k, start=start: held.row_name(start + k)) for item, start in starts]
+    refuse_agents(system, bound, rows, molecules)

@@ -428,7 +428,7 @@ def test_what_cannot_be_thermostatted_is_refused():
     system.addParticle(14.0)
     x, v = np.vstack([x, x[:1] + 0.2]), np.vstack([v, v[:1]])
     part = hold(system, [Distance([[0, 2]], lambda t: np.sqrt(0.12) + 0.5 * t)], positions=x)
-    with pytest.raises(UnsupportedError, match=r"targets of .* move"):
+    with pytest.raises(UnsupportedError, match="needs constant targets"):
         run(system, ProjectedIntegrator(1e-3, parts=[part], ensemble=NoseHoover(300.0, 20.0)), x, v, 1)
     one = openmm.System()
     one.addParticle(1.0)
