@@ -296,6 +296,7 @@ class CollectiveRows(GroupRows):
         InfeasibleError
             Rows that are plain coordinates cannot be reached with bonds and angles as they are; likewise.
         """
+        require_context(context)
         scales, velocities = np.array(self.scales), velocities_of(context)
         start, system = positions_of(context), context.getSystem()
         if tolerance is None:

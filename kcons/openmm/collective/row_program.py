@@ -22,6 +22,7 @@ from kcons.errors import InputError
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import require_context
 from kcons.steppers.operations import Exchange
 
 #: A pivot below this fraction of the row's own norm means that the row depends on others, in double precision.
@@ -469,6 +470,7 @@ def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
 
 def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
+    require_context(context)
     integrator = context.getIntegrator()
     members = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
