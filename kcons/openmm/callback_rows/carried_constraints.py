@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
 
@@ -36,12 +35,10 @@ from kcons.openmm.collective.coordinates import free_groups
 from kcons.openmm.integrator.part import NEAR, Part, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import refuse_agents, require_context, virtual_sites
+from kcons.openmm.integrator.system_checks import groups_in, refuse_agents, require_context, virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
+from kcons.openmm.states import forces_at
 from kcons.openmm.topology import bonds_of
-
-#: Rounding of positions, relative to the shortest row, that a run begins to show.
-COARSE = 1e-11
 
 
 class CarriedConstraints(Part):
@@ -78,7 +75,6 @@ class CarriedConstraints(Part):
     """
 
     evaluates = lands_last = True
-    _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
 
@@ -194,7 +190,6 @@ class CarriedConstraints(Part):
         self._check_system(system, Precision.of(context))
         refuse_movers(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
-        self._tell_of_rounding(x)
         miss = self._worst(x, v if velocities else None, time)
         if miss is not None:
             raise InputError(
@@ -260,21 +255,6 @@ class CarriedConstraints(Part):
         lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
         return Violation.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
 
-    def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Warn once of coordinates so large that their rounding adds noise to the velocities."""
-        held = self.motion.constraint_set
-        if self._told or not held.n_rows:
-            return
-        reach = float(np.abs(x[held.touched]).max())
-        grain = self._engine.passage.grain(reach)
-        self._told = grain > COARSE * held.scale.min()
-        if self._told:
-            warnings.warn(
-                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; "
-                "each step turns this into velocity, and the energy wanders. Move the origin nearer",
-                stacklevel=3,
-            )
-
     def apply_positions(self, context: openmm.Context) -> None:
         """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
 
@@ -315,9 +295,8 @@ class CarriedConstraints(Part):
         state = context.getState(positions=True, velocities=True)
         if self._engine.cell is not None:
             self._engine.follow_cell(state)
-        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
-        return x, v, state.getTime().value_in_unit(unit.picosecond)
+        x, v = np.asarray(state.getPositions(asNumpy=True)._value), np.asarray(state.getVelocities(asNumpy=True)._value)
+        return x, v, float(state.getTime()._value)
 
     # -- results --------------------------------------------------------------------------------
 
@@ -328,10 +307,7 @@ class CarriedConstraints(Part):
         at the price of a force evaluation where forces are not known.
         """
         x, v, time = self._state(context)
-        groups = {g for g in range(32) if g not in self.groups}
-        kept = context.getIntegrator().getIntegrationForceGroups()
-        state = context.getState(forces=True, groups=kept & sum(1 << g for g in groups))
-        f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        f = forces_at(context, groups_in(context.getIntegrator()) - self.groups)
         return self.motion.multipliers(x, v, f, time)
 
     @property
