@@ -106,7 +106,7 @@ def more_tables(
 def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
     """The tables where all rows are left to the engine."""
     none = np.zeros((0, 2), dtype=np.int64)
-    return packed(None, None, none, np.zeros(0), np.zeros(0), none[:, 0], np.zeros((0, 3)), *more)
+    return pack_solver_tables([], none[:, 0], np.zeros((0, 3)), *more)
 
 
 def spheres_of(motion: Motion) -> FloatArray | None:
