@@ -106,10 +106,10 @@ def plain_if_small(kernel: Any, size: int) -> Any:
 
 
 _PACKAGE = Path(__file__).parents[1]
-#: Kernels, functions that are compiled as parts of kernels, and numbers in them.
+#: Kernels, and functions that are compiled as parts of kernels.
 _HAS_KERNELS = re.compile(
-    r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b|^ +def row\(r: Any, p: Any"
-    r"|^# Compiled into kernels",
+    r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b|^# Compiled into kernels"
+    r"|^ +def row\(r: Any, p: Any",
     re.MULTILINE,
 )
 _IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)

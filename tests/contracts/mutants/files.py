@@ -226,9 +226,9 @@ MUTANTS = [
         "tests/ase/test_logger.py::test_a_fixed_atom_needs_no_mass",
     ),
     (
-        "openmm/collective/rows_in_context.py",
-        "self._clock == 0.0",
-        "self._clock >= 0.0",
+        "openmm/collective/collective_rows.py",
+        "self._clock(holder) == 0.0",
+        "self._clock(holder) >= 0.0",
         "tests/openmm/collective/test_row_program.py::test_a_state_of_another_program_has_no_time_of_targets",
     ),
 ]

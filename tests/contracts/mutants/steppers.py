@@ -274,8 +274,8 @@ MUTANTS = [
     ),
     (
         "thermostats/correlated_series.py",
-        "more = [], [], np.expm1(_LOG_R)",
-        "more = [], [], 0.0 * _LOG_R",
+        "        more = np.expm1(log_r)",
+        "        more = 0.0 * log_r",
         "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[memory-3]",
     ),
     (
@@ -283,6 +283,12 @@ MUTANTS = [
         "_ALIKE * float(blocks @ blocks)",
         "float(blocks @ blocks)",
         "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[smooth]",
+    ),
+    (
+        "thermostats/correlated_series.py",
+        "for turn in (0.0, *_OSCILLATORS):",
+        "for turn in (0.0,):",
+        "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[underdamped]",
     ),
     (
         "thermostats/correlated_series.py",
