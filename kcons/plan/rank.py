@@ -9,7 +9,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
-from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.addressable_solvers import AddressableSolver
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent, rank
@@ -82,6 +82,6 @@ def rank_of_shape(
     """Independent rows of a shape whose graph does not tell; `moved` as in `Request`."""
     if isinstance(solver, GeneralClusters):
         return solver.rank(positions, time, moved)
-    if isinstance(solver, CalledSolver):
+    if isinstance(solver, AddressableSolver):
         return solver.rank(positions, lattice, time, moved)
     return rank_of_small(shape, inverse_masses, positions, lattice)

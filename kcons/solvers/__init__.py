@@ -3,7 +3,7 @@
 - `tolerances`: every number of Newton's method and of rank, and why
 - `kernels`: what compiled kernels are made of
 - `cluster_solver`: the contract of a solver: what it is asked, and what it reports
-- `called_solvers`: solvers as data, which kernels call by address, alone or several in one call
+- `addressable_solvers`: solvers as data, which kernels call by address, alone or several in one call
 - `distance_clusters`: what the solvers of held distances share
 - `rigid_triangles`, `small_clusters`, `chains`, `sparse`: held distances by shape, and rows of mixed kinds
 - `single_rows`: functions that share no atom

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import NO_NUMBERS, Kernels
+from kcons.solvers.addressable_solvers import NO_NUMBERS, Kernels
 from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.kernels.lattices import OPEN, lattice_kind, nearest_image
 from kcons.solvers.sparse.elimination import FAST
@@ -19,8 +20,9 @@ from kcons.solvers.tolerances import EPS, ROUNDING
 _NO_POINTS = np.zeros((0, 3))
 
 
-class PackedLanes(NamedTuple):
-    """A solver of eight clusters at a time, for other kernels: see `kcons.solvers.called_solvers`."""
+@dataclass
+class PackedLanes:
+    """A solver of eight clusters at a time, for other kernels: see `kcons.solvers.addressable_solvers`."""
 
     kernels: Kernels
     tables: FloatArray

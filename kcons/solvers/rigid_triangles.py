@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.called_solvers import Kernels
+from kcons.solvers.addressable_solvers import Kernels
 from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver
 from kcons.solvers.kernels.aligned_memory import copied, in_one_array, room
 from kcons.solvers.kernels.array_views import at_first, halves, integers, none_of, piece
@@ -221,7 +221,7 @@ def project_triangles(tangent, points, references, velocities, inverse_dt, given
 
 @njit(cache=True, nogil=True)
 def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
-    """This and the next two as `kcons.solvers.called_solvers` says."""
+    """This and the next two as `kcons.solvers.addressable_solvers` says."""
     sides = wanted if wanted.size else piece(tables, integers(tables), _SIDES)
     return project_triangles(None, x, x_ref, v, inv_dt, sides, lattice, kind, none_of(tables), tables)
 

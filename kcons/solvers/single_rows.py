@@ -14,7 +14,7 @@ from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import CalledSolver, Kernels
+from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import halves, integers, piece
 from kcons.solvers.kernels.lattices import OPEN
@@ -43,7 +43,7 @@ WORDS, ALLOWED, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
 _PUSHES, _SOLUTION, _RUNS = 7, 8, 9
 
 
-class SingleRows(CalledSolver):
+class SingleRows(AddressableSolver):
     """Solver for clusters of one row, which is a function.
 
     Parameters
@@ -145,7 +145,7 @@ def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, pushes, solution = piece(u, h, 0), piece(u, h, 1), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
     for k in range(len(solution)):
@@ -161,7 +161,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 def _positions(  # type: ignore[no-untyped-def]
     careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
-    """As `kcons.solvers.called_solvers` says; all is careful here."""
+    """As `kcons.solvers.addressable_solvers` says; all is careful here."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses, base = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2), piece(t, h, 3)
     state, scale, pushes, solution = piece(t, h, 4), piece(t, h, 5), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
@@ -260,7 +260,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2)
     pushes, solution, driven = piece(t, h, _PUSHES), piece(t, h, _SOLUTION), wanted.size > 0

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import address_of
+from kcons.solvers.addressable_solvers import address_of
 from kcons.steppers.operations import Fly, Kick, Operation
 from kcons.steppers.stages import compiled_operations as kernel
 from kcons.steppers.stages.compiled_operations import ADDRESS, CALL, FUNCTION, PYTHON, WIDTH

@@ -9,7 +9,7 @@ from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
-from kcons.solvers.called_solvers import packed_positions, packed_tangents, set_lattice
+from kcons.solvers.addressable_solvers import packed_positions, packed_tangents, set_lattice
 from kcons.steppers.stages.packed_system import MOST_ROWS, packed_rows
 
 FAR_AWAY = np.array([5.0, -7.0, 3.0])

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import Kernels
+from kcons.solvers.addressable_solvers import Kernels
 from kcons.solvers.chains.strips import SHORT, long_strip, short_strip, whole_slots
 from kcons.solvers.chains.sweeps import BONDS, LENGTHS, SLOT, project
 from kcons.solvers.cluster_solver import Outcome, Request, resume
@@ -18,7 +18,7 @@ from kcons.solvers.tolerances import MAX_ROUNDS
 
 @njit(cache=True, nogil=True)
 def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
-    """This and the next two as `kcons.solvers.called_solvers` says."""
+    """This and the next two as `kcons.solvers.addressable_solvers` says."""
     lengths = wanted if wanted.size else piece(tables, integers(tables), LENGTHS)
     return project(None, x, x_ref, v, inv_dt, lengths, lattice, kind, none_of(tables), tables)
 

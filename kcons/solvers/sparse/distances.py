@@ -13,7 +13,7 @@ from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import CalledSolver, Kernels
+from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, piece
@@ -53,7 +53,7 @@ from kcons.solvers.tolerances import (
 _PAIRS, _LENGTHS, _STATE, _PIVOTS, _MOVES, _SOLUTION = 9, 10, 11, 13, 16, 17
 
 
-class SparseDistances(CalledSolver):
+class SparseDistances(AddressableSolver):
     """Solver for distance rows in clusters of any shape.
 
     Parameters
@@ -239,7 +239,7 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
 def _positions(  # type: ignore[no-untyped-def]
     careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atoms, atom_start, w = at_piece(h, h, 0), at_piece(u, h, 1), at_piece(h, h, 2), at_piece(t, h, 3)
     links, columns, targets, couplings = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(t, h, 7)
@@ -336,7 +336,7 @@ def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atoms, atom_start, w = at_piece(h, h, 0), at_piece(u, h, 1), at_piece(h, h, 2), at_piece(t, h, 3)
     links, columns, targets, couplings = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(t, h, 7)
@@ -425,7 +425,7 @@ def _largest(first, last, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
     atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
     for a in range(h[3] - h[2]):
@@ -434,6 +434,6 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST)
 def _resolved(x, lattice, kind, tables):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
     return resolved(x, piece(halves(tables), h, _PAIRS), piece(tables, h, _LENGTHS), lattice, kind)

@@ -15,7 +15,7 @@ from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import CalledSolver, Kernels, address_of, caller_of
+from kcons.solvers.addressable_solvers import AddressableSolver, Kernels, address_of, caller_of
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS, at_first, at_piece, halves, integers
 from kcons.solvers.kernels.lattices import OPEN
@@ -67,7 +67,7 @@ _BACKWARD = types.none(*_RANGE, *(3 * (INDICES,)), *(6 * (NUMBERS,)))
 _call_factor, _call_forward, _call_backward = map(caller_of, (_FACTOR, _FORWARD, _BACKWARD))
 
 
-class SparseRows(CalledSolver):
+class SparseRows(AddressableSolver):
     """Solver for clusters of compiled rows of any kind.
 
     Parameters
@@ -328,7 +328,7 @@ def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST)
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
     atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
     for a in range(h[3] - h[2]):
@@ -339,7 +339,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 def _positions(  # type: ignore[no-untyped-def]
     careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
     kinds, links, columns, targets = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(u, h, 7)
@@ -427,7 +427,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
-    """As `kcons.solvers.called_solvers` says."""
+    """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
     kinds, links, columns, targets = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(u, h, 7)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import RowKind
 from kcons.constraints.internal import angle_between
-from kcons.solvers.called_solvers import address_of, caller_of
+from kcons.solvers.addressable_solvers import address_of, caller_of
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS
 from kcons.solvers.kernels.two_and_four_wide import (
     dot,

@@ -23,7 +23,7 @@ from numba.extending import intrinsic
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
-from kcons.solvers.called_solvers import MORE, caller_of, packed_positions, packed_tangents
+from kcons.solvers.addressable_solvers import MORE, caller_of, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import bits, flat, integers, piece, view
 from kcons.solvers.tolerances import MANY_ITERATIONS
 

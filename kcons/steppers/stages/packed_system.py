@@ -1,6 +1,6 @@
 """What compiled steps know of a system: 1/m, spheres, how far is far, and its rows where kernels know all of them.
 
-The tables are those of `solvers.called_solvers`: rigid triangles, chains and rows of all kinds that are at rest, each
+The tables are those of `solvers.addressable_solvers`: rigid triangles, chains and rows of all kinds that are at rest, each
 with its solver, behind one array of numbers.
 """
 
@@ -16,7 +16,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import Motion
-from kcons.solvers.called_solvers import Addressable, CalledSolver, pack_solver_tables, set_lattice
+from kcons.solvers.addressable_solvers import Addressable, AddressableSolver, pack_solver_tables, set_lattice
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import SimdClusterSolver
@@ -188,7 +188,7 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
 
 def _solver_like(
     solver: ClusterSolver, held: ConstraintSet, inverse_masses: FloatArray, eliminate_last: NDArray[np.bool_]
-) -> CalledSolver:
+) -> AddressableSolver:
     rows = np.sort(solver.rows)
     if isinstance(solver, SingleRows):
         return SingleRows(held, rows, inverse_masses)

@@ -191,10 +191,10 @@ MUTANTS = [
     ),
     # -- functions --
     (
-        "solvers/called_solvers.py",
+        "solvers/addressable_solvers.py",
         "_call_apply(words[k + 2], (v, inv_dt, mine))",
         "_call_apply(words[k + 2], (v, 1.0, mine))",
-        "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
+        "tests/solvers/test_addressable_solvers.py::test_the_same_as_from_python",
     ),
     (
         "constraints/surface.py",

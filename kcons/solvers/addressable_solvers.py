@@ -77,7 +77,7 @@ class Addressable(Protocol):
         """Raise what a Python function among the rows has raised while a kernel ran."""
 
 
-class CalledSolver(ABC):
+class AddressableSolver(ABC):
     """Base of the solvers that all kernels can call, each a `ClusterSolver`.
 
     Attributes

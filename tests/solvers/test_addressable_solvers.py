@@ -11,7 +11,7 @@ import pytest
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, Custom, Dihedral, Distance, Sphere
-from kcons.solvers.called_solvers import pack_solver_tables, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.addressable_solvers import pack_solver_tables, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
