@@ -38,7 +38,7 @@ from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.kernels.aligned_memory import in_one_array
 from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, none_of, piece, view
 from kcons.solvers.kernels.lattices import NO_LATTICE, lattice_kind
-from kcons.solvers.kernels.two_and_four_wide import entry, number, put
+from kcons.solvers.kernels.two_and_four_wide import load_double, load_index, store_double
 from kcons.solvers.tolerances import MAX_ROUNDS
 
 NO_NUMBERS = np.zeros(0)
@@ -273,7 +273,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     t, h, u = tables, integers(tables), halves(tables)
     pinned, places = at_piece(u, h, _PINNED), at_piece(t, h, _PLACES)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
-        put(x, 3 * entry(pinned, k // 3) + k % 3, number(places, k))
+        store_double(x, 3 * load_index(pinned, k // 3) + k % 3, load_double(places, k))
     words, lattice, kind, none = piece(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
     most = 0
     for k in range(0, words.size, WORDS):
@@ -310,7 +310,7 @@ def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     pinned = at_piece(u, h, _PINNED)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
-        put(v, 3 * entry(pinned, k // 3) + k % 3, 0.0)
+        store_double(v, 3 * load_index(pinned, k // 3) + k % 3, 0.0)
     words, lattice, kind, none = piece(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +26,7 @@ class PackedLanes:
 
     kernels: Kernels
     tables: FloatArray
-    numbers: FloatArray = NO_NUMBERS
+    numbers: FloatArray = field(default_factory=lambda: NO_NUMBERS)
 
     def refuse(self) -> None:
         """There is nothing to be refused."""

@@ -18,7 +18,15 @@ from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import halves, integers, piece
 from kcons.solvers.kernels.lattices import OPEN
-from kcons.solvers.kernels.two_and_four_wide import entry, lane, load_point, number, put, quad, rolled
+from kcons.solvers.kernels.two_and_four_wide import (
+    extract,
+    keep_loop_rolled,
+    load_double,
+    load_index,
+    load_point,
+    quad,
+    store_double,
+)
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
 from kcons.solvers.sparse.row_values import cell_of, miss, near
@@ -95,20 +103,20 @@ class SingleRows(AddressableSolver):
 def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type: ignore[no-untyped-def]
     """Positions of a row's atoms from `room[at]` on, as its function gets them."""
     a, b, c = 0.0, 0.0, 0.0
-    before = load_point(x, 3 * entry(atoms, slot))
+    before = load_point(x, 3 * load_index(atoms, slot))
     for p in range(slot, end):
-        rolled()
-        here = load_point(x, 3 * entry(atoms, p))
+        keep_loop_rolled()
+        here = load_point(x, 3 * load_index(atoms, p))
         if relative:
             cell, inverse = cell_of(lattice)
             dx, dy, dz = near(here - before, quad(0.0, 0.0, 0.0, 0.0), cell, inverse, periodic)
             a, b, c = a + dx, b + dy, c + dz
             before = here
         else:
-            a, b, c = lane(here, 0), lane(here, 1), lane(here, 2)
-        put(room, at, a)
-        put(room, at + 1, b)
-        put(room, at + 2, c)
+            a, b, c = extract(here, 0), extract(here, 1), extract(here, 2)
+        store_double(room, at, a)
+        store_double(room, at + 1, b)
+        store_double(room, at + 2, c)
         at += 3
 
 
@@ -116,20 +124,20 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
 def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-def]
     """Positions of rows of one atom each, as `rows_at_once` takes them."""
     for i in range(stop - begin):
-        g = 3 * entry(atoms, first + i)
-        put(numbers, ROOM + i, number(x, g))
-        put(numbers, ROOM + BLOCK + i, number(x, g + 1))
-        put(numbers, ROOM + 2 * BLOCK + i, number(x, g + 2))
+        g = 3 * load_index(atoms, first + i)
+        store_double(numbers, ROOM + i, load_double(x, g))
+        store_double(numbers, ROOM + BLOCK + i, load_double(x, g + 1))
+        store_double(numbers, ROOM + 2 * BLOCK + i, load_double(x, g + 2))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignore[no-untyped-def]
     """The same of where the multipliers have moved them."""
     for i in range(stop - begin):
-        lam, p = number(solution, begin + i), 3 * (first + i)
-        put(numbers, ROOM + i, number(base, 3 * i) + lam * number(pushes, p))
-        put(numbers, ROOM + BLOCK + i, number(base, 3 * i + 1) + lam * number(pushes, p + 1))
-        put(numbers, ROOM + 2 * BLOCK + i, number(base, 3 * i + 2) + lam * number(pushes, p + 2))
+        lam, p = load_double(solution, begin + i), 3 * (first + i)
+        store_double(numbers, ROOM + i, load_double(base, 3 * i) + lam * load_double(pushes, p))
+        store_double(numbers, ROOM + BLOCK + i, load_double(base, 3 * i + 1) + lam * load_double(pushes, p + 1))
+        store_double(numbers, ROOM + 2 * BLOCK + i, load_double(base, 3 * i + 2) + lam * load_double(pushes, p + 2))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -137,9 +145,9 @@ def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
     """Whether a gradient has less than `FLAT` of that at the reference along it; `slope` is their product."""
     size = 0.0
     for i in range(count):
-        push = number(pushes, 3 * slot + i)
+        push = load_double(pushes, 3 * slot + i)
         if push != 0.0:
-            size += push * push / number(masses, slot + i // 3)
+            size += push * push / load_double(masses, slot + i // 3)
     return slope < FLAT * size
 
 
@@ -149,12 +157,12 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, pushes, solution = piece(u, h, 0), piece(u, h, 1), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
     for k in range(len(solution)):
-        change = factor * number(solution, k)
-        for p in range(entry(links, 3 * k), entry(links, 3 * k + 3)):
-            rolled()
-            g = 3 * entry(atoms, p)
+        change = factor * load_double(solution, k)
+        for p in range(load_index(links, 3 * k), load_index(links, 3 * k + 3)):
+            keep_loop_rolled()
+            g = 3 * load_index(atoms, p)
             for i in range(3):
-                put(x, g + i, number(x, g + i) + change * number(pushes, 3 * p + i))
+                store_double(x, g + i, load_double(x, g + i) + change * load_double(pushes, 3 * p + i))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -171,84 +179,87 @@ def _positions(  # type: ignore[no-untyped-def]
     worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     for begin in range(0, len(solution), BLOCK):
         stop = min(begin + BLOCK, len(solution))
-        first, shared = entry(links, 3 * begin), entry(links, 3 * begin + 1) + 2
+        first, shared = load_index(links, 3 * begin), load_index(links, 3 * begin + 1) + 2
         rows, apart = runs[1 + begin // (BLOCK // 2)], runs[2 + begin // (BLOCK // 2)]
         if rows != 0:
             _places(x_ref, begin, stop, first, atoms, numbers)
-            call_rows(numbers, rows, stop - begin, ROOM, shared, apart, number(numbers, 1), outs)
+            call_rows(numbers, rows, stop - begin, ROOM, shared, apart, load_double(numbers, 1), outs)
         for k in range(begin, stop):
-            slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
-            relative = entry(links, 3 * k + 2) != FUNCTION
+            slot, end, parameters = load_index(links, 3 * k), load_index(links, 3 * k + 3), load_index(links, 3 * k + 1)
+            relative = load_index(links, 3 * k + 2) != FUNCTION
             out = outs + (k - begin) + 3 * (slot - first)
             if rows == 0:
                 _gather(x_ref, slot, end, atoms, relative, lattice, periodic, numbers, ROOM)
-                call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
+                call_row(numbers, parameters, ROOM, parameters + 2, load_double(numbers, 1), out)
             reach = 0.0
             for p in range(slot, end):
-                rolled()
+                keep_loop_rolled()
                 size, far = 0.0, 0.0
                 for i in range(3):
-                    g, r = number(numbers, out + 1 + 3 * (p - slot) + i), number(x, 3 * entry(atoms, p) + i)
-                    put(pushes, 3 * p + i, g * number(masses, p))
+                    g, r = (
+                        load_double(numbers, out + 1 + 3 * (p - slot) + i),
+                        load_double(x, 3 * load_index(atoms, p) + i),
+                    )
+                    store_double(pushes, 3 * p + i, g * load_double(masses, p))
                     size, far = size + g * g, far + r * r
                 reach += math.sqrt(size * far)
             _gather(x, slot, end, atoms, relative, lattice, periodic, base, 3 * (slot - first))
             at = WORDS * (k - begin)
-            put(state, at + ALLOWED, max(ROUNDING * number(scale, k), 2 * EPS * reach))
-            put(state, at + PREVIOUS, np.inf)
-            put(state, at + LAST, 0.0)
-            put(state, at + HALVINGS, 0.0)
-            put(solution, k, 0.0)
+            store_double(state, at + ALLOWED, max(ROUNDING * load_double(scale, k), 2 * EPS * reach))
+            store_double(state, at + PREVIOUS, np.inf)
+            store_double(state, at + LAST, 0.0)
+            store_double(state, at + HALVINGS, 0.0)
+            store_double(solution, k, 0.0)
         # Rows of a block take each iteration together, so that the processor has several under way at once.
         iteration, left = 0, stop - begin
         while left > 0:
             left = 0
             if rows != 0:
                 _pushed(begin, stop, first, base, pushes, solution, numbers)
-                call_rows(numbers, rows, stop - begin, ROOM, shared, apart, number(numbers, 0), outs)
+                call_rows(numbers, rows, stop - begin, ROOM, shared, apart, load_double(numbers, 0), outs)
             for k in range(begin, stop):
                 at = WORDS * (k - begin)
-                halvings = number(state, at + HALVINGS)
+                halvings = load_double(state, at + HALVINGS)
                 if halvings < 0.0:
                     continue
-                slot, parameters, lam = entry(links, 3 * k), entry(links, 3 * k + 1), number(solution, k)
-                count = 3 * (entry(links, 3 * k + 3) - slot)
+                slot, parameters, lam = load_index(links, 3 * k), load_index(links, 3 * k + 1), load_double(solution, k)
+                count = 3 * (load_index(links, 3 * k + 3) - slot)
                 out = outs + (k - begin) + 3 * (slot - first)
                 if rows == 0:
                     for i in range(count):
-                        rolled()
-                        r = number(base, 3 * (slot - first) + i) + lam * number(pushes, 3 * slot + i)
-                        put(numbers, ROOM + i, r)
-                    call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 0), out)
+                        keep_loop_rolled()
+                        r = load_double(base, 3 * (slot - first) + i) + lam * load_double(pushes, 3 * slot + i)
+                        store_double(numbers, ROOM + i, r)
+                    call_row(numbers, parameters, ROOM, parameters + 2, load_double(numbers, 0), out)
                 slope = 0.0
                 for i in range(count):
-                    rolled()
-                    slope += number(numbers, out + 1 + i) * number(pushes, 3 * slot + i)
-                off = miss(number(numbers, out), number(wanted, k), number(numbers, parameters + 1))
-                whole, error, previous = number(scale, k), abs(off), number(state, at + PREVIOUS)
+                    keep_loop_rolled()
+                    slope += load_double(numbers, out + 1 + i) * load_double(pushes, 3 * slot + i)
+                off = miss(load_double(numbers, out), load_double(wanted, k), load_double(numbers, parameters + 1))
+                whole, error, previous = load_double(scale, k), abs(off), load_double(state, at + PREVIOUS)
                 if not (error < np.inf):
                     return False, np.inf, iteration, k
-                rounding = number(state, at + ALLOWED)
+                rounding = load_double(state, at + ALLOWED)
                 if error <= rounding and (error <= NEWTON_TOLERANCE * whole or error > 0.1 * previous):
                     # A gradient must not have turned by 90 degrees or more within the step.
                     if not (slope > 0.0) or (iteration > MANY_ITERATIONS and _flat(slope, slot, count, masses, pushes)):
                         return False, np.inf, iteration, k
-                    put(state, at + HALVINGS, -1.0)
+                    store_double(state, at + HALVINGS, -1.0)
                     if error >= worst * whole:
                         worst, worst_row = error / whole, k
                     continue
                 if iteration == MAX_ITERATIONS or halvings > MAX_HALVINGS:
                     return False, error / whole, iteration, k
                 left += 1
-                last = number(state, at + LAST)
+                last = load_double(state, at + LAST)
                 if previous < np.inf and not (error < 0.999 * previous) and error > NEAR * whole:
-                    put(state, at + HALVINGS, halvings + 1.0)
-                    put(solution, k, last + 0.5 * (lam - last))
+                    store_double(state, at + HALVINGS, halvings + 1.0)
+                    store_double(solution, k, last + 0.5 * (lam - last))
                 else:
-                    put(state, at + PREVIOUS, error)
-                    put(state, at + LAST, lam)
-                    put(state, at + HALVINGS, 0.0)
-                    put(solution, k, lam + off / slope)
+                    store_double(state, at + PREVIOUS, error)
+                    store_double(state, at + LAST, lam)
+                    store_double(state, at + HALVINGS, 0.0)
+                    store_double(solution, k, lam + off / slope)
             iteration += 1
         most = max(most, iteration - 1)
     if alone:
@@ -268,30 +279,30 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
     worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     begin, rows = 0, np.int64(0)
     for k in range(len(solution)):
-        slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
+        slot, end, parameters = load_index(links, 3 * k), load_index(links, 3 * k + 3), load_index(links, 3 * k + 1)
         if k % BLOCK == 0:
             begin, rows = k, runs[1 + k // (BLOCK // 2)]
             if rows != 0:
                 stop = min(begin + BLOCK, len(solution))
                 _places(x, begin, stop, slot, atoms, numbers)
                 apart = runs[2 + k // (BLOCK // 2)]
-                call_rows(numbers, rows, stop - begin, ROOM, parameters + 2, apart, number(numbers, 1), outs)
+                call_rows(numbers, rows, stop - begin, ROOM, parameters + 2, apart, load_double(numbers, 1), outs)
         out = outs + 4 * (k - begin)
         if rows == 0:
             out = outs
-            _gather(x, slot, end, atoms, entry(links, 3 * k + 2) != FUNCTION, lattice, periodic, numbers, ROOM)
-            call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
-        goal = number(wanted, k) if driven else 0.0
+            _gather(x, slot, end, atoms, load_index(links, 3 * k + 2) != FUNCTION, lattice, periodic, numbers, ROOM)
+            call_row(numbers, parameters, ROOM, parameters + 2, load_double(numbers, 1), out)
+        goal = load_double(wanted, k) if driven else 0.0
         size, off, whole = abs(goal), goal, 0.0
         for p in range(slot, end):
-            rolled()
+            keep_loop_rolled()
             for i in range(3):
-                g = number(numbers, out + 1 + 3 * (p - slot) + i)
-                part = g * number(y, 3 * entry(atoms, p) + i)
+                g = load_double(numbers, out + 1 + 3 * (p - slot) + i)
+                part = g * load_double(y, 3 * load_index(atoms, p) + i)
                 off -= part
                 size += abs(part)
-                put(pushes, 3 * p + i, g * number(masses, p))
-                whole += g * g * number(masses, p)
+                store_double(pushes, 3 * p + i, g * load_double(masses, p))
+                whole += g * g * load_double(masses, p)
         if not (size < np.inf):
             return False, np.inf, 0, k
         inverse = 1.0 / whole if whole > 0.0 else 0.0
@@ -299,16 +310,16 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
         while True:
             off = goal
             for p in range(slot, end):
-                rolled()
+                keep_loop_rolled()
                 for i in range(3):
-                    speed = number(y, 3 * entry(atoms, p) + i) + lam * number(pushes, 3 * p + i)
-                    off -= number(numbers, out + 1 + 3 * (p - slot) + i) * speed
+                    speed = load_double(y, 3 * load_index(atoms, p) + i) + lam * load_double(pushes, 3 * p + i)
+                    off -= load_double(numbers, out + 1 + 3 * (p - slot) + i) * speed
             if abs(off) <= SPEED_TOLERANCE * size or not (abs(off) < 0.5 * error):
                 break
             error = abs(off)
             lam += off * inverse
             iteration += 1
-        put(solution, k, lam)
+        store_double(solution, k, lam)
         if not (abs(off) <= SPEED_ROUNDINGS * SPEED_TOLERANCE * size):
             return False, abs(off), iteration, k
         if abs(off) >= worst:

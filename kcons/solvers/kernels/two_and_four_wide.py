@@ -27,20 +27,20 @@ _TWO, _FOUR, _LINE = vectors(2), vectors(4), vectors(8).llvm
 pair_type, quad_type = _TWO.kind, _FOUR.kind
 
 # Numbers, pairs and quads that begin at an entry of a flat float64 array.
-number, put = reader(types.float64, None), writer(types.float64, None)
+load_double, store_double = reader(types.float64, None), writer(types.float64, None)
 load_pair, store_pair = _TWO.load, _TWO.store
 load_quad, store_quad = _FOUR.load, _FOUR.store
 
 
 @instruction(types.void)
-def rolled(builder):
+def keep_loop_rolled(builder):
     """Stands in a loop of few turns and keeps the compiler from unrolling it."""
     nothing = ir.InlineAsm(ir.FunctionType(ir.VoidType(), []), "", "", side_effect=True)
     builder.call(nothing, [], attrs=("convergent", "nounwind"))
 
 
 @instruction(types.int64, None, types.int64)
-def entry(builder, table, start):
+def load_index(builder, table, start):
     """``table[start]`` of a uint32 array as int64; the table must not change while a kernel runs."""
     value = builder.load(place(builder, table, start))
     value.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -72,7 +72,7 @@ def settled(builder, value):
 
 
 @intrinsic
-def lane(typingctx, value, which):
+def extract(typingctx, value, which):
     """One number of a pair or quad; `which` is a literal."""
     if not isinstance(which, types.IntegerLiteral):
         return None

@@ -21,16 +21,16 @@ from kcons.solvers.kernels.lattices import OPEN, nearest_image
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
-    entry,
+    extract,
     first_vector,
-    lane,
+    load_double,
+    load_index,
     load_point,
     load_quad,
-    number,
     pair,
-    put,
     quad,
     second_vector,
+    store_double,
     store_first,
     store_line,
     store_quad,
@@ -188,34 +188,34 @@ def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, p
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Reference vectors s and current vectors q of a cluster; largest and total relative error of the lengths."""
     for a in range(first_atom, last_atom):
-        g = 3 * entry(atoms, a)
+        g = 3 * load_index(atoms, a)
         store_quad(places, 4 * a, load_point(x_ref, g))
         store_quad(moves, 4 * a, load_point(x_new, g))
     error, total = 0.0, 0.0
     for k in range(first, last):
-        i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+        i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
         s = load_quad(places, i) - load_quad(places, j)
         q = load_quad(moves, i) - load_quad(moves, j)
         if periodic:
             s, q = _image(s, lattice), _image(q, lattice)
-        d2 = number(lengths, k) * number(lengths, k)
+        d2 = load_double(lengths, k) * load_double(lengths, k)
         miss = 0.5 * (d2 - dot(q, q))
         store_line(state, 8 * k, q, s, pair(0.0, miss))
         store_quad(starts, 4 * k, q)
         inverse = 1.0 / d2
-        put(starts, 4 * k + 3, inverse)
-        put(solution, k, 0.0)
+        store_double(starts, 4 * k + 3, inverse)
+        store_double(solution, k, 0.0)
         e = abs(miss) * inverse
         total += e
         error = max(error, e)
     for a in range(first_atom, last_atom):
-        store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, number(w, a)))
+        store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, load_double(w, a)))
     return error, total
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _image(vector, lattice):  # type: ignore[no-untyped-def]
-    x, y, z = nearest_image(lane(vector, 0), lane(vector, 1), lane(vector, 2), lattice)
+    x, y, z = nearest_image(extract(vector, 0), extract(vector, 1), extract(vector, 2), lattice)
     return quad(x, y, z, 0.0)
 
 
@@ -224,12 +224,12 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
     """Current vectors and right-hand sides; largest and total relative error of the lengths."""
     error, total = 0.0, 0.0
     for k in range(first, last):
-        i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+        i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
         r = load_quad(starts, 4 * k) + (load_quad(moves, i) - load_quad(moves, j))
-        d2 = number(lengths, k) * number(lengths, k)
+        d2 = load_double(lengths, k) * load_double(lengths, k)
         miss = 0.5 * (d2 - dot(r, r))
         store_first(state, 8 * k, r, pair(0.0, miss))
-        e = abs(miss) * number(starts, 4 * k + 3)
+        e = abs(miss) * load_double(starts, 4 * k + 3)
         total += e
         error = max(error, e)
     return error, total
@@ -348,28 +348,28 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
     for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         for a in range(atom_start[c], atom_start[c + 1]):
-            g = 3 * entry(atoms, a)
+            g = 3 * load_index(atoms, a)
             store_quad(places, 4 * a, load_point(x, g))
             store_quad(moves, 4 * a, load_point(y, g))
         largest = 0.0
         total = 0.0
         for k in range(first, last):
-            i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+            i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
             s = load_quad(places, i) - load_quad(places, j)
             u = load_quad(moves, i) - load_quad(moves, j)
             if periodic:
                 s = _image(s, lattice)
             s2 = dot(s, s)
-            goal = number(rates, k) * np.sqrt(s2) if driven else 0.0
+            goal = load_double(rates, k) * np.sqrt(s2) if driven else 0.0
             store_line(state, 8 * k, u, s, pair(0.0, goal - dot(s, u)))
             store_quad(starts, 4 * k, u)
-            put(starts, 4 * k + 3, goal)
+            store_double(starts, 4 * k + 3, goal)
             size = dot(u, u) * s2 + goal * goal
             largest = max(largest, size)
             total += size if s2 > 0.0 else np.inf
-            put(solution, k, 0.0)
+            store_double(solution, k, 0.0)
         for a in range(atom_start[c], atom_start[c + 1]):
-            store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, number(w, a)))
+            store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, load_double(w, a)))
         if not (total < np.inf):
             return False, np.inf, 0, _first_bad(first, last, state)
         factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
@@ -381,10 +381,10 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
             iteration += 1
             error, total = 0.0, 0.0
             for k in range(first, last):
-                i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+                i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
                 u = load_quad(starts, 4 * k) + (load_quad(moves, i) - load_quad(moves, j))
-                miss = number(starts, 4 * k + 3) - dot(second_vector(state, 8 * k), u)
-                put(state, 8 * k + RIGHT, miss)
+                miss = load_double(starts, 4 * k + 3) - dot(second_vector(state, 8 * k), u)
+                store_double(state, 8 * k + RIGHT, miss)
                 total += abs(miss)
                 error = max(error, abs(miss))
             if not (total < np.inf):
@@ -429,7 +429,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     h = integers(tables)
     atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
     for a in range(h[3] - h[2]):
-        add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
+        add_to_point(x, 3 * load_index(atoms, a), factor * load_quad(moves, 4 * a))
 
 
 @njit(cache=True, fastmath=FAST)

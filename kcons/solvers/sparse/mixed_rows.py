@@ -22,19 +22,19 @@ from kcons.solvers.kernels.lattices import OPEN
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
-    entry,
+    extract,
     first_vector,
-    lane,
+    keep_loop_rolled,
+    load_double,
+    load_index,
     load_pair,
     load_point,
     load_quad,
-    number,
     pair,
-    put,
     quad,
-    rolled,
     second_vector,
     settled,
+    store_double,
     store_pair,
     store_quad,
     swapped,
@@ -185,43 +185,51 @@ def _factor(  # type: ignore[no-untyped-def]
 
     Entries are stored as in `kcons.solvers.sparse.substitution`; accumulated changes are left at zero.
     """
-    begin, t, slot = entry(links, 4 * first), entry(links, 4 * first + 1), 8 * entry(links, 4 * first + 2)
+    begin, t, slot = (
+        load_index(links, 4 * first),
+        load_index(links, 4 * first + 1),
+        8 * load_index(links, 4 * first + 2),
+    )
     for k in range(first, last):
-        stop = 8 * entry(links, 4 * k + 6)
+        stop = 8 * load_index(links, 4 * k + 6)
         whole = 0.0
         while slot < stop:
-            rolled()
-            inner = number(lines, slot) * number(lines, slot + 1) + number(lines, slot + 2) * number(lines, slot + 3)
-            whole += number(lines, slot + 6) * (inner + number(lines, slot + 4) * number(lines, slot + 5))
+            keep_loop_rolled()
+            inner = load_double(lines, slot) * load_double(lines, slot + 1) + load_double(
+                lines, slot + 2
+            ) * load_double(lines, slot + 3)
+            whole += load_double(lines, slot + 6) * (
+                inner + load_double(lines, slot + 4) * load_double(lines, slot + 5)
+            )
             slot += 8
-        d = whole + number(state, 2 * k)
-        put(state, 2 * k, 0.0)
-        right = number(state, 2 * k + 1)
+        d = whole + load_double(state, 2 * k)
+        store_double(state, 2 * k, 0.0)
+        right = load_double(state, 2 * k + 1)
         inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
-        put(pivots, k, inverse)
-        end = entry(links, 4 * k + 4)
-        u = entry(triple, begin)
+        store_double(pivots, k, inverse)
+        end = load_index(links, 4 * k + 4)
+        u = load_index(triple, begin)
         for p in range(begin, end):
-            rolled()
+            keep_loop_rolled()
             both = load_pair(entries, 4 * p + 2)
-            stop = entry(triple, p + 1)
+            stop = load_index(triple, p + 1)
             while u < stop:
-                rolled()
-                a, b = 8 * entry(sides, 2 * u), 8 * entry(sides, 2 * u + 1)
+                keep_loop_rolled()
+                a, b = 8 * load_index(sides, 2 * u), 8 * load_index(sides, 2 * u + 1)
                 inner2 = swapped(load_pair(lines, a)) * load_pair(lines, b)
                 inner2 = inner2 + swapped(load_pair(lines, a + 2)) * load_pair(lines, b + 2)
                 inner2 = inner2 + swapped(load_pair(lines, a + 4)) * load_pair(lines, b + 4)
-                both = both + number(masses, u) * inner2
+                both = both + load_double(masses, u) * inner2
                 u += 1
-            l = 2 * entry(columns, p)
-            low, up = inverse * lane(both, 0), lane(both, 1)
+            l = 2 * load_index(columns, p)
+            low, up = inverse * extract(both, 0), extract(both, 1)
             store_quad(entries, 4 * p, settled(pair(low, up)))
             store_pair(state, l, load_pair(state, l) - low * pair(up, right))
         for p in range(begin, end - 1):
-            rolled()
+            keep_loop_rolled()
             mine = load_pair(entries, 4 * p)
             for q in range(p + 1, end):
-                rolled()
+                keep_loop_rolled()
                 update(t, mine, load_pair(entries, 4 * q), targets, entries)
                 t += 1
         begin = end
@@ -229,38 +237,38 @@ def _factor(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
-    begin = entry(links, 4 * first)
+    begin = load_index(links, 4 * first)
     for k in range(first, last):
-        right = number(state, 2 * k + 1)
-        end = entry(links, 4 * k + 4)
+        right = load_double(state, 2 * k + 1)
+        end = load_index(links, 4 * k + 4)
         for p in range(begin, end):
-            rolled()
-            l = 2 * entry(columns, p) + 1
-            put(state, l, number(state, l) - number(entries, 4 * p) * right)
+            keep_loop_rolled()
+            l = 2 * load_index(columns, p) + 1
+            store_double(state, l, load_double(state, l) - load_double(entries, 4 * p) * right)
         begin = end
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
     """Backward substitution; adds to the multipliers and moves the atoms along the reference gradients."""
-    end, slot = entry(links, 4 * last), entry(links, 4 * last + 2)
+    end, slot = load_index(links, 4 * last), load_index(links, 4 * last + 2)
     for back in range(last - first):
         k = last - 1 - back
-        step = number(state, 2 * k + 1)
-        begin = entry(links, 4 * k)
+        step = load_double(state, 2 * k + 1)
+        begin = load_index(links, 4 * k)
         for p in range(begin, end):
-            rolled()
-            step -= number(entries, 4 * p + 1) * number(state, 2 * entry(columns, p) + 1)
+            keep_loop_rolled()
+            step -= load_double(entries, 4 * p + 1) * load_double(state, 2 * load_index(columns, p) + 1)
         end = begin
-        step *= number(pivots, k)
-        put(state, 2 * k + 1, step)
-        put(solution, k, number(solution, k) + step)
-        stop = entry(links, 4 * k + 2)
+        step *= load_double(pivots, k)
+        store_double(state, 2 * k + 1, step)
+        store_double(solution, k, load_double(solution, k) + step)
+        stop = load_index(links, 4 * k + 2)
         while slot > stop:
-            rolled()
+            keep_loop_rolled()
             slot -= 1
-            a = 4 * entry(slot_atoms, slot)
-            f = step * number(lines, 8 * slot + 6)
+            a = 4 * load_index(slot_atoms, slot)
+            f = step * load_double(lines, 8 * slot + 6)
             store_quad(moves, a, load_quad(moves, a) + f * second_vector(lines, 8 * slot))
 
 
@@ -272,28 +280,28 @@ def _begin(  # type: ignore[no-untyped-def]
     """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
     zero = quad(0.0, 0.0, 0.0, 0.0)
     for a in range(first_atom, last_atom):
-        store_quad(origin, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
+        store_quad(origin, 4 * a, load_point(x_ref, 3 * load_index(atoms, a)))
         store_quad(moves, 4 * a, zero)
     call_evaluate(functions[0], (
         functions[1], first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, moved, lattice,
         periodic, values, lines, REFERENCE,
     ))  # fmt: skip
     for a in range(first_atom, last_atom):
-        point = load_point(x_new, 3 * entry(atoms, a))
+        point = load_point(x_new, 3 * load_index(atoms, a))
         store_quad(base, 4 * a, point)
-        put(base, 4 * a + 3, np.sqrt(dot(point, point)))
+        store_double(base, 4 * a + 3, np.sqrt(dot(point, point)))
     for k in range(first, last):
-        put(solution, k, 0.0)
+        store_double(solution, k, 0.0)
         # Of absolute positions for rows on space, of the row's own size for others.
         reach = 0.0
-        for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
-            rolled()
-            size = number(base, 4 * entry(slot_atoms, p) + 3)
-            if entry(kinds, k) != DISTANCE:
+        for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+            keep_loop_rolled()
+            size = load_double(base, 4 * load_index(slot_atoms, p) + 3)
+            if load_index(kinds, k) != DISTANCE:
                 g = second_vector(lines, 8 * p)
                 size *= np.sqrt(dot(g, g))
             reach += size
-        put(inverse_rounding, k, 1.0 / max(ROUNDING * number(scale, k), 2 * EPS * reach))
+        store_double(inverse_rounding, k, 1.0 / max(ROUNDING * load_double(scale, k), 2 * EPS * reach))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -303,18 +311,18 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_round
     bad = first
     for k in range(first, last):
         period = 0.0
-        if entry(kinds, k) >= FUNCTION:
-            period = number(parameters, entry(links, 4 * k + 3) + 1)
-        off = miss(number(values, k), number(wanted, k), period)
-        put(state, 2 * k + 1, off)
-        e = abs(off) / number(scale, k)
-        if entry(kinds, k) >= VELOCITY:
+        if load_index(kinds, k) >= FUNCTION:
+            period = load_double(parameters, load_index(links, 4 * k + 3) + 1)
+        off = miss(load_double(values, k), load_double(wanted, k), period)
+        store_double(state, 2 * k + 1, off)
+        e = abs(off) / load_double(scale, k)
+        if load_index(kinds, k) >= VELOCITY:
             e *= CLOSER
         total += e
         if e > error:
             error = e
             bad = k
-        excess = max(excess, abs(off) * number(inverse_rounding, k))
+        excess = max(excess, abs(off) * load_double(inverse_rounding, k))
     return error, total, excess, bad
 
 
@@ -332,7 +340,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     h = integers(tables)
     atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
     for a in range(h[3] - h[2]):
-        add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
+        add_to_point(x, 3 * load_index(atoms, a), factor * load_quad(moves, 4 * a))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -409,11 +417,11 @@ def _positions(  # type: ignore[no-untyped-def]
                 return False, np.inf, iteration, bad_row
         for k in range(first, last):
             along = 0.0
-            for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
-                rolled()
+            for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+                keep_loop_rolled()
                 along += dot(first_vector(lines, 8 * p), second_vector(lines, 8 * p))
             # A gradient must not have turned by 90 degrees or more within the step.
-            if not (along > 0.0) and (entry(kinds, k) < VELOCITY or number(parameters, COUNT) != 0.0):
+            if not (along > 0.0) and (load_index(kinds, k) < VELOCITY or load_double(parameters, COUNT) != 0.0):
                 return False, np.inf, iteration, k
         if error >= worst:
             worst, worst_row = error, bad
@@ -440,7 +448,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
     for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         for a in range(atom_start[c], atom_start[c + 1]):
-            g = 3 * entry(atoms, a)
+            g = 3 * load_index(atoms, a)
             store_quad(base, 4 * a, load_point(x, g))
             store_quad(speeds, 4 * a, load_point(y, g))
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
@@ -450,22 +458,22 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
         ))  # fmt: skip
         largest, total = 0.0, 0.0
         for k in range(first, last):
-            goal = number(goals, k) if driven else 0.0
+            goal = load_double(goals, k) if driven else 0.0
             off, size = goal, abs(goal)
-            for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
-                rolled()
+            for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+                keep_loop_rolled()
                 g = second_vector(lines, 8 * p)
-                put(lines, 8 * p, lane(g, 0))
-                put(lines, 8 * p + 2, lane(g, 1))
-                put(lines, 8 * p + 4, lane(g, 2))
-                part = g * load_quad(speeds, 4 * entry(slot_atoms, p))
-                off -= lane(part, 0) + lane(part, 1) + lane(part, 2)
-                size += abs(lane(part, 0)) + abs(lane(part, 1)) + abs(lane(part, 2))
-            put(state, 2 * k, 0.0)
-            put(state, 2 * k + 1, off)
+                store_double(lines, 8 * p, extract(g, 0))
+                store_double(lines, 8 * p + 2, extract(g, 1))
+                store_double(lines, 8 * p + 4, extract(g, 2))
+                part = g * load_quad(speeds, 4 * load_index(slot_atoms, p))
+                off -= extract(part, 0) + extract(part, 1) + extract(part, 2)
+                size += abs(extract(part, 0)) + abs(extract(part, 1)) + abs(extract(part, 2))
+            store_double(state, 2 * k, 0.0)
+            store_double(state, 2 * k + 1, off)
             largest = max(largest, size)
             total += size
-            put(solution, k, 0.0)
+            store_double(solution, k, 0.0)
         if not (total < np.inf):
             return False, np.inf, 0, _first_not_finite(first, last, state)
         matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
@@ -481,12 +489,12 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
             error, total = 0.0, 0.0
             bad = first
             for k in range(first, last):
-                off = number(goals, k) if driven else 0.0
-                for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
-                    rolled()
-                    a = 4 * entry(slot_atoms, p)
+                off = load_double(goals, k) if driven else 0.0
+                for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+                    keep_loop_rolled()
+                    a = 4 * load_index(slot_atoms, p)
                     off -= dot(second_vector(lines, 8 * p), load_quad(speeds, a) + load_quad(moves, a))
-                put(state, 2 * k + 1, off)
+                store_double(state, 2 * k + 1, off)
                 total += abs(off)
                 if abs(off) > error:
                     error = abs(off)

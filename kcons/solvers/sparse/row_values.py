@@ -22,15 +22,15 @@ from kcons.solvers.addressable_solvers import address_of, caller_of
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS
 from kcons.solvers.kernels.two_and_four_wide import (
     dot,
-    entry,
+    extract,
     first_vector,
-    lane,
+    keep_loop_rolled,
+    load_double,
+    load_index,
     load_quad,
-    number,
-    put,
     quad,
-    rolled,
     second_vector,
+    store_double,
 )
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, call_row
@@ -80,7 +80,7 @@ def cell_of(lattice):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def]
     # No arrays come here: one that passes a branch costs reference counting.
-    x, y, z = lane(whole, 0), lane(whole, 1), lane(whole, 2)
+    x, y, z = extract(whole, 0), extract(whole, 1), extract(whole, 2)
     if periodic:
         a = np.rint(x * inverse[0][0] + y * inverse[1][0] + z * inverse[2][0])
         b = np.rint(x * inverse[0][1] + y * inverse[1][1] + z * inverse[2][1])
@@ -88,14 +88,14 @@ def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def
         x -= a * cell[0][0] + b * cell[1][0] + c * cell[2][0]
         y -= a * cell[0][1] + b * cell[1][1] + c * cell[2][1]
         z -= a * cell[0][2] + b * cell[1][2] + c * cell[2][2]
-    return x + lane(change, 0), y + lane(change, 1), z + lane(change, 2)
+    return x + extract(change, 0), y + extract(change, 1), z + extract(change, 2)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _put(lines, place, x, y, z):  # type: ignore[no-untyped-def]
-    put(lines, place, x)
-    put(lines, place + 2, y)
-    put(lines, place + 4, z)
+    store_double(lines, place, x)
+    store_double(lines, place + 2, y)
+    store_double(lines, place + 4, z)
 
 
 _angle = njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")(angle_between)
@@ -113,45 +113,51 @@ def _function(  # type: ignore[no-untyped-def]
     size = 3 * (end - slot)
     rolls = kind >= VELOCITY
     at, out = ROOM, ROOM + 2 * size
-    if rolls and number(parameters, COUNT) == 0.0:
+    if rolls and load_double(parameters, COUNT) == 0.0:
         for p in range(ROOM, out + size + 1):
-            rolled()
-            put(parameters, p, 0.0)
+            keep_loop_rolled()
+            store_double(parameters, p, 0.0)
     else:
         x, y, z = 0.0, 0.0, 0.0
         before, change_before = quad(0.0, 0.0, 0.0, 0.0), quad(0.0, 0.0, 0.0, 0.0)
         for p in range(slot, end):
-            rolled()
-            i = 4 * entry(slot_atoms, p)
+            keep_loop_rolled()
+            i = 4 * load_index(slot_atoms, p)
             here, change = load_quad(base, i), load_quad(moves, i)
             if rolls:
                 start = load_quad(origin, i)
                 way = (here - start) + change
                 here, change = start, 0.5 * way
-                put(parameters, at + size, lane(way, 0))
-                put(parameters, at + size + 1, lane(way, 1))
-                put(parameters, at + size + 2, lane(way, 2))
+                store_double(parameters, at + size, extract(way, 0))
+                store_double(parameters, at + size + 1, extract(way, 1))
+                store_double(parameters, at + size + 2, extract(way, 2))
             if kind in (FUNCTION, VELOCITY):
                 r = (here - load_quad(moved, 4 * p)) + change
-                x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
+                x, y, z = extract(r, 0), extract(r, 1), extract(r, 2)
             elif p > slot:
                 dx, dy, dz = near(here - before, change - change_before, cell, inverse, periodic)
                 x, y, z = x + dx, y + dy, z + dz
             before, change_before = here, change
-            put(parameters, at, x)
-            put(parameters, at + 1, y)
-            put(parameters, at + 2, z)
+            store_double(parameters, at, x)
+            store_double(parameters, at + 1, y)
+            store_double(parameters, at + 2, z)
             at += 3
-        time = number(parameters, which)
+        time = load_double(parameters, which)
         if rolls:  # where the reference is asked for, the way is 0, and the time that of the reference
-            time = 0.5 * (time + number(parameters, 1))
+            time = 0.5 * (time + load_double(parameters, 1))
         call_row(parameters, offset, ROOM, offset + 2, time, out)
     at = out
     for p in range(slot, end):
-        rolled()
-        _put(lines, 8 * p + which, number(parameters, at + 1), number(parameters, at + 2), number(parameters, at + 3))
+        keep_loop_rolled()
+        _put(
+            lines,
+            8 * p + which,
+            load_double(parameters, at + 1),
+            load_double(parameters, at + 2),
+            load_double(parameters, at + 3),
+        )
         at += 3
-    return number(parameters, out)
+    return load_double(parameters, out)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -166,20 +172,20 @@ def evaluate(  # type: ignore[no-untyped-def]
     """
     cell, inverse = cell_of(lattice)
     for k in range(first, last):
-        kind = entry(kinds, k)
-        slot = entry(links, 4 * k + 2)
-        place, offset = 8 * slot + which, entry(links, 4 * k + 3)
-        i = entry(slot_atoms, slot)
+        kind = load_index(kinds, k)
+        slot = load_index(links, 4 * k + 2)
+        place, offset = 8 * slot + which, load_index(links, 4 * k + 3)
+        i = load_index(slot_atoms, slot)
         if kind == DISTANCE:
-            x, y, z = _difference(i, entry(slot_atoms, slot + 1), base, moves, cell, inverse, periodic)
+            x, y, z = _difference(i, load_index(slot_atoms, slot + 1), base, moves, cell, inverse, periodic)
             value = math.sqrt(x * x + y * y + z * z)
             x, y, z = x / value, y / value, z / value
             _put(lines, place, x, y, z)
             _put(lines, place + 8, -x, -y, -z)
         elif kind == ANGLE:
-            j = entry(slot_atoms, slot + 1)
+            j = load_index(slot_atoms, slot + 1)
             x, y, z = _difference(i, j, base, moves, cell, inverse, periodic)
-            wx, wy, wz = _difference(entry(slot_atoms, slot + 2), j, base, moves, cell, inverse, periodic)
+            wx, wy, wz = _difference(load_index(slot_atoms, slot + 2), j, base, moves, cell, inverse, periodic)
             value, ax, ay, az, bx, by, bz = _angle(x, y, z, wx, wy, wz)
             _put(lines, place, ax, ay, az)
             _put(lines, place + 8, -(ax + bx), -(ay + by), -(az + bz))
@@ -187,22 +193,25 @@ def evaluate(  # type: ignore[no-untyped-def]
         elif kind == LINEAR:
             # sum c . r; small moves and large positions are summed apart.
             whole, change = 0.0, 0.0
-            for p in range(slot, entry(links, 4 * k + 6)):
-                i = 4 * entry(slot_atoms, p)
+            for p in range(slot, load_index(links, 4 * k + 6)):
+                i = 4 * load_index(slot_atoms, p)
                 c = quad(
-                    number(parameters, offset), number(parameters, offset + 1), number(parameters, offset + 2), 0.0
+                    load_double(parameters, offset),
+                    load_double(parameters, offset + 1),
+                    load_double(parameters, offset + 2),
+                    0.0,
                 )
-                _put(lines, 8 * p + which, lane(c, 0), lane(c, 1), lane(c, 2))
+                _put(lines, 8 * p + which, extract(c, 0), extract(c, 1), extract(c, 2))
                 whole += dot(c, load_quad(base, i) - load_quad(moved, 4 * p))
                 change += dot(c, load_quad(moves, i))
                 offset += 3
             value = whole + change
         else:
             value = _call_function(function, (
-                kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, moved,
+                kind, slot, load_index(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, moved,
                 lattice, periodic, lines, which,
             ))  # fmt: skip
-        put(values, k, value)
+        store_double(values, k, value)
 
 
 def addresses_for(kinds: NDArray[np.uint32]) -> tuple[int, int]:
@@ -215,8 +224,8 @@ def first_flat(first, last, links, lines):  # type: ignore[no-untyped-def]
     """The first row whose gradient has less than `FLAT` of that at the reference along it; -1 if none has."""
     for k in range(first, last):
         along, size = 0.0, 0.0
-        for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
-            rolled()
+        for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+            keep_loop_rolled()
             g = second_vector(lines, 8 * p)
             along += dot(first_vector(lines, 8 * p), g)
             size += dot(g, g)

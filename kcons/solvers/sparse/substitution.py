@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.kernels.two_and_four_wide import (
-    entry,
-    lane,
+    extract,
+    keep_loop_rolled,
+    load_double,
+    load_index,
     load_pair,
     load_quad,
-    number,
     pair,
-    put,
-    rolled,
     second_vector,
     settled,
+    store_double,
     store_pair,
     store_quad,
     swapped,
@@ -34,10 +34,10 @@ CHANGE, RIGHT = 6, 7
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries):  # type: ignore[no-untyped-def]
     """Assemble entry p of a row (vectors x, y, z: s and r) and take it from its column; returns the entry."""
-    l = 8 * entry(columns, p)
+    l = 8 * load_index(columns, p)
     both = x * load_pair(state, l) + y * load_pair(state, l + 2) + z * load_pair(state, l + 4)
-    both = number(couplings, p) * both + load_pair(entries, 4 * p + 2)
-    low, up = inverse * lane(both, 0), lane(both, 1)
+    both = load_double(couplings, p) * both + load_pair(entries, 4 * p + 2)
+    low, up = inverse * extract(both, 0), extract(both, 1)
     done = pair(low, up)
     store_quad(entries, 4 * p, settled(done))
     store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
@@ -47,24 +47,24 @@ def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries): 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def update(t, one, two, targets, entries):  # type: ignore[no-untyped-def]
     """Take the product of two entries of a row, to columns l and m, from A_ml and A_lm."""
-    e = 4 * entry(targets, t) + 2
+    e = 4 * load_index(targets, t) + 2
     store_pair(entries, e, load_pair(entries, e) - swapped(one) * two)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep."""
-    begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
+    begin, t = load_index(links, 4 * first), load_index(links, 4 * first + 1)
     for k in range(first, last):
         x, y, z = swapped(load_pair(state, 8 * k)), swapped(load_pair(state, 8 * k + 2)), load_pair(state, 8 * k + 4)
         z = swapped(z)
-        inner = lane(x, 0) * lane(x, 1) + lane(y, 0) * lane(y, 1) + lane(z, 0) * lane(z, 1)
-        whole = number(weights, k) * inner
-        d = whole + number(state, 8 * k + CHANGE)
-        right = number(state, 8 * k + RIGHT)
+        inner = extract(x, 0) * extract(x, 1) + extract(y, 0) * extract(y, 1) + extract(z, 0) * extract(z, 1)
+        whole = load_double(weights, k) * inner
+        d = whole + load_double(state, 8 * k + CHANGE)
+        right = load_double(state, 8 * k + RIGHT)
         inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
-        put(pivots, k, inverse)
-        end = entry(links, 4 * k + 4)
+        store_double(pivots, k, inverse)
+        end = load_index(links, 4 * k + 4)
         # Few entries are the rule; spelt out, their numbers stay in registers.
         count = end - begin
         if count == 1:
@@ -84,13 +84,13 @@ def factor(first, last, links, columns, targets, couplings, weights, state, entr
             t += 3
         else:
             for p in range(begin, end):
-                rolled()
+                keep_loop_rolled()
                 _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries)
             for p in range(begin, end - 1):
-                rolled()
+                keep_loop_rolled()
                 mine = load_pair(entries, 4 * p)
                 for q in range(p + 1, end):
-                    rolled()
+                    keep_loop_rolled()
                     update(t, mine, load_pair(entries, 4 * q), targets, entries)
                     t += 1
         begin = end
@@ -98,9 +98,9 @@ def factor(first, last, links, columns, targets, couplings, weights, state, entr
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries):  # type: ignore[no-untyped-def]
-    l = 8 * entry(columns, p)
-    inner = sx * number(state, l + 1) + sy * number(state, l + 3) + sz * number(state, l + 5)
-    up = number(couplings, p) * inner + number(entries, 4 * p + 2)
+    l = 8 * load_index(columns, p)
+    inner = sx * load_double(state, l + 1) + sy * load_double(state, l + 3) + sz * load_double(state, l + 5)
+    up = load_double(couplings, p) * inner + load_double(entries, 4 * p + 2)
     low = up * inverse
     store_quad(entries, 4 * p, settled(pair(low, up)))
     store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
@@ -109,22 +109,22 @@ def _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, stat
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _update_symmetric(t, low, up, targets, entries):  # type: ignore[no-untyped-def]
-    e = 4 * entry(targets, t) + 2
-    put(entries, e, number(entries, e) - low * up)
+    e = 4 * load_index(targets, t) + 2
+    store_double(entries, e, load_double(entries, e) - low * up)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
     """`factor` for r = s: half the work."""
-    begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
+    begin, t = load_index(links, 4 * first), load_index(links, 4 * first + 1)
     for k in range(first, last):
-        sx, sy, sz = number(state, 8 * k + 1), number(state, 8 * k + 3), number(state, 8 * k + 5)
-        whole = number(weights, k) * (sx * sx + sy * sy + sz * sz)
-        d = whole + number(state, 8 * k + CHANGE)
-        right = number(state, 8 * k + RIGHT)
+        sx, sy, sz = load_double(state, 8 * k + 1), load_double(state, 8 * k + 3), load_double(state, 8 * k + 5)
+        whole = load_double(weights, k) * (sx * sx + sy * sy + sz * sz)
+        d = whole + load_double(state, 8 * k + CHANGE)
+        right = load_double(state, 8 * k + RIGHT)
         inverse = 1.0 / d if d > PIVOT_TOLERANCE * whole else 0.0
-        put(pivots, k, inverse)
-        end = entry(links, 4 * k + 4)
+        store_double(pivots, k, inverse)
+        end = load_index(links, 4 * k + 4)
         count = end - begin
         if count == 1:
             _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
@@ -143,14 +143,14 @@ def factor_symmetric(first, last, links, columns, targets, couplings, weights, s
             t += 3
         else:
             for p in range(begin, end):
-                rolled()
+                keep_loop_rolled()
                 _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries)
             for p in range(begin, end - 1):
-                rolled()
-                low = number(entries, 4 * p)
+                keep_loop_rolled()
+                low = load_double(entries, 4 * p)
                 for q in range(p + 1, end):
-                    rolled()
-                    _update_symmetric(t, low, number(entries, 4 * q + 1), targets, entries)
+                    keep_loop_rolled()
+                    _update_symmetric(t, low, load_double(entries, 4 * q + 1), targets, entries)
                     t += 1
         begin = end
 
@@ -158,34 +158,34 @@ def factor_symmetric(first, last, links, columns, targets, couplings, weights, s
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
     """Forward substitution with the factor kept from before."""
-    begin = entry(links, 4 * first)
+    begin = load_index(links, 4 * first)
     for k in range(first, last):
-        right = number(state, 8 * k + RIGHT)
-        end = entry(links, 4 * k + 4)
+        right = load_double(state, 8 * k + RIGHT)
+        end = load_index(links, 4 * k + 4)
         for p in range(begin, end):
-            rolled()
-            l = 8 * entry(columns, p) + RIGHT
-            put(state, l, number(state, l) - number(entries, 4 * p) * right)
+            keep_loop_rolled()
+            l = 8 * load_index(columns, p) + RIGHT
+            store_double(state, l, load_double(state, l) - load_double(entries, 4 * p) * right)
         begin = end
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def backward(first, last, links, columns, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
     """Backward substitution; adds to the multipliers and moves the atoms along s in the same sweep."""
-    end = entry(links, 4 * last)
+    end = load_index(links, 4 * last)
     for back in range(last - first):
         k = last - 1 - back
         # The whole line is read before a part of it is written: the other way round the processor waits.
         s = second_vector(state, 8 * k)
-        step = number(state, 8 * k + RIGHT)
-        begin = entry(links, 4 * k)
+        step = load_double(state, 8 * k + RIGHT)
+        begin = load_index(links, 4 * k)
         for p in range(begin, end):
-            rolled()
-            step -= number(entries, 4 * p + 1) * number(state, 8 * entry(columns, p) + RIGHT)
+            keep_loop_rolled()
+            step -= load_double(entries, 4 * p + 1) * load_double(state, 8 * load_index(columns, p) + RIGHT)
         end = begin
-        step *= number(pivots, k)
-        put(state, 8 * k + RIGHT, step)
-        put(solution, k, number(solution, k) + step)
-        i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
-        store_quad(moves, i, load_quad(moves, i) + (step * number(moves, i + 3)) * s)
-        store_quad(moves, j, load_quad(moves, j) - (step * number(moves, j + 3)) * s)
+        step *= load_double(pivots, k)
+        store_double(state, 8 * k + RIGHT, step)
+        store_double(solution, k, load_double(solution, k) + step)
+        i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
+        store_quad(moves, i, load_quad(moves, i) + (step * load_double(moves, i + 3)) * s)
+        store_quad(moves, j, load_quad(moves, j) - (step * load_double(moves, j + 3)) * s)

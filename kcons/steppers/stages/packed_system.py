@@ -1,6 +1,6 @@
 """What compiled steps know of a system: 1/m, spheres, how far is far, and its rows where kernels know all of them.
 
-The tables are those of `solvers.addressable_solvers`: rigid triangles, chains and rows of all kinds that are at rest, each
+The tables are those of `solvers.addressable_solvers`: rigid triangles, chains and rows of all kinds at rest, each
 with its solver, behind one array of numbers.
 """
 

@@ -84,8 +84,8 @@ MUTANTS = [
     ),
     (
         "solvers/sparse/distances.py",
-        "goal = number(rates, k) * np.sqrt(s2) if driven",
-        "goal = number(rates, k) * s2 if driven",
+        "goal = load_double(rates, k) * np.sqrt(s2) if driven",
+        "goal = load_double(rates, k) * s2 if driven",
         "tests/solvers/test_distance_solvers.py::test_tangents_match_dense_solve[True-sparse-comb]",
     ),
     # -- eight small clusters at once --
@@ -210,7 +210,7 @@ MUTANTS = [
     ),
     (
         "solvers/single_rows.py",
-        "put(solution, k, last + 0.5 * (lam - last))",
+        "store_double(solution, k, last + 0.5 * (lam - last))",
         "put(solution, k, lam)",
         "tests/solvers/test_single_rows.py::test_steps_that_overshoot_are_halved",
     ),

@@ -28,8 +28,8 @@ MUTANTS = [
     ),
     (
         "solvers/sparse/row_values.py",
-        "time = 0.5 * (time + number(parameters, 1))",
-        "time = number(parameters, 0)",
+        "time = 0.5 * (time + load_double(parameters, 1))",
+        "time = load_double(parameters, 0)",
         "tests/steppers/test_flights.py::test_driven_velocities_hold_at_the_middle_of_the_time",
     ),
     (

@@ -17,7 +17,7 @@ from kcons.solvers.kernels.array_views import (
     octets,
     piece,
 )
-from kcons.solvers.kernels.two_and_four_wide import number, put
+from kcons.solvers.kernels.two_and_four_wide import load_double, store_double
 
 
 @njit
@@ -55,8 +55,8 @@ def test_all_numbers_of_an_array_of_any_shape():
 @njit
 def beginnings(room, header, k):
     piece_of_room = at_piece(room, header, k)
-    put(piece_of_room, 1, -1.0)
-    return at_first(room)[0], piece_of_room[0], number(piece_of_room, 2), none_of(room).size
+    store_double(piece_of_room, 1, -1.0)
+    return at_first(room)[0], piece_of_room[0], load_double(piece_of_room, 2), none_of(room).size
 
 
 def test_where_arrays_and_their_pieces_begin():

@@ -9,13 +9,13 @@ from kcons.solvers.kernels.any_width import FLAGS
 
 @njit(fastmath=set(FLAGS))
 def small_things(a, table, out):
-    p = narrow.pair(narrow.number(a, 0), narrow.number(a, 1))
+    p = narrow.pair(narrow.load_double(a, 0), narrow.load_double(a, 1))
     q = narrow.load_quad(a, 1)
     narrow.store_pair(out, 0, narrow.swapped(p))
     narrow.store_quad(out, 2, narrow.settled(p))
-    narrow.put(out, 6, narrow.lane(q, 2))
-    narrow.put(out, 7, narrow.dot(q, narrow.quad(2.0, 3.0, 4.0, np.nan)))
-    return narrow.entry(table, 1)
+    narrow.store_double(out, 6, narrow.extract(q, 2))
+    narrow.store_double(out, 7, narrow.dot(q, narrow.quad(2.0, 3.0, 4.0, np.nan)))
+    return narrow.load_index(table, 1)
 
 
 def test_pairs_and_quads():
@@ -28,7 +28,7 @@ def test_pairs_and_quads():
 def move(points, offset, by):
     before = narrow.load_point(points, offset)
     narrow.add_to_point(points, offset, before * 0.0 + narrow.load_quad(by, 0))
-    return narrow.lane(before, 0), narrow.lane(before, 2), narrow.lane(before, 3)
+    return narrow.extract(before, 0), narrow.extract(before, 2), narrow.extract(before, 3)
 
 
 def test_the_last_point_of_an_array():
