@@ -94,7 +94,7 @@ class AddressableSolver(ABC):
     rows: IntArray
     kernels: Kernels
     tables: FloatArray
-    numbers: FloatArray = NO_NUMBERS
+    numbers: FloatArray
     #: Ways of solving for positions, one after the other until one arrives.
     ways: tuple[bool, ...] = (False,)
     _solution: FloatArray
@@ -119,21 +119,15 @@ class AddressableSolver(ABC):
         """The last solution, by unit steps in what rows measure."""
         return self._solution
 
-    def _enter(self, request: Request, times: tuple[float, float, float]) -> FloatArray:
-        """Take over cell and times of a request; returns what is wanted of the rows."""
-        if request.moved is not None or self._moved:
-            self._take_off(request.moved)
-        if request.lattice is not self._lattice:
-            self._lattice = request.lattice
-            self._cell, self._kind = lattice_kind(request.lattice)
-        if self.numbers.size:
-            self.numbers[:3] = times
-        return NO_NUMBERS if request.wanted is None else request.wanted[self.rows]
-
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, _, _, time, reference_time, velocities, inv_dt, flight, _ = request
-        wanted = self._enter(request, (time, reference_time, flight))
+        x, reference, given, lattice, time, reference_time, velocities, inv_dt, flight, moved = request
+        if moved is not None or self._moved:
+            self._take_off(moved)
+        if lattice is not self._lattice:
+            self._lattice, (self._cell, self._kind) = lattice, lattice_kind(lattice)
+        wanted = NO_NUMBERS if given is None else given[self.rows]
+        self.numbers[:3] = time, reference_time, flight
         if velocities is None:
             velocities, inv_dt = x, 0.0
         for careful in self.ways:
@@ -150,8 +144,13 @@ class AddressableSolver(ABC):
 
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, _, _, time, _, _, _, _, _ = request
-        wanted = self._enter(request, (time, time, 1.0))
+        y, x, given, lattice, time, _, _, _, _, moved = request
+        if moved is not None or self._moved:
+            self._take_off(moved)
+        if lattice is not self._lattice:
+            self._lattice, (self._cell, self._kind) = lattice, lattice_kind(lattice)
+        wanted = NO_NUMBERS if given is None else given[self.rows]
+        self.numbers[:3] = time, time, 1.0
         found = self.kernels[1](True, x, y, wanted, self._cell, self._kind, self.tables, self.numbers)
         self.refuse()
         if found[0] and multipliers is not None:

@@ -196,10 +196,8 @@ def _positions(  # type: ignore[no-untyped-def]
                 keep_loop_rolled()
                 size, far = 0.0, 0.0
                 for i in range(3):
-                    g, r = (
-                        load_double(numbers, out + 1 + 3 * (p - slot) + i),
-                        load_double(x, 3 * load_index(atoms, p) + i),
-                    )
+                    g = load_double(numbers, out + 1 + 3 * (p - slot) + i)
+                    r = load_double(x, 3 * load_index(atoms, p) + i)
                     store_double(pushes, 3 * p + i, g * load_double(masses, p))
                     size, far = size + g * g, far + r * r
                 reach += math.sqrt(size * far)

@@ -105,7 +105,7 @@ class SparseDistances(AddressableSolver):
                 *(room(4 * n_atoms), room(n), room(4 * n_atoms), room(n)),
             )
         )
-        self.kernels = Kernels(_positions, _tangents, _apply, resolved=_resolved)
+        self.kernels, self.numbers = Kernels(_positions, _tangents, _apply, resolved=_resolved), np.zeros(3)
         self._solution = part_of(self.tables, _SOLUTION)
 
     def __reduce__(self) -> tuple[type[SparseDistances], tuple[object, ...]]:
