@@ -8,7 +8,7 @@ import numpy as np
 
 from kcons import ConstraintSet, Motion, System, run
 from kcons.constraints import Ellipsoid, Formula, Sphere, Torus
-from kcons.motion import minimise
+from kcons.motion import minimize
 
 n = 12
 atoms, origin = np.arange(n), [0.0, 0.0, 0.0]
@@ -41,7 +41,7 @@ for name, surface in surfaces.items():
     path = run(system, system.initial_state(x, np.zeros_like(x)), 0.005, 400, record=400)
     change = energy(path.positions[-1]) + 0.5 * np.sum(path.velocities[-1] ** 2) - energy(x)
     off = np.abs(held.value(path.positions[-1])).max()
-    found = energy(minimise(motion, repulsion, path.positions[-1], tolerance=1e-9, longest=0.2).positions)
+    found = energy(minimize(motion, repulsion, path.positions[-1], tolerance=1e-9, longest=0.2).positions)
     print(f"{name:10s} {change:16.1e} {off:17.0e} {found:22.8f}")
     assert off < 1e-12 and abs(change) < 1e-2 * energy(x)
     assert name != "sphere" or abs(found - 49.165253058) < 1e-8

@@ -7,10 +7,10 @@
 - `report`: what is held, and how well
 - `condition`: condition numbers of clusters
 - `restoring`: positions that are off, brought onto the constraints
-- `minimisation`: statics
+- `minimization`: statics
 """
 
-from kcons.motion.minimisation import Minimum, minimise
+from kcons.motion.minimization import Minimum, minimize
 from kcons.motion.motion import Motion
 
-__all__ = ["Minimum", "Motion", "minimise"]
+__all__ = ["Minimum", "Motion", "minimize"]

@@ -87,7 +87,7 @@ class Failures:
             f"{outcome.iterations} iterations. "
             + (
                 straight
-                or "The displacement is too large for this geometry; use a smaller time step (or optimiser step), or "
+                or "The displacement is too large for this geometry; use a smaller time step (or optimizer step), or "
                 "restore_positions for a start that is far off"
             ),
             residual=outcome.residual,
@@ -138,7 +138,7 @@ class Failures:
         sum_of_squares = float(np.sum(self._rows.value(x, time) ** 2))
         return InfeasibleError(
             f"infeasible: residual cannot go below {sum_of_squares:.6g} (sum of squares) from these positions; "
-            f"worst row {name}. Check its target against its neighbours', or start nearer to a solution",
+            f"worst row {name}. Check its target against its neighbors', or start nearer to a solution",
             residual=outcome.residual,
             iterations=outcome.iterations,
             row=row,

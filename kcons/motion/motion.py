@@ -421,7 +421,7 @@ class Motion:
     ) -> FloatArray:
         """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected).
 
-        `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilisation).
+        `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilization).
         """
         return self._accelerated(x, v, f, time, feedback)[0]
 
@@ -491,7 +491,7 @@ class Motion:
     def project_forces(
         self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None
     ) -> FloatArray:
-        """f + z with b = 0: what is left of the force on the surface, for optimisers, shape (n_atoms, 3)."""
+        """f + z with b = 0: what is left of the force on the surface, for optimizers, shape (n_atoms, 3)."""
         time = finite_number(time, "time")
         force = as_array(f, self._shape, "forces")
         here = as_array(x, self._shape, "positions")

@@ -120,7 +120,7 @@ def _joined(begins, atoms, n_atoms):  # type: ignore[no-untyped-def]
 
 
 def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: FloatArray) -> Iterator[Shape]:
-    """Sort the clusters by the shape of their graph; vectorised over clusters."""
+    """Sort the clusters by the shape of their graph; vectorized over clusters."""
     n_clusters = int(labels.max(initial=-1)) + 1
     if n_clusters == 0:
         return

@@ -183,7 +183,7 @@ class Plan:
             name = self.named.row_name(int(rows[np.argmax(self.labels[rows] == np.argmax(sizes))]))
             raise UnsupportedError(
                 f"these positions are too far off for the cluster of {sizes.max()} rows around {name}: start nearer "
-                "to the constraints (minimise with harmonic bonds first), or hold fewer rows"
+                "to the constraints (minimize with harmonic bonds first), or hold fewer rows"
             )
         inverse_masses = (self.inverse_masses > 0).astype(np.float64) if equal else self.inverse_masses
         return GeneralClusters(self.constraint_set, rows, self.labels[rows], inverse_masses)

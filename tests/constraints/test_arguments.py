@@ -38,7 +38,7 @@ from kcons.constraints.arguments import (
 )
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.motion import Motion, minimise
+from kcons.motion import Motion, minimize
 from kcons.steppers import (
     BlanesMoan6,
     BlanesMoan6a,
@@ -416,7 +416,7 @@ OTHER_ARGUMENTS = {
     ),
     "the force of group 'fast' takes (x)": lambda: ForceGroups({"fast": lambda x: x}),
     "force takes (y), but is called with (x, t)": (
-        lambda: minimise(Motion(NONE, X), lambda y: y, X, tolerance=1.0, longest=1.0)
+        lambda: minimize(Motion(NONE, X), lambda y: y, X, tolerance=1.0, longest=1.0)
     ),
     "stress takes (x, t), but is called with (x, t, cell)": (
         lambda: CellSystem(

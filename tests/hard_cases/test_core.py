@@ -212,8 +212,8 @@ def test_H07_rows_of_angles_keep_their_size_towards_180_degrees() -> None:
         assert np.linalg.norm(row) == pytest.approx(np.sqrt(4 - 2 * np.cos(bend)), rel=1e-12)
 
 
-@pytest.mark.parametrize(("n", "linearised"), [(3, 7), (4, 7), (6, 9)])
-def test_H04_H05_degrees_of_freedom_of_what_is_singular_are_counted(n: int, linearised: int) -> None:
+@pytest.mark.parametrize(("n", "linearized"), [(3, 7), (4, 7), (6, 9)])
+def test_H04_H05_degrees_of_freedom_of_what_is_singular_are_counted(n: int, linearized: int) -> None:
     """A straight molecule and planar rings, held by all of their distances."""
     turn = 2 * np.pi * np.arange(n) / n
     x = (
@@ -222,6 +222,6 @@ def test_H04_H05_degrees_of_freedom_of_what_is_singular_are_counted(n: int, line
         else np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     )
     body = 5 if n == 3 else 6
-    with refused(Singular, f"{linearised} linearised degrees of freedom but the rigid body has {body}", x):
+    with refused(Singular, f"{linearized} linearized degrees of freedom but the rigid body has {body}", x):
         Core().system(Problem(x, np.ones(n), every(n)), degenerate="raise")
     assert motion_of(Problem(x, np.ones(n), every(n))).degrees_of_freedom == body

@@ -39,7 +39,7 @@ def test_kcons_holds_it_or_says_why_not(name):
     result = EXAMPLE.run_carried(*CASES[name])
     if name in REFUSED:
         assert "SingularGeometryError" in result["refused"]
-        assert "linearised degrees of freedom" in result["refused"]
+        assert "linearized degrees of freedom" in result["refused"]
         return
     assert "refused" not in result, result
     assert result["error"] <= 1e-13

@@ -40,7 +40,7 @@ from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import FIRST, relax
 from kcons.free_energy.scans.scan_result import Attempt, Attempts, Scan
 from kcons.free_energy.torsion_force import warn_of_gaps
-from kcons.motion.minimisation import minimise
+from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
 
 #: Energy by which a structure has to be lower to be handed on to the neighbors, in eV (10^-5 hartree).
@@ -200,7 +200,7 @@ class _Surface:
                 calls += 1
                 return self.evaluate(y)[1]
 
-            found = minimise(motion, force, x, tolerance=fmax, longest=FIRST, steps=evaluations)
+            found = minimize(motion, force, x, tolerance=fmax, longest=FIRST, steps=evaluations)
             energy, _ = self.evaluate(found.positions)
             attempt.positions, attempt.energy, attempt.largest = found.positions, energy, found.largest
             attempt.evaluations = calls

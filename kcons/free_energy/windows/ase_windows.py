@@ -29,7 +29,7 @@ from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
-from kcons.motion import minimise
+from kcons.motion import minimize
 from kcons.motion.motion import Motion
 from kcons.thermostats import IsokineticSpheres
 
@@ -211,7 +211,7 @@ class _Simulation:
 
         if settings.relax:
             try:
-                x = minimise(motion, force, x, tolerance=_FORCE, longest=_STRIDE, steps=settings.relax).positions
+                x = minimize(motion, force, x, tolerance=_FORCE, longest=_STRIDE, steps=settings.relax).positions
             except ConvergenceError as error:  # relaxed as far as wanted
                 if error.positions is None:
                     raise

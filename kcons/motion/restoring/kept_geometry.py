@@ -23,7 +23,7 @@ from kcons.topology.topology import BoolArray, bond_angles, connected, sorted_pa
 
 #: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
 BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)
-#: Displacements below this part of the distance to the nearest neighbour leave bonds and angles as they are.
+#: Displacements below this part of the distance to the nearest neighbor leave bonds and angles as they are.
 STILL = 3e-3
 #: Rows off by more than this (radian, or part of the length) are far.
 FAR = 0.25
@@ -326,7 +326,7 @@ class Geometry:
 
 
 def _closest(x: FloatArray, chosen: BoolArray) -> float:
-    """The least distance of some atoms to their nearest neighbours."""
+    """The least distance of some atoms to their nearest neighbors."""
     from scipy.spatial import cKDTree
 
     if len(x) < 2:

@@ -118,7 +118,7 @@ def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> Infeasi
         return None
     return InfeasibleError(
         f"the positions that were found miss row {held.row_name(row)} by {miss[row]:.6g}; check its target against its "
-        "neighbours', or start nearer to a solution",
+        "neighbors', or start nearer to a solution",
         residual=float(miss[row] / held.scale[row]),
         tolerance=float(allowed[row] / held.scale[row]),
         row=row,

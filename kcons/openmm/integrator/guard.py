@@ -276,7 +276,7 @@ class Guard:
         miss = np.abs(self.rows.stretches(x))
         row = int(np.argmax(miss)) if len(miss) else 0
         if len(miss) and not miss[row] <= NEAR:
-            remedy = "minimise the energy or call integrator.applyConstraints(context)" if x.any() else "set positions"
+            remedy = "minimize the energy or call integrator.applyConstraints(context)" if x.any() else "set positions"
             raise InputError(
                 f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative) at the start; {remedy} first",
                 item="positions",

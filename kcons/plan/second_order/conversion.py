@@ -130,7 +130,7 @@ class _Stack:
     def _dense(
         self, constraint_set: ConstraintSet, x: FloatArray, time: float
     ) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
-        """Row-normalised A of each block, fixed atoms' columns zero, and the curvatures of the same rows."""
+        """Row-normalized A of each block, fixed atoms' columns zero, and the curvatures of the same rows."""
         n_blocks, n_rows = self.rows.shape
         n_atoms = self.atoms.shape[1]
         a = np.zeros((n_blocks, n_rows, n_atoms, 3))
@@ -196,7 +196,7 @@ class _Stack:
                     lengths=length[k, 2:],
                     tied=np.array([middle]),
                     weights=np.array([[1.0 - c, c]]),
-                    linearised=7,
+                    linearized=7,
                 )
             )
         return bodies, done

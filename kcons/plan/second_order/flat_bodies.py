@@ -42,7 +42,7 @@ class FlatBody:
         The other atoms.
     weights : ndarray, shape (n, n_bases)
         x_tied = weights @ x_bases.
-    linearised : int
+    linearized : int
         Degrees of freedom that the replaced rows leave at first order; the body itself has 5 or 6.
     """
 
@@ -53,7 +53,7 @@ class FlatBody:
     lengths: FloatArray
     tied: IntArray
     weights: FloatArray
-    linearised: int
+    linearized: int
 
     def __str__(self) -> str:
         """For example 'atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows'."""
@@ -172,16 +172,16 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
     """What holds a flat group: bases, their distances, and the weights of the other atoms."""
     inside = block.inside(atoms)
     moving = [k for k in inside if isinstance(block.part.locate(int(k))[0].target, MovingTarget)]
-    linearised = 3 * len(atoms) - int(block.pinned[atoms].sum()) * 3 - block.rank(block.x, inside)
+    linearized = 3 * len(atoms) - int(block.pinned[atoms].sum()) * 3 - block.rank(block.x, inside)
     flat = affine_dimension(x[atoms])
     if moving:
         raise SingularGeometryError(
-            _sentence(linearised, flat, block.atoms[atoms])
+            _sentence(linearized, flat, block.atoms[atoms])
             + "; it cannot be converted, since a target among these atoms is a function of time",
             rows=block.rows[inside],
             atoms=block.atoms[atoms],
         )
-    plane = _fitted(block, atoms, inside, x, flat, linearised)
+    plane = _fitted(block, atoms, inside, x, flat, linearized)
     bases, weights = _bases(block, atoms, inside, plane)
     others = np.setdiff1d(np.arange(len(atoms)), bases)
     held = np.array(list(combinations(bases, 2)))
@@ -201,12 +201,12 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
         lengths=lengths,
         tied=atoms[others],
         weights=weights[others],
-        linearised=linearised,
+        linearized=linearized,
     )
 
 
 def _fitted(
-    block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, flat: int, linearised: int
+    block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, flat: int, linearized: int
 ) -> FloatArray:
     """Coordinates along the line or in the plane that fulfil the targets, shape (n, 1) or (n, 2).
 
@@ -238,7 +238,7 @@ def _fitted(
         worst = int(np.argmax(np.abs(block.part.value(whole, block.time)[inside]) / scale))
         row = int(block.rows[inside[worst]])
         raise SingularGeometryError(
-            _sentence(linearised, flat, block.atoms[atoms])
+            _sentence(linearized, flat, block.atoms[atoms])
             + f"; it cannot be converted, since the targets do not fit a {('linear', 'planar')[flat - 1]} group: "
             f"row {block.set.row_name(row)} stays off by {miss:.2g} (relative)",
             rows=block.rows[inside],
@@ -362,7 +362,7 @@ def with_flat_bodies(
 def refusal(body: FlatBody) -> SingularGeometryError:
     """The error for second-order-singular rows that may not be converted."""
     return SingularGeometryError(
-        _sentence(body.linearised, len(body.bases) - 1, body.atoms), rows=body.rows, atoms=body.atoms
+        _sentence(body.linearized, len(body.bases) - 1, body.atoms), rows=body.rows, atoms=body.atoms
     )
 
 
@@ -370,7 +370,7 @@ def _listed(atoms: IntArray) -> str:
     return ", ".join(str(a) for a in atoms[:8]) + (", ..." if len(atoms) > 8 else "")
 
 
-def _sentence(linearised: int, flat: int, atoms: IntArray) -> str:
+def _sentence(linearized: int, flat: int, atoms: IntArray) -> str:
     shown = _listed(atoms)
     freedom, shape, remedy = (
         (5, "collinear", "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead")
@@ -382,7 +382,7 @@ def _sentence(linearised: int, flat: int, atoms: IntArray) -> str:
         )
     )
     return (
-        f"constraint set singular at this geometry: {linearised} linearised degrees of freedom but the rigid body "
+        f"constraint set singular at this geometry: {linearized} linearized degrees of freedom but the rigid body "
         f"has {freedom} (atoms {shown} are {shape}); {remedy}"
     )
 
@@ -392,7 +392,7 @@ def _unresolved(block: LocalRows, generic: int) -> SingularGeometryError:
     here = block.rank(block.x)
     free = 3 * int(np.sum(~block.pinned))
     return SingularGeometryError(
-        f"constraint set singular at this geometry: {free - here} linearised degrees of freedom here but "
+        f"constraint set singular at this geometry: {free - here} linearized degrees of freedom here but "
         f"{free - generic} at positions nearby; rows {names} resist some motion only at second order, and no linear "
         "or planar rigid group explains it. Leave out the rows that do this, start from another geometry, or hold "
         "the atoms by x_a = sum c_i x_i (LinearRelation)",

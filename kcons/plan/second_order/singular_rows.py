@@ -114,7 +114,7 @@ class LocalRows:
         )
 
     def unit_jacobian(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Row-normalised A without the columns' part of fixed atoms, and the norms."""
+        """Row-normalized A without the columns' part of fixed atoms, and the norms."""
         a = self.part.jacobian(x, self.time).toarray()
         a[:, np.repeat(self.pinned, 3)] = 0.0
         norms = np.linalg.norm(a, axis=1)

@@ -1,7 +1,7 @@
 """Numbers some doubles wide for Numba kernels.
 
 Kernels written with them read like scalar code and are vector code by construction: nothing depends on what the
-auto-vectoriser recognises, and Newton loops of unknown length may stand inside a kernel.
+auto-vectorizer recognizes, and Newton loops of unknown length may stand inside a kernel.
 
 Arrays are handed to intrinsics only: an array handed to a Python function inside a loop costs reference counting, and
 the call makes every vector register spill. They are read and written without checks of the index.

@@ -31,7 +31,7 @@ UIntArray = NDArray[np.uint32]
 #: `nnan` and `ninf` are left out on purpose: a NaN must fail every comparison with a tolerance.
 FAST = {"contract", "arcp", "nsz"}
 
-#: Updates of a factorisation, each stored in four bytes.
+#: Updates of a factorization, each stored in four bytes.
 MOST_UPDATES = 2.5e8
 
 #: Places between a row and its children in the elimination tree, where other rows can stand between.
@@ -162,7 +162,7 @@ def _minimum_degree(row_start, row_atoms, n_atoms, eliminate_last):  # type: ign
             i = struct[struct_used + p]
             old = count[i]
             first = begin[i]
-            # Drop k from i's list, then add those of k's neighbours that i does not know.
+            # Drop k from i's list, then add those of k's neighbors that i does not know.
             new = 0
             for q in range(old):
                 j = pool[first + q]
@@ -309,7 +309,7 @@ def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
 
 @register_jitable
 def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
-    """Children before parents, branch by branch; neighbouring branches of a tree alternate.
+    """Children before parents, branch by branch; neighboring branches of a tree alternate.
 
     A row waits for the pivots of its children, each a division late. So a row is put at least `DISTANCE`
     places behind its children where there are others to go first, those earliest in postorder.

@@ -195,9 +195,8 @@ def _factor(  # type: ignore[no-untyped-def]
         whole = 0.0
         while slot < stop:
             keep_loop_rolled()
-            inner = load_double(lines, slot) * load_double(lines, slot + 1) + load_double(
-                lines, slot + 2
-            ) * load_double(lines, slot + 3)
+            inner = load_double(lines, slot) * load_double(lines, slot + 1)
+            inner += load_double(lines, slot + 2) * load_double(lines, slot + 3)
             whole += load_double(lines, slot + 6) * (
                 inner + load_double(lines, slot + 4) * load_double(lines, slot + 5)
             )

@@ -13,7 +13,7 @@ from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
 from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import relax
-from kcons.motion import minimise
+from kcons.motion import minimize
 
 
 def forces_of(atoms):
@@ -46,7 +46,7 @@ def test_it_needs_far_fewer_calls_than_forces_alone():
     atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=8)
     found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-3)
     evaluate = forces_of(atoms)
-    other = minimise(motion, lambda y, t: evaluate(y)[1], x, tolerance=1e-3, longest=0.2)
+    other = minimize(motion, lambda y, t: evaluate(y)[1], x, tolerance=1e-3, longest=0.2)
     assert found.energy == pytest.approx(evaluate(other.positions)[0], abs=1e-5)
     assert 2 * found.evaluations < other.evaluations
 

@@ -127,7 +127,7 @@ def test_start_off_the_constraints_is_refused(kind):
     x[4] += 0.03
     integrator = kind(1e-3)
     context = started(system, integrator, x, v)
-    with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimise") as caught:
+    with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimize") as caught:
         integrator.step(5)
     assert 4 in caught.value.atoms
     np.testing.assert_array_equal(state_of(context), [x, v])

@@ -195,22 +195,22 @@ def refuse(rows: Constraint | Sequence[Constraint], x: Array, *, convert: bool =
 def test_sentence_for_a_linear_group() -> None:
     error = refuse(Distance(pairs_of(3)), turned(CO2), convert=False)
     assert str(error).startswith(
-        "constraint set singular at this geometry: 7 linearised degrees of freedom but the rigid body has 5"
+        "constraint set singular at this geometry: 7 linearized degrees of freedom but the rigid body has 5"
     )
     assert "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead" in str(error)
     assert error.rows == (0, 1, 2) and error.atoms == (0, 1, 2)
 
 
-@pytest.mark.parametrize(("n", "linearised"), [(4, 7), (6, 9)])
-def test_sentence_for_a_planar_group(n: int, linearised: int) -> None:
+@pytest.mark.parametrize(("n", "linearized"), [(4, 7), (6, 9)])
+def test_sentence_for_a_planar_group(n: int, linearized: int) -> None:
     error = refuse(Distance(pairs_of(n)), turned(ring(n)), convert=False)
-    assert f"{linearised} linearised degrees of freedom but the rigid body has 6" in str(error)
+    assert f"{linearized} linearized degrees of freedom but the rigid body has 6" in str(error)
     assert "hold three distances and" in str(error) and "LinearRelation" in str(error)
 
 
 def test_motion_refuses_on_request() -> None:
     x = turned(CO2)
-    with pytest.raises(SingularGeometryError, match="7 linearised degrees of freedom"):
+    with pytest.raises(SingularGeometryError, match="7 linearized degrees of freedom"):
         Motion(ConstraintSet(Distance(pairs_of(3)), x, np.ones(3)), x, degenerate="raise")
 
 
@@ -258,7 +258,7 @@ def test_singular_mechanisms_are_refused(case: str) -> None:
     if case.startswith("four-bar"):
         x[3, 0] = 1.0
     error = refuse(rows(), x)
-    assert "linearised degrees of freedom here but" in str(error) and "#0" in str(error)
+    assert "linearized degrees of freedom here but" in str(error) and "#0" in str(error)
 
 
 def test_flat_sheet_of_triangles_too_large_for_dense_algebra_is_refused() -> None:
@@ -373,7 +373,7 @@ def porphin_like():
 def test_hinged_plates_that_lock_each_other_are_refused():
     """Each five-ring alone can be held by linear rows; that they cannot fold against each other cannot."""
     x, pairs = porphin_like()
-    with pytest.raises(SingularGeometryError, match="27 linearised degrees of freedom here but 8 at positions nearby"):
+    with pytest.raises(SingularGeometryError, match="27 linearized degrees of freedom here but 8 at positions nearby"):
         Motion(ConstraintSet(Distance(pairs), x, np.ones(len(x))), x)
     # One of the plates is fine.
     ring = [p for p in pairs if max(p) < 5]

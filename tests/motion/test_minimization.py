@@ -8,7 +8,7 @@ import pytest
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Angle, Distance, Ellipsoid, FixedAtoms, MovingTarget, Sphere
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
-from kcons.motion import minimise
+from kcons.motion import minimize
 
 
 def repulsion(x, t):
@@ -23,7 +23,7 @@ def test_twelve_charges_on_a_sphere_make_an_icosahedron(masses):
     x = np.random.default_rng(1).normal(size=(12, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     motion = Motion(ConstraintSet(Sphere(range(12), [0, 0, 0], 1.0), x, masses), x)
-    found = minimise(motion, repulsion, x, tolerance=1e-9, longest=0.2)
+    found = minimize(motion, repulsion, x, tolerance=1e-9, longest=0.2)
     assert found.largest < 1e-9
     np.testing.assert_allclose(np.linalg.norm(found.positions, axis=1), 1, rtol=1e-14)
     r = np.linalg.norm(found.positions[:, None] - found.positions[None], axis=-1)
@@ -34,7 +34,7 @@ def test_twelve_charges_on_a_sphere_make_an_icosahedron(masses):
 def test_a_bead_on_an_ellipsoid_comes_to_its_lowest_point():
     x = np.array([[1.0, 0.5, 0.0]])
     motion = Motion(ConstraintSet(Ellipsoid([0], (0, 0, 0), (1.0, 2.0, 3.0)), x, [2.0]), x)
-    found = minimise(motion, lambda x, t: np.array([[0.0, 0.0, -5.0]]), x, tolerance=1e-10, longest=0.5)
+    found = minimize(motion, lambda x, t: np.array([[0.0, 0.0, -5.0]]), x, tolerance=1e-10, longest=0.5)
     np.testing.assert_allclose(found.positions, [[0, 0, -3]], atol=1e-9)
 
 
@@ -60,7 +60,7 @@ def test_it_is_where_dynamics_with_friction_comes_to_rest():
     x = np.cumsum([[0.0, 0, 0], [1.2, 0.6, 0.1], [1.2, -0.6, 0.3], [1.0, 0.6, -0.5], [1.2, -0.5, 0.2]], axis=0)
     rows = [Distance([[k, k + 1] for k in range(4)]), Angle([[0, 1, 2], [1, 2, 3], [2, 3, 4]]), FixedAtoms([0])]
     motion = Motion(ConstraintSet(rows, x, [12.0, 12, 1, 12, 16]), x)
-    found = minimise(motion, springs, x, tolerance=1e-10, longest=0.1)
+    found = minimize(motion, springs, x, tolerance=1e-10, longest=0.1)
     acceleration = motion.acceleration(found.positions, np.zeros_like(x), springs(found.positions, 0))
     assert np.abs(acceleration).max() < 1e-9
     assert np.abs(motion.constraint_set.value(found.positions)).max() < 1e-13
@@ -78,7 +78,7 @@ def test_moving_targets_hold_still_at_their_time():
     motion = Motion(
         ConstraintSet(Sphere([0], [0, 0, 0], MovingTarget(lambda t: 1 + t, lambda t: 1.0, lambda t: 0.0)), x, [1.0]), x
     )
-    found = minimise(motion, lambda x, t: np.array([[0.0, t, 0.0]]), x, tolerance=1e-10, longest=0.3, time=2.0)
+    found = minimize(motion, lambda x, t: np.array([[0.0, t, 0.0]]), x, tolerance=1e-10, longest=0.3, time=2.0)
     np.testing.assert_allclose(found.positions, [[0, 3, 0]], atol=1e-9)
 
 
@@ -86,13 +86,13 @@ def test_what_stops_it():
     x = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     motion = Motion(ConstraintSet(Sphere([0, 1], [0, 0, 0], 1.0), x, [1.0, 1.0]), x)
     with pytest.raises(NonFiniteError, match="force on atom 1 is not finite"):
-        minimise(motion, lambda x, t: np.array([[0, 0, 0], [0, np.nan, 0]]), x, tolerance=1e-6, longest=0.1)
+        minimize(motion, lambda x, t: np.array([[0, 0, 0], [0, np.nan, 0]]), x, tolerance=1e-6, longest=0.1)
     with pytest.raises(ConvergenceError, match=r"after 3 steps, and not 1e-12; give more steps") as stopped:
-        minimise(motion, repulsion, x, tolerance=1e-12, longest=0.01, steps=3)
+        minimize(motion, repulsion, x, tolerance=1e-12, longest=0.01, steps=3)
     assert np.abs(stopped.value.positions - x).max() > 0.01
     back = np.array([[0, 1.0, 0], [0, 0, 0]])  # where it has gone it is told to go back
     with pytest.raises(ConvergenceError, match="no gradient, or not so exact") as stopped:
-        minimise(
+        minimize(
             motion,
             lambda y, t: back if np.allclose(y, x, rtol=0, atol=1e-12) else -3 * back,
             x,
@@ -102,6 +102,6 @@ def test_what_stops_it():
     np.testing.assert_allclose(stopped.value.positions, x, atol=1e-12)
     for wrong in ({"tolerance": 0.0, "longest": 0.1}, {"tolerance": 1e-6, "longest": np.nan}):
         with pytest.raises(InputError, match="give a positive number"):
-            minimise(motion, repulsion, x, **wrong)
+            minimize(motion, repulsion, x, **wrong)
     with pytest.raises(InputError, match="force"):
-        minimise(motion, lambda x, t: np.zeros(3), x, tolerance=1e-6, longest=0.1)
+        minimize(motion, lambda x, t: np.zeros(3), x, tolerance=1e-6, longest=0.1)

@@ -47,7 +47,7 @@ class Minimum:
         return _largest(self.forces)
 
 
-def minimise(
+def minimize(
     motion: Motion,
     force: Callable[[FloatArray, float], ArrayLike],
     positions: ArrayLike,
