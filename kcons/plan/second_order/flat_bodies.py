@@ -19,7 +19,6 @@ from kcons.constraints.linear import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
 from kcons.plan.second_order.singular_rows import STEP_CUT, UNSOLVABLE, BoolArray, LocalRows, extent_of
-from kcons.solvers.tolerances import LOST
 
 #: Extent across a line or plane, relative to the extent along it, that still counts as flat.
 FLAT = 1e-6
@@ -307,9 +306,7 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     distances between them resist the fold at second order.
     """
     new = _rebuilt(block, bodies)
-    unit, _ = new.unit_jacobian(block.x)
-    u, s, vt = np.linalg.svd(unit, full_matrices=True)
-    rank = int(np.sum(s > LOST * s[0]))
+    u, s, vt, rank = new.decomposed(block.x)
     old, _ = block.unit_jacobian(block.x)
     if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
         raise _unresolved(block, generic)

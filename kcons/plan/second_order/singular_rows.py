@@ -120,6 +120,11 @@ class LocalRows:
         norms = np.linalg.norm(a, axis=1)
         return a / np.where(norms > 0, norms, 1.0)[:, None], norms
 
+    def decomposed(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+        """u, s and v^T of these rows, all singular vectors, and their rank."""
+        u, s, vt = np.linalg.svd(self.unit_jacobian(x)[0], full_matrices=True)
+        return u, s, vt, int(np.sum(s > LOST * s[0]))
+
     def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
         """Whether these rows (all by default) are singular at second order at `x`."""
         rows = np.arange(self.part.n_rows) if rows is None else rows
@@ -141,9 +146,7 @@ class LocalRows:
 
     def stressed(self, x: FloatArray) -> IntArray:
         """Rows (block numbering) that take part in a dependence omega^T A = 0."""
-        unit, _ = self.unit_jacobian(x)
-        u, s, _ = np.linalg.svd(unit, full_matrices=True)
-        rank = int(np.sum(s > LOST * s[0]))
+        u, _, _, rank = self.decomposed(x)
         return np.flatnonzero(np.einsum("rk,rk->r", u[:, rank:], u[:, rank:]) > 1e-10)
 
     def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
@@ -176,9 +179,7 @@ class LocalRows:
         for _ in range(3):
             x = self.x + step * rng.standard_normal(self.x.shape)
             x[self.pinned] = self.x[self.pinned]
-            unit, _ = self.unit_jacobian(x)
-            _, s, vt = np.linalg.svd(unit, full_matrices=True)
-            rank = int(np.sum(s > LOST * s[0]))
+            _, _, vt, rank = self.decomposed(x)
             if rank <= best:
                 continue
             best = rank
