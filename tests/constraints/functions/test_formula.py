@@ -202,7 +202,7 @@ def test_formulas_move_as_the_families_do(formula, family):
     ends = []
     for row in (formula, family):
         motion = Motion(ConstraintSet([Distance([0, 1]), Plane([0], UP), row], x, [1.0, 2.0]), x)
-        assert motion.plan.kinds[0].solver == "mixed"
+        assert motion.plan.kinds[0].solver == "SparseRows"
         start = State(x, motion.project_velocities(x, v))
         ends.append(run(System(motion, lambda x, t: np.sin(3 * x)), start, 0.02, 20))
     np.testing.assert_allclose(ends[0].positions, ends[1].positions, rtol=0, atol=1e-13)
