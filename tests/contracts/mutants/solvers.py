@@ -211,7 +211,7 @@ MUTANTS = [
     (
         "solvers/single_rows.py",
         "store_double(solution, k, last + 0.5 * (lam - last))",
-        "put(solution, k, lam)",
+        "store_double(solution, k, lam)",
         "tests/solvers/test_single_rows.py::test_steps_that_overshoot_are_halved",
     ),
     (
