@@ -348,7 +348,7 @@ def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
     works = [
         np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each]) for each in pulls
     ]
-    starts, ends = (np.array([[-0.5 * s.log_det_z[k] for s in each] for each in pulls]) for k in (0, -1))
+    starts, ends = ([np.array([-0.5 * s.log_det_z[k] for s in each]) for each in pulls] for k in (0, -1))
     # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
     if len(pulls) == 2:
         shift = kT * (_log_mean(starts[0]) - _log_mean(starts[1]))
