@@ -7,7 +7,7 @@ import pytest
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Angle, Distance, FixedAtoms, Formula, Plane
-from kcons.free_energy import HeldCoordinates, Recorder, Sample, Series, local_mean_force, mean_force, weighted_mean
+from kcons.free_energy import HeldCoordinates, Sample, Series, local_mean_force, mean_force, weighted_mean
 from kcons.free_energy.mean_forces import _quietest
 from kcons.thermostats import Langevin
 
