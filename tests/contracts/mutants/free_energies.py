@@ -21,7 +21,7 @@ MUTANTS = [
         "tests/free_energy/scans/test_relaxation.py::test_what_was_learned_goes_along",
     ),
     (
-        "free_energy/scans/model_hessian.py",
+        "free_energy/scans/relaxation.py",
         "return [x[atoms] + images for",
         "return [lined_up(x[atoms], self.lattice) + 0 * images for",
         "tests/free_energy/scans/test_model_hessian.py::test_terms_keep_their_images",

@@ -16,8 +16,7 @@ from kcons.cli.terminal import rendered
 from kcons.constraints import Custom, Dihedral, Distance
 from kcons.errors import InputError, OccupiedError, UnreadableError
 from kcons.free_energy import scan
-from kcons.free_energy.scans.grid import Grid
-from kcons.free_energy.scans.scan_result import KJ, PLACE, Attempt, Attempts
+from kcons.free_energy.scans.scan_result import KJ, PLACE, Attempt, Attempts, Grid
 
 TURN = Dihedral([[0, 1, 2, 3]])
 
