@@ -31,7 +31,7 @@ STRETCH, BEND, TURN = 0.45, 0.15, 0.005
 _EXPONENT = np.array([[1.0, 0.3949, 0.3949], [0.3949, 0.28, 0.28], [0.3949, 0.28, 0.28]])
 _LENGTH = np.array([[1.35, 2.1, 2.53], [2.1, 2.87, 3.4], [2.53, 3.4, 3.4]])
 #: Closeness below which a term is left out: atoms that are bonded have about 1.
-LEAST_PAIR, LEAST = 1e-3, 1e-2
+CLOSE_PAIR, CLOSE = 1e-3, 1e-2
 #: Sine of an angle below which it counts as straight.
 STRAIGHT = 0.2
 
@@ -48,14 +48,14 @@ class Internals:
         apart = norm(minimum_image(x[None] - x[:, None], lattice)) / units.Bohr
         close = np.exp(_EXPONENT[row[:, None], row] * (_LENGTH[row[:, None], row] ** 2 - apart**2))
         np.fill_diagonal(close, 0.0)
-        near = close >= LEAST
-        pairs = np.argwhere(np.triu(close >= LEAST_PAIR))
+        near = close >= CLOSE
+        pairs = np.argwhere(np.triu(close >= CLOSE_PAIR))
         triples = [
             (i, j, k)
             for j in range(self.n_atoms)
             for i in np.flatnonzero(near[j])
             for k in np.flatnonzero(near[j])
-            if i < k and close[i, j] * close[j, k] >= LEAST
+            if i < k and close[i, j] * close[j, k] >= CLOSE
         ]
         table = np.array(triples, dtype=np.int64).reshape(-1, 3)
         sine = self._sines(x, table)
@@ -64,7 +64,7 @@ class Internals:
             (i, j, k, l)
             for i, j, k in (tuple(t) for half in (bent, bent[:, ::-1]) for t in half.tolist())
             for l in np.flatnonzero(near[k])
-            if l not in (i, j) and i < l and close[i, j] * close[j, k] * close[k, l] >= LEAST
+            if l not in (i, j) and i < l and close[i, j] * close[j, k] * close[k, l] >= CLOSE
         ]
         turns = np.array(quads, dtype=np.int64).reshape(-1, 4)
         turns = turns[self._sines(x, turns[:, 1:]) >= STRAIGHT]
