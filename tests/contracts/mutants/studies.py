@@ -69,7 +69,7 @@ MUTANTS = [
         "tests/openmm/collective/test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
     ),
     (
-        "free_energy/windows/free_energy.py",
+        "free_energy/windows/driver.py",
         "covariance = covariance + np.outer(half, half)",
         "covariance = covariance + 0 * np.outer(half, half)",
         "tests/free_energy/windows/test_free_energy.py::test_sides_that_differ_by_more_than_chance_widen_the_error",
