@@ -30,6 +30,8 @@ Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 SIDES, DIRECTIONS = ("up", "down"), ("forward", "backward")
 #: Steps of a structure on its way to a window where nothing can be turned, and what bonds may change by.
 _WALK, _STRETCHED = 20, 0.1
+#: Atoms of all configurations that wait for being looked at together, at most.
+_KEPT = 200_000
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,7 @@ class Sampler(ABC):
         """Take steps and record the coordinates, with `start` before the first one, too."""
         held = run.held.measured(window.target)
         series, taken = Series(held.names, held.periods), list[Any]()
+        most = min(AT_ONCE, 1 + _KEPT // len(run.held.positions))
 
         def keep() -> None:
             for sample in held.samples(*zip(*taken, strict=True)) if taken else ():
@@ -188,7 +191,7 @@ class Sampler(ABC):
 
         def take() -> None:
             taken.append(run.state())
-            if len(taken) == AT_ONCE:
+            if len(taken) == most:
                 keep()
 
         if start:
