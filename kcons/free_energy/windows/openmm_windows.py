@@ -25,8 +25,8 @@ from kcons.openmm.callback_rows.callbacks import cell_of
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites, with_massless_atoms
 from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
-from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.quantities import accepted, masses_of, nanometers
+from kcons.openmm.states import positions_of, velocities_of
 from kcons.openmm.topology import bonds_of
 
 #: What a relaxation leaves of the forces, kJ/mol/nm.

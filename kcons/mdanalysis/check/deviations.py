@@ -28,7 +28,7 @@ from kcons.errors import NonFiniteError
 from kcons.mdanalysis.check.endings import Break
 from kcons.mdanalysis.check.precision import FilePrecision
 from kcons.mdanalysis.topology import NARROWEST
-from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
+from kcons.solvers.kernels.lattices import NO_LATTICE, nearest_image
 
 #: Natural units of rows, in this order.
 UNITS = ("Å", "rad")

@@ -4,8 +4,8 @@ MUTANTS = [
     # -- studies: what is kept, and what is shown --
     (
         "steppers/files.py",
-        "if not math.isfinite(value):",
-        "if False:",
+        "and not math.isfinite(value) else value",
+        "and False else value",
         "tests/steppers/test_files.py::test_data_as_json",
     ),
     (

@@ -139,7 +139,7 @@ def test_velocities_on_spheres_are_refused_where_multipliers_need_thermal_ones(m
     held = [turn, *held]
     draw_velocities(atoms, 300, 1, constraints=held)
     fast, slow = (LennardJones(sigma=1.0, epsilon=e, rc=6.0) for e in (0.02, 0.01))
-    how = {"fast": fast, "slow": slow, "fast_steps": 2, "bath": "spheres", "seed": 1, "constraints": held}
+    how = {"fast": fast, "slow": slow, "fast_steps": 2, "bath": "spheres", "rng": 1, "constraints": held}
     dynamics = MultipleTimeSteps(atoms, 0.5 * units.fs, temperature_K=300, friction=0.02, **how)
     recorder = AseRecorder(dynamics, {"turn": turn})
     dynamics.attach(recorder, interval=1)
