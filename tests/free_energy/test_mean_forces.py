@@ -7,7 +7,7 @@ import pytest
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Angle, Distance, FixedAtoms, Formula, Plane
-from kcons.free_energy import HeldCoordinates, Sample, Series, local_mean_force, mean_force, weighted_mean
+from kcons.free_energy import HeldCoordinates, Recorder, Sample, Series, local_mean_force, mean_force, weighted_mean
 from kcons.free_energy.mean_forces import _quietest
 from kcons.thermostats import Langevin
 
@@ -204,12 +204,9 @@ def test_errors_of_repeated_runs_are_as_large_as_they_say():
         x[3] += rng.normal(size=3) * np.sqrt(kT / stiff) - [np.cos(q), 0.0, 0.0]
         state = State(x, motion.project_velocities(x, rng.normal(size=x.shape)))
         state = run(system, state, 0.15, 25, stepper=Langevin(kT, 12.0, 2 * seed))
-        taken, series = [], Series(held.names)
-        run(system, state, 0.15, 340, stepper=Langevin(kT, 12.0, 2 * seed + 1), observers=[taken.append], every=5)
-        states = [(s.positions, s.velocities, forces(s.positions, s.time), s.time) for s in taken]
-        for sample in held.samples(*zip(*states, strict=True)):
-            series.append(sample)
-        result = mean_force(series, kT)
+        recorder = Recorder(system, held)
+        run(system, state, 0.15, 340, stepper=Langevin(kT, 12.0, 2 * seed + 1), observers=[recorder], every=5)
+        result = mean_force(recorder.series, kT)
         found.append((result.force[0] + kT / np.tan(q) - stiff * np.cos(q) * np.sin(q), result.error[0]))
     away, said = np.array(found).T
     assert abs(away.mean()) < 3 * away.std() / np.sqrt(len(away))
