@@ -4,7 +4,7 @@ ASE applies constraint objects one after another, and each undoes the work of th
 whole set and solves it as one. Units are ASE's; targets are in angstrom and radian. Importing this package registers
 the object with ASE, which makes files that contain it readable.
 
-- `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
+- `topology`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
 - `pressure`, `pressure_reporter`: the stress of the constraint forces, cells that change
 - `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
@@ -26,7 +26,6 @@ try:
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.logger import ConstraintLogger
     from kcons.ase.pressure_reporter import PressureReporter
-    from kcons.ase.rigid_water import rigid_water
     from kcons.ase.thermostat_dynamics import (
         ConstrainedLangevin,
         ConstrainedMonteCarlo,
@@ -35,7 +34,7 @@ try:
         MultipleTimeSteps,
         draw_velocities,
     )
-    from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass
+    from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass, rigid_water
     from kcons.ase.translation import from_ase_constraints
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.ase") from error
