@@ -6,7 +6,7 @@ the object with ASE, which makes files that contain it readable.
 
 - `topology`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
-- `pressure`, `pressure_reporter`: the stress of the constraint forces, cells that change
+- `pressure`: cells that change, the pressure along a run
 - `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
 - `logger`: ASE's log, with multipliers and the right temperature
 - `dynamics`, `thermostat_dynamics`: dynamics with any stepper, thermostat and barostat
@@ -25,7 +25,7 @@ try:
     )
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.logger import ConstraintLogger
-    from kcons.ase.pressure_reporter import PressureReporter
+    from kcons.ase.pressure import PressureReporter
     from kcons.ase.thermostat_dynamics import (
         ConstrainedLangevin,
         ConstrainedMonteCarlo,

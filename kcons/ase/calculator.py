@@ -12,8 +12,7 @@ from ase.calculators.calculator import Calculator, PropertyNotImplementedError, 
 from numpy.typing import NDArray
 
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure import VOIGT
-from kcons.ase.respect import refuse_taken_along
+from kcons.ase.respect import VOIGT, refuse_taken_along
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError

@@ -23,9 +23,8 @@ from kcons.ase.binding import (
     shared,
     touched_atoms,
 )
-from kcons.ase.pressure import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, Watch, fulfilled
+from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, Watch, fulfilled, virial_of
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint

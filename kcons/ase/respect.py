@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from ase import Atoms
 from ase.cell import Cell
 
+from kcons.ase.topology import velocities_of
 from kcons.constraints.arguments import finite_array
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
@@ -12,6 +14,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.thermostats.pressure.measured import constraint_virial
 from kcons.thermostats.pressure.pieces import rows_open
 
 #: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
@@ -215,6 +218,30 @@ def require_on_surface(
         finite_array(x, held.n_atoms, "position")
         said = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}): {why}"
         raise UnsupportedError(said) if by_class else InputError(said, item="positions", atoms=held.row_atoms(row))
+
+
+#: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
+VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
+
+
+def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
+    """`constraint_virial` at the present positions and momenta, which are zero where there are none.
+
+    Raises
+    ------
+    UnsupportedError
+        The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
+        StrainFilter, does not respect them.
+    """
+    x = atoms.arrays["positions"]
+    try:
+        require_on_surface(motion.constraint_set, x, time)
+    except InputError as error:
+        raise UnsupportedError(
+            f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
+            "them. Relax cells with FrechetCellFilter, or restore the atoms first"
+        ) from error
+    return constraint_virial(motion, x, velocities_of(atoms), forces, time)
 
 
 def deformation(before: FloatArray, after: FloatArray) -> FloatArray:
