@@ -222,8 +222,9 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
         if len(both):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {both[0]}, which kcons holds too; ASE would apply the two "
-                f"one after the other, and neither would hold. Put all of it into one Constraints object"
-                f"{_REPLACEMENTS.get(type(other).__name__, '')}"
+                "one after the other, and neither would hold. Put all of it into one Constraints object: attach(atoms) "
+                "does so for what is on the atoms; for new rows, held = from_ase_constraints(atoms), "
+                "atoms.set_constraint(), constrain(atoms, [*held, *new])"
             )
     bound.others = company(present)
 
@@ -236,25 +237,6 @@ def _acted_on(other: Any, n_atoms: int) -> IntArray:
         return np.asarray(other.touched)
     indices = other.get_indices() if hasattr(other, "get_indices") else slice(None)
     return np.arange(n_atoms)[indices]
-
-
-_REPLACEMENTS = {
-    name: f", with {ours} for what {name} held"
-    for name, ours in {
-        "FixAtoms": "FixedAtoms",
-        "FixBondLengths": "Distance",
-        "FixInternals": "Distance, Angle, Dihedral and DistanceDifference",
-        "FixLinearTriatomic": "Distance and LinearRelation",
-        "FixCom": "CenterOfMass",
-        "FixSubsetCom": "CenterOfMass",
-        "FixedPlane": "Plane",
-        "FixedLine": "Line",
-        "FixCartesian": "LinearCombination",
-    }.items()
-} | dict.fromkeys(
-    ("Constraints", "ConstraintsWithFixedAtoms"),
-    ": atoms.set_constraint(), then constrain(atoms, [*old.constraints, *new])",
-)
 
 
 def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:

@@ -316,22 +316,17 @@ def test_projection_that_fails_late_changes_nothing(error, monkeypatch):
         (Constraints(Distance([0, 1])), r"Constraints\(1 rows.* is no kcons constraint.* the attribute constraints"),
         (None, "None is no kcons constraint"),
         (["hbonds"], r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"),
+        ("hbonds", r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"),
     ],
 )
 def test_what_is_no_constraint_is_named(given, named):
     atoms = molecule("H2O")
     atoms.calc = Free()
     with pytest.raises(InputError, match=named):
-        constrain(atoms, given)
+        Constraints(given)
     with pytest.raises(InputError, match=named):
         ConstrainedDynamics(atoms, FS, constraints=given)
     assert atoms.constraints == [] and "momenta" not in atoms.arrays
-
-
-def test_a_name_is_not_taken_for_a_list_of_letters():
-    for make in (Constraints, lambda name: ConstrainedDynamics(molecule("H2O"), FS, constraints=name)):
-        with pytest.raises(InputError, match=r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"):
-            make("hbonds")
 
 
 # -- changes of the atoms ---------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 from ase import Atoms
 from ase.build import bulk, molecule
 
-from kcons.ase import constraints_of, from_ase_constraints, rigid_water
+from kcons.ase import constraints_of, rigid_water
 from kcons.errors import InputError
 
 
@@ -69,12 +69,3 @@ def test_a_geometry_that_is_none_is_refused(geometry):
         rigid_water(water, geometry)
     with pytest.raises(InputError, match=r"geometry|degrees"):
         constraints_of(water, water_geometry=geometry)
-
-
-def test_other_odd_arguments_of_rigid_water_are_refused():
-    with pytest.raises(InputError, match="reach"):
-        rigid_water(molecule("H2O"), reach="1")
-    with pytest.raises(InputError, match=r"ase\.io\.read"):
-        rigid_water([molecule("H2O")])
-    with pytest.raises(InputError, match=r"ase\.io\.read"):
-        from_ase_constraints([molecule("H2O")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from pathlib import Path
 
 import ase.io
@@ -12,12 +13,12 @@ from ase import Atoms
 from ase.build import molecule
 
 from kcons.ase import (
-    ConstrainedDynamics,
     ConstrainedLangevin,
     constrain,
     constraints_of,
     draw_velocities,
     repartition_hydrogen_mass,
+    rigid_water,
 )
 from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, mend_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
@@ -30,6 +31,9 @@ def peptide():
     atoms.new_array("residuenames", np.array(["SER"] * 4))
     atoms.new_array("residuenumbers", np.array([4] * 4))
     return atoms
+
+
+LANGEVIN = {"timestep": 1.0, "temperature_K": 300, "friction": 0.01}
 
 
 def test_bonds_are_guessed_where_none_are_given():
@@ -52,19 +56,10 @@ def test_a_molecule_that_ase_wrote_to_a_pdb_file_keeps_its_bonds(tmp_path):
             assert constraints_of(back, held)[0].n_rows == rows[0].n_rows
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        constraints_of,
-        lambda atoms: constrain(atoms, "hbonds"),
-        lambda atoms: constrain(atoms, []),
-        lambda atoms: ConstrainedDynamics(atoms, 1.0),
-        lambda atoms: ConstrainedLangevin(atoms, 1.0, temperature_K=300, friction=0.01),
-        lambda atoms: draw_velocities(atoms, temperature_K=300),
-    ],
-    ids=["constraints_of", "by name", "rows", "dynamics", "thermostat", "velocities"],
-)
+@pytest.mark.parametrize("call", [constraints_of, constrain, ConstrainedLangevin, draw_velocities, rigid_water])
 def test_a_list_of_frames_is_no_atoms(call):
+    more = {constrain: {"constraints": []}, ConstrainedLangevin: LANGEVIN, draw_velocities: {"temperature_K": 300}}
+    call = partial(call, **more.get(call, {}))
     with pytest.raises(InputError, match=r"atoms must be an ase.Atoms .* not list; of several, give one") as caught:
         call([molecule("H2O")])
     assert caught.value.item == "atoms"
