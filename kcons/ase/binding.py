@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
 from threading import local
@@ -237,6 +238,21 @@ def _acted_on(other: Any, n_atoms: int) -> IntArray:
         return np.asarray(other.touched)
     indices = other.get_indices() if hasattr(other, "get_indices") else slice(None)
     return np.arange(n_atoms)[indices]
+
+
+@contextmanager
+def unchanged_on_failure(atoms: Atoms) -> Iterator[None]:
+    """Put positions, momenta, cell and constraints of the atoms back where something is refused."""
+    arrays = {name: atoms.arrays[name].copy() for name in ("positions", "momenta") if name in atoms.arrays}
+    cell, constraints = atoms.cell.array.copy(), list(atoms.constraints)
+    try:
+        yield
+    except BaseException:
+        for name, values in arrays.items():
+            atoms.arrays[name][...] = values
+        atoms.cell[...] = cell
+        atoms.set_constraint(constraints)
+        raise
 
 
 def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:

@@ -22,6 +22,7 @@ from kcons.ase.binding import (
     refuse_not_finite,
     shared,
     touched_atoms,
+    unchanged_on_failure,
 )
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, Watch, fulfilled, virial_of
@@ -541,10 +542,8 @@ def constrain(
     if isinstance(constraints, str):
         constraints = named = named_rows(atoms, constraints)
     held = Constraints(constraints, degenerate=degenerate)
-    before = list(atoms.constraints)
-    arrays = {name: atoms.arrays[name].copy() for name in ("positions", "momenta") if name in atoms.arrays}
-    atoms.set_constraint([*before, held])
-    try:
+    with unchanged_on_failure(atoms):
+        atoms.set_constraint([*atoms.constraints, held])
         if project:
             held.restore(atoms)
         bound, watch = held._bound(atoms), held._watch
@@ -552,11 +551,6 @@ def constrain(
         watch.between_steps = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
-    except BaseException:
-        atoms.set_constraint(before)
-        for name, values in arrays.items():
-            atoms.arrays[name][...] = values
-        raise
     if named is not None and named.bonds_guessed:
         keep_guessed(atoms, named.topology.bonds)
         warnings.warn(
