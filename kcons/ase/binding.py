@@ -48,8 +48,6 @@ class Binding:
     motion: Motion
     given: tuple[Constraint, ...]
     touched: IntArray
-    #: The atoms whose masses matter.
-    weighed: IntArray | slice
     n_atoms: int
     mass_array: str
     masses: bytes
@@ -72,7 +70,7 @@ class Binding:
             len(arrays["positions"]) == self.n_atoms
             and atoms.pbc.tobytes() == self.pbc
             and name == self.mass_array
-            and arrays[name][self.weighed].tobytes() == self.masses
+            and arrays[name].tobytes() == self.masses
         )
 
     def serves(self, holder: object, cell: FloatArray) -> bool:
@@ -124,10 +122,8 @@ def bind(
     atoms: Atoms,
     degenerate: Literal["convert", "raise"],
     time: float = 0.0,
-    *,
-    all_masses: bool = False,
 ) -> Binding:
-    """A new engine for `given` on `atoms`; with `all_masses` it fits as long as masses of free atoms stay, too."""
+    """A new engine for `given` on `atoms`."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]
     held = ConstraintSet(
@@ -135,21 +131,18 @@ def bind(
     )
     motion = Motion(held, x, degenerate=degenerate, time=time)
     touched = touched_atoms(held.constraints)
-    all_touched = len(touched) == len(atoms)
     name = "masses" if "masses" in atoms.arrays else "numbers"
-    weighed = slice(None) if all_masses or all_touched else touched
     return Binding(
         motion=motion,
         given=held.constraints,
         touched=touched,
-        weighed=weighed,
         n_atoms=len(atoms),
         mass_array=name,
-        masses=atoms.arrays[name][weighed].tobytes(),
+        masses=atoms.arrays[name].tobytes(),
         periodic=periodic,
         pbc=atoms.pbc.tobytes(),
         cell=atoms.cell.array.tobytes(),
-        weights=_weights(motion) if all_touched else None,
+        weights=_weights(motion) if len(touched) == len(atoms) else None,
     )
 
 

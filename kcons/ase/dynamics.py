@@ -382,7 +382,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if bound is None or not bound.fits(atoms):
             self._refuse_fewer(len(atoms))
             rows = [*_rows(atoms, present), *self._more]
-            bound = bind(rows, atoms, self._degenerate, self.time, all_masses=True)
+            bound = bind(rows, atoms, self._degenerate, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, company(present), None

@@ -116,21 +116,6 @@ def test_new_masses_are_noticed():
     assert np.array_equal(held.engine(atoms).masses, atoms.get_masses())
 
 
-def test_masses_of_other_atoms_do_not_rebuild_the_engine():
-    atoms = loose_waters(2)
-    held = constrain(atoms, Distance([0, 1]))
-    engine = held.engine(atoms)
-    masses = atoms.get_masses()
-    atoms.set_masses(masses)
-    engine = held.engine(atoms)
-    masses[5] = 3.0
-    atoms.set_masses(masses)
-    assert held.engine(atoms) is engine
-    masses[0] = 3.0
-    atoms.set_masses(masses)
-    assert held.engine(atoms) is not engine
-
-
 def test_new_cell_is_noticed_and_targets_stay():
     atoms = molecule("H2O")
     atoms.set_cell([6, 6, 6])
