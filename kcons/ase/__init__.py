@@ -34,7 +34,7 @@ try:
         MultipleTimeSteps,
         draw_velocities,
     )
-    from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass, rigid_water
+    from kcons.ase.topology import constraints_of, repair_elements, repartition_hydrogen_mass, rigid_water
     from kcons.ase.translation import from_ase_constraints
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.ase") from error
@@ -56,7 +56,7 @@ __all__ = [
     "constraints_of",
     "draw_velocities",
     "from_ase_constraints",
-    "mend_elements",
+    "repair_elements",
     "repartition_hydrogen_mass",
     "rigid_water",
     "to_ase_constraints",

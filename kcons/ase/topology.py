@@ -40,8 +40,8 @@ __all__ = [
     "bonds_of",
     "constraints_of",
     "kinetic_energy_of",
-    "mend_elements",
     "named_rows",
+    "repair_elements",
     "repartition_hydrogen_mass",
     "require_atoms",
     "rigid_water",
@@ -164,7 +164,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     """Topology and positions of `atoms`.
 
     Atoms with names and residues get the element that the name says, since ASE reads PDB files without a column of
-    elements as if 'HG' were mercury; `mend_elements` corrects the atoms themselves.
+    elements as if 'HG' were mercury; `repair_elements` corrects the atoms themselves.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residues = np.zeros(n, np.int64)
         residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
     if known and "atomtypes" in arrays:
-        elements, masses = _mended(elements, masses, names, residues, residue_names, "masses" in arrays)
+        elements, masses = _repaired(elements, masses, names, residues, residue_names, "masses" in arrays)
     bonds, guessed = _given_bonds(atoms)
     charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
     topology = Topology(
@@ -259,7 +259,7 @@ def _given_bonds(atoms: Atoms) -> tuple[IntArray, bool]:
     return check_pairs(bonds, len(atoms), _ITEM), guessed
 
 
-def mend_elements(atoms: Atoms) -> int:
+def repair_elements(atoms: Atoms) -> int:
     """Give atoms of residues the elements that their names say, in place; how many changed.
 
     ASE's reader takes atom names for symbols where a PDB file has no column of elements. Elements other than hydrogen
@@ -347,7 +347,7 @@ def _had_elements(elements: NDArray[np.str_], by_name: NDArray[np.str_], names: 
     return any(name[:2].capitalize() in atomic_numbers for name in set(names[right].tolist()) if name[1:2].isalpha())
 
 
-def _mended(
+def _repaired(
     elements: NDArray[np.str_],
     masses: NDArray[np.float64],
     names: NDArray[np.str_],
@@ -379,7 +379,7 @@ def _mended(
     warnings.warn(
         f"{int(wrong.sum())} atoms have elements that their names contradict, such as {names[atom]} of "
         f"{residue_names[residues[atom]]}, which is no {elements[atom]}; the names are followed. "
-        "kcons.ase.mend_elements(atoms) corrects the atoms",
+        "kcons.ase.repair_elements(atoms) corrects the atoms",
         UserWarning,
         stacklevel=4,
     )

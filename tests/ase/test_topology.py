@@ -20,7 +20,7 @@ from kcons.ase import (
     repartition_hydrogen_mass,
     rigid_water,
 )
-from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, mend_elements, snapshot_of, velocities_of
+from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, repair_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
 
 
@@ -89,10 +89,10 @@ def test_names_say_what_elements_are():
     assert topology.elements.tolist() == ["N", "C", "C", "H"]
     assert topology.masses[1] == pytest.approx(12.011) and topology.masses[3] == pytest.approx(1.008)
     assert atoms.symbols[1] == "Ca"  # until they are mended
-    assert mend_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
+    assert repair_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert mend_elements(atoms) == 0
+        assert repair_elements(atoms) == 0
     other = peptide()
     other.set_masses([14.0, 99.0, 12.0, 98.0])
     with pytest.warns(UserWarning):
@@ -105,17 +105,17 @@ def test_metals_of_a_file_with_elements_stay():
     atoms.symbols = "NCCoHg"
     atoms.arrays["atomtypes"][2] = "CO"
     with pytest.warns(UserWarning, match="1 elements are not what names suggest, such as Co of CO") as told:
-        assert mend_elements(atoms) == 1
+        assert repair_elements(atoms) == 1
     assert str(atoms.symbols) == "NCCoH" and len(told) == 1
     with pytest.warns(UserWarning, match="they are left"):
         assert snapshot_of(atoms).topology.elements[2] == "Co"
     atoms.symbols[1] = "Ca"  # nothing says that elements were in a file
-    assert mend_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
+    assert repair_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
 
 
 def test_there_and_back():
     atoms = peptide()
-    mend_elements(atoms)
+    repair_elements(atoms)
     atoms.new_array("chainids", np.array(["B"] * 4))
     atoms.info["bonds"] = np.array([[0, 1], [1, 2]])
     atoms.set_initial_charges([0.1, 0.2, -0.3, 0.0])
