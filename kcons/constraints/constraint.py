@@ -426,7 +426,7 @@ class Constraint:
         Raises
         ------
         InputError
-            If an entry is missing, unknown or of the wrong shape.
+            If an entry is missing or unknown.
         """
         names = {"family", "atoms", "target", *cls.per_row, *cls.shared}
         found = set(data) - {"units"}
@@ -492,13 +492,7 @@ def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:
-    """One constraint, or several, as a list.
-
-    Raises
-    ------
-    InputError
-        Something else.
-    """
+    """One constraint, or several, as a list; `InputError` for something else."""
     found: list[Any]
     found = [given] if isinstance(given, Constraint | str) or not isinstance(given, Iterable) else list(given)
     for entry in found:

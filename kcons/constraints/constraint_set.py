@@ -63,8 +63,7 @@ class ConstraintSet:
     Raises
     ------
     InputError
-        Wrong shapes, NaN or infinity, unknown atoms, masses that are not positive, a degenerate cell,
-        a periodic row longer than half the box.
+        Unknown atoms, masses that are not positive, a degenerate cell, a periodic row longer than half the box.
     ConstraintError
         A row that is undefined at `positions` or cannot be fulfilled; two targets for one coordinate
         (`ContradictionError`).
@@ -224,13 +223,11 @@ class ConstraintSet:
 
     def measure(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Natural coordinates q(x), shape (n_rows,); 0 for velocity rows."""
-        time = finite_number(time, "time")
-        return self._of_rows(x, lambda c, r: c.measure(r, time) if c.holonomic else np.zeros(c.n_rows))
+        return self._of_rows(x, time, lambda c, r, t: c.measure(r, t) if c.holonomic else np.zeros(c.n_rows))
 
     def value(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """sigma(x, t) = q(x, t) - target(t), shape (n_rows,); 0 for velocity rows (notes eq. 81)."""
-        time = finite_number(time, "time")
-        return self._of_rows(x, lambda c, r: self._sigma(c, r, time))
+        return self._of_rows(x, time, self._sigma)
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
@@ -266,23 +263,21 @@ class ConstraintSet:
 
     def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
-        time = finite_number(time, "time")
         velocities = self._positions(v, "velocities")
 
-        def b_of(c: Constraint, r: FloatArray) -> FloatArray:
+        def b_of(c: Constraint, r: FloatArray, time: float) -> FloatArray:
             u = velocities[c.atoms]
             if not c.holonomic:
                 return _rate_at(c, time) - c.curvature(r, u, time)
             second = c.target.acceleration_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else 0.0
             return second - c.acceleration_terms(r, u, time)
 
-        return self._of_rows(x, b_of)
+        return self._of_rows(x, time, b_of)
 
     def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
-        time = finite_number(time, "time")
         u = self._positions(v, "velocities")
-        return self._of_rows(x, lambda c, r: c.curvature(r, u[c.atoms], time))
+        return self._of_rows(x, time, lambda c, r, t: c.curvature(r, u[c.atoms], t))
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
@@ -371,11 +366,13 @@ class ConstraintSet:
     def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
         return joined([function(c) for c in self.constraints])
 
-    def _of_rows(self, x: ArrayLike, function: Callable[[Constraint, FloatArray], FloatArray]) -> FloatArray:
-        """A function of each constraint and the positions of its atoms, for all rows."""
-        positions = self._positions(x)
+    def _of_rows(
+        self, x: ArrayLike, time: float, function: Callable[[Constraint, FloatArray, float], FloatArray]
+    ) -> FloatArray:
+        """A function of each constraint, the positions of its atoms and the time, for all rows."""
+        time, positions = finite_number(time, "time"), self._positions(x)
         whole = self.whole(positions)
-        return self._rows(lambda c: function(c, self._gather(c, positions, whole)))
+        return self._rows(lambda c: function(c, self._gather(c, positions, whole), time))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
         array = numbers(x, item)
