@@ -108,8 +108,9 @@ def plain_if_small(kernel: Any, size: int) -> Any:
 _PACKAGE = Path(__file__).parents[1]
 #: Kernels, and functions that are compiled as parts of kernels.
 _HAS_KERNELS = re.compile(
-    r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b|^ +def row\(r: Any, p: Any",
-    re.M,
+    r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b|^# Compiled into kernels"
+    r"|^ +def row\(r: Any, p: Any",
+    re.MULTILINE,
 )
 _IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 

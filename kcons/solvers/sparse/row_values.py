@@ -34,7 +34,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
 )
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, call_row
-from kcons.solvers.sparse.step_control import FLAT
+from kcons.solvers.tolerances import FLAT
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
