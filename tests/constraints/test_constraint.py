@@ -65,17 +65,6 @@ def test_gradient_and_curvature_by_taylor_remainder(name, seed):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_shapes(name):
-    item = made(name)
-    r = scattered(0)[item.atoms]
-    assert item.measure(r, TIME).shape == (item.n_rows,)
-    assert item.gradient(r, TIME).shape == (item.n_rows, item.width, 3)
-    assert item.curvature(r, np.ones_like(r), TIME).shape == (item.n_rows,)
-    assert item.parameters().shape[0] == item.n_rows
-    assert all(part.shape == (item.n_rows,) for part in item.time_terms(r, r, TIME))
-
-
-@pytest.mark.parametrize("name", CASES)
 def test_selected_rows_behave_like_the_rows(name):
     item = made(name)
     x = scattered(1)
