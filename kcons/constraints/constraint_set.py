@@ -410,7 +410,7 @@ class ConstraintSet:
         self._set_cell(cell, pbc)
         if self.lattice is None or all(c.holds_length and not c.moving for c in self.constraints if c.relative):
             return
-        if before is not None and self.images is not None and np.any(self.images.loose >= 0):
+        if before is not None and self.images is not None and np.any(self.images.unheld >= 0):
             change = np.linalg.norm(self.lattice[0] - before[0], axis=1) / np.linalg.norm(before[0], axis=1)
             change = change[self.lattice[1].any(axis=0)]  # the vector of a direction without periodicity is arbitrary
             if np.any(change > MOST_STRAIN):
@@ -437,7 +437,7 @@ class ConstraintSet:
         norms = np.linalg.norm(self.lattice[1], axis=0)
         return 0.5 / float(norms.max())
 
-    def refuse_loose_links(self, whole: FloatArray, numbers: IntArray | None = None) -> None:
+    def refuse_unheld_links(self, whole: FloatArray, numbers: IntArray | None = None) -> None:
         """Raise `ImageError` where atoms of a row, made whole, are half the cell apart and nothing ties them.
 
         `numbers` are the names of the atoms in messages, if not their own numbers.
@@ -447,7 +447,7 @@ class ConstraintSet:
         link = self.images.reached_half(whole, self.lattice)
         if link >= 0:
             pair = np.array([self.images.parents[link], self.images.atoms[link]])
-            row = int(self.images.loose[link])
+            row = int(self.images.unheld[link])
             raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
 
     def check_half_box(self, positions: FloatArray | None = None, before: FloatArray | None = None) -> None:
@@ -485,7 +485,7 @@ class ConstraintSet:
             )
         if positions is None:
             return
-        self.refuse_loose_links(self.whole(positions))
+        self.refuse_unheld_links(self.whole(positions))
         if before is not None:
             self.refuse_other_images(positions, before, None)
         for item, start in zip(self.constraints, self.starts, strict=False):
