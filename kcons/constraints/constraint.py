@@ -137,7 +137,8 @@ class Constraint:
     def __init_subclass__(cls, base: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         cls.family = cls.__name__
-        if not base and FAMILIES.get(cls.family, cls).__module__ == cls.__module__:  # nobody takes the name of another's
+        # The name of a family of another module is not taken from it.
+        if not base and FAMILIES.get(cls.family, cls).__module__ == cls.__module__:
             FAMILIES[cls.family] = cls
         if cls.row is not None and cls.kind is RowKind.INTERPRETED:
             cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
