@@ -173,7 +173,7 @@ def shared(given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["conve
             return bound
     bound = bind(given, atoms, degenerate)
     motion = bound.motion
-    plain = motion.constraint_set.images is None and all(item.windings is None for item in bound.given)
+    plain = motion.constraint_set.images is None and all(item.cell_offsets is None for item in bound.given)
     if content and plain and not motion.conversions:
         _recent.known.append((content, bound))
     return bound
@@ -256,7 +256,7 @@ def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:
 def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
     masses = np.repeat(motion.masses, 3).reshape(-1, 3)
     for item in motion.constraint_set.constraints:
-        if item.family == "FixedAtoms":
+        if item.fixes_atoms:
             masses[item.atoms.ravel()] = np.inf
     inverse_masses = 1.0 / masses
     masses[np.isinf(masses)] = 0.0

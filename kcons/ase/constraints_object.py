@@ -105,7 +105,7 @@ class Constraints(FixConstraint):
     @constraints.setter
     def constraints(self, rows: tuple[Constraint, ...]) -> None:
         self.__dict__["constraints"] = rows
-        fixed = any(item.family == "FixedAtoms" and item.n_rows for item in rows)
+        fixed = any(item.fixes_atoms and item.n_rows for item in rows)
         self.__class__ = ConstraintsWithFixedAtoms if fixed else Constraints  # type: ignore[assignment]
 
     # -- the engine -----------------------------------------------------------------------------
@@ -413,7 +413,7 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
         UserWarning
             Other rows are held, too, of which a program that asks for fixed atoms alone knows nothing.
         """
-        others = sum(item.n_rows for item in self.constraints if item.family != "FixedAtoms")
+        others = sum(item.n_rows for item in self.constraints if not item.fixes_atoms)
         if others:
             warnings.warn(
                 f"the fixed atoms are told, of the other {others} rows nothing: a file does not have them, and a "
@@ -425,7 +425,7 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
     def get_indices(self) -> IntArray:
         """The fixed atoms, in ascending order."""
-        return touched_atoms([item for item in self.constraints if item.family == "FixedAtoms"])
+        return touched_atoms([item for item in self.constraints if item.fixes_atoms])
 
     def delete_atoms(self, indices: Any, natoms: int) -> Constraints | None:
         """Keep the rows whose atoms all stay, renumbered; None if there are none."""

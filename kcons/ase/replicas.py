@@ -12,9 +12,6 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import UnsupportedError
 
-#: Families whose target is an absolute position: replicas take theirs from where they are.
-_PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass", "Plane", "Line")
-
 
 def within(constraints: Sequence[Constraint], atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
     """Rows all of whose atoms are among `atoms`, of n_atoms, with these renumbered in their order."""
@@ -39,7 +36,7 @@ def tiled(constraints: Sequence[Constraint], times: tuple[int, int, int], n: int
     copies = times[0] * times[1] * times[2]
     result = []
     for item in constraints:
-        if not item.translation_invariant and item.family not in _PLACED:
+        if not (item.translation_invariant or item.held_in_place):
             raise UnsupportedError(
                 f"{item!r} has a place in space and cannot be repeated; remove it with atoms.set_constraint() "
                 "and add one for each replica afterwards"

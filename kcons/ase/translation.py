@@ -136,7 +136,7 @@ def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Co
     """
     kinds: dict[str, list[Constraint]] = {}
     for item in rows:
-        known = isinstance(item.target, np.ndarray) and item.n_rows and item.windings is None
+        known = isinstance(item.target, np.ndarray) and item.n_rows and item.cell_offsets is None
         kinds.setdefault(_KINDS.get(item.family, "") if known else "", []).append(item)
     left = kinds.pop("", [])
     forms = []

@@ -36,11 +36,8 @@ LARGEST = 1e150
 def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
     """`values` themselves if they are an array of float64, or a float64 copy of real numbers.
 
-    Raises
-    ------
-    InputError
-        Complex numbers, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities, whose
-        units would be; objects, text, rows of different length.
+    Complex numbers are refused, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities,
+    whose units would be.
     """
     if type(values) is np.ndarray and values.dtype is _FLOAT:
         return values
@@ -96,43 +93,32 @@ def out_of_range(values: FloatArray) -> tuple[int, str] | None:
     return int(first[0]) if len(first) else 0, said
 
 
-def lent(array: FloatArray) -> FloatArray:
+def read_only_view(array: FloatArray) -> FloatArray:
     """The same numbers, for a function of the user: it can read them and not change them."""
     view = array.view()
     view.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
     return view
 
 
-def kept(array: NDArray[Any]) -> NDArray[Any]:
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
     """The array itself, which nobody can change from now on."""
     array.setflags(write=False)
     return array
 
 
 def check_out(out: FloatArray, shape: tuple[int, ...], item: str = "out") -> None:
-    """Refuse arrays that results cannot be written into.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse arrays that results cannot be written into."""
     if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
         raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
 
 
 def atom_array(atoms: Any, item: str) -> NDArray[Any]:
-    """Atoms as an array of any shape, a single one as an array of one.
-
-    Raises
-    ------
-    InputError
-        Rows of different length; what is no array.
-    """
+    """Atoms as an array of any shape, a single one as an array of one."""
     try:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"{item}: rows name different numbers of atoms, {_shown(atoms)}; use one object for each number",
+            f"{item}: rows name different numbers of atoms, {_value_text(atoms)}; use one object for each number",
             item="atoms",
         ) from None
 
@@ -143,13 +129,7 @@ def atom_column(atoms: Any, item: str) -> NDArray[Any]:
 
 
 def check_pairs(pairs: ArrayLike, n_atoms: int | None = None, item: str = "bonds") -> IntArray:
-    """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet.
-
-    Raises
-    ------
-    InputError
-        Another shape; numbers that are no integers; atoms that do not exist.
-    """
+    """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet."""
     try:
         table = np.asarray(pairs)
     except ValueError as error:
@@ -194,10 +174,7 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
         Names of what it is called with.
     hint : str
         Ends the sentence.
-
-    Raises
-    ------
-    InputError
+    needed : bool
     """
     if not callable(function) and (needed or function is not None):
         raise InputError(
@@ -217,19 +194,13 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
 
 
 def finite_number(value: Any, item: str) -> float:
-    """`value` as a float.
-
-    Raises
-    ------
-    InputError
-        It has units, is no number, or is not finite.
-    """
+    """`value` as a float."""
     if type(value) is float and math.isfinite(value):  # each call of the engine comes through here
         return value
     refuse_units(value, item)
     found = _float(value)
     if not math.isfinite(found):
-        raise InputError(f"{item} is {_shown(value)}; give a finite number", item=item.rpartition(": ")[2])
+        raise InputError(f"{item} is {_value_text(value)}; give a finite number", item=item.rpartition(": ")[2])
     return found
 
 
@@ -241,7 +212,7 @@ def _float(value: Any) -> float:
         return math.nan
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """A value in a message: of whole numbers of thousands of digits, which Python does not print, the kind."""
     try:
         return f"{value!r:.80}"
@@ -250,16 +221,10 @@ def _shown(value: Any) -> str:
 
 
 def positive(value: float, item: str) -> float:
-    """`value` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number above zero, or infinite.
-    """
+    """`value` as a float, which has to be finite and above zero."""
     number = math.nan if isinstance(value, str | bytes | bool) else _float(value)
     if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{item} is {_shown(value)}; give a positive number", item=item.rpartition(": ")[2])
+        raise InputError(f"{item} is {_value_text(value)}; give a positive number", item=item.rpartition(": ")[2])
     return number
 
 
@@ -286,13 +251,7 @@ def unit(vectors: ArrayLike, item: str) -> FloatArray:
 
 
 def whole_number(value: Any, item: str, least: int = 1, most: int | None = None) -> int:
-    """`value` as an int.
-
-    Raises
-    ------
-    InputError
-        It is no whole number, or below `least` or above `most`.
-    """
+    """`value` as an int, from `least` to `most`."""
     try:
         found = int(value)
         good = bool(found == value) and least <= found and (most is None or found <= most)
@@ -300,7 +259,7 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
         good = False
     if not good or isinstance(value, bool):
         bounds = f", {least} or more" if most is None else f" from {least} to {most}"
-        raise InputError(f"{item} is {_shown(value)}; give a whole number{bounds}", item=item)
+        raise InputError(f"{item} is {_value_text(value)}; give a whole number{bounds}", item=item)
     return found
 
 
@@ -408,22 +367,22 @@ def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
         raise InputError(f"{item} has units that are not those of openmm.unit; give plain numbers", item=item)
     found = {dimension.name: power for dimension, power in values.unit.iter_base_dimensions() if power}
     if kind.exponents is not None and found != dict(kind.exponents) and (found or kind is not ANGLE):
-        raise InputError(f"{item} is {shown(values)}; give it in {kind.words}", item=item)
+        raise InputError(f"{item} is {quantity_text(values)}; give it in {kind.words}", item=item)
     matters = kind is not DIRECTION and not set(found) <= {"angle"}
     return values.value_in_unit_system(system), matters
 
 
-def shown(values: Any) -> str:
+def quantity_text(values: Any) -> str:
     """The beginning of a Quantity in words, on one line."""
     words = " ".join(str(values).split())
     return words if len(words) <= 60 else f"{words[:50]} ..."
 
 
 def refuse_units(values: Any, item: str) -> None:
-    """Raise `InputError` for Quantities where nobody knows which units the other numbers are in."""
+    """Refuse Quantities where nobody knows which units the other numbers are in."""
     if has_units(values):
         raise InputError(
-            f"{item} has units ({shown(values)}), and only kcons.openmm knows what the other numbers are in; "
+            f"{item} has units ({quantity_text(values)}), and only kcons.openmm knows what the other numbers are in; "
             "give plain numbers in the units of the run",
             item=item,
         )

@@ -29,12 +29,12 @@ from kcons.constraints.arguments import (
     Kind,
     atom_array,
     checked,
-    kept,
     numbers,
     out_of_range,
     plain_target,
+    read_only,
 )
-from kcons.constraints.compilation import njit
+from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError
@@ -44,7 +44,7 @@ IntArray = NDArray[np.int64]
 _COMPLEX_STEP = 2.0**-100
 
 #: Rows of more atoms are compiled where others are taken at once, since loops over atoms are then long.
-WIDE = 32
+WIDE = 6
 
 #: All families by name.
 FAMILIES: dict[str, type[Constraint]] = {}
@@ -132,20 +132,21 @@ class Constraint:
     #: Rows that take their atoms in the images of the set's tree, and how many cells their atoms lie from these,
     #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.periodic.images`.
     whole: NDArray[np.bool_] | None = None
-    windings: IntArray | None = None
+    cell_offsets: IntArray | None = None
 
     def __init_subclass__(cls, base: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         cls.family = cls.__name__
-        if not base:
+        # The name of a family of another module is not taken from it.
+        if not base and FAMILIES.get(cls.family, cls).__module__ == cls.__module__:
             FAMILIES[cls.family] = cls
         if cls.row is not None and cls.kind is RowKind.INTERPRETED:
             cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
-        if "__init__" in cls.__dict__:
+        if "__init__" in cls.__dict__ or cls.__init__ is Constraint.__init__:
             cls.__init__ = checked(cls.__init__)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
-        self.atoms: IntArray = kept(_atom_table(atoms, type(self).__name__, self.row_width))
+        self.atoms: IntArray = read_only(_atom_table(atoms, type(self).__name__, self.row_width))
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
@@ -168,12 +169,12 @@ class Constraint:
             if wrong is not None:
                 row, said = wrong
                 raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
-            setattr(self, name, kept(np.array(array, order="C")))
+            setattr(self, name, read_only(np.array(array, order="C")))
 
     def __setstate__(self, own: dict[str, Any]) -> None:
         for value in own.values():
             if isinstance(value, np.ndarray):
-                kept(value)
+                read_only(value)
         self.__dict__.update(own)
 
     def _settle(self) -> None:
@@ -353,7 +354,7 @@ class Constraint:
         if not self.uses_masses:
             return self
         copy = self.with_target(self.target)
-        copy.masses = kept(np.array(masses, dtype=np.float64, order="C"))
+        copy.masses = read_only(np.array(masses, dtype=np.float64, order="C"))
         return copy
 
     def with_target(self, target: Target) -> Self:
@@ -370,15 +371,15 @@ class Constraint:
         """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
         copy = self.with_target(None)
-        copy.atoms = kept(self.atoms[rows])
+        copy.atoms = read_only(self.atoms[rows])
         for name in self.per_row:
-            setattr(copy, name, kept(getattr(self, name)[rows]))
+            setattr(copy, name, read_only(getattr(self, name)[rows]))
         if self.masses is not None:
-            copy.masses = kept(self.masses[rows])
+            copy.masses = read_only(self.masses[rows])
         copy.whole = None if self.whole is None else self.whole[rows]
-        copy.windings = None if self.windings is None else self.windings[rows]
+        copy.cell_offsets = None if self.cell_offsets is None else self.cell_offsets[rows]
         if isinstance(self.target, np.ndarray):
-            copy.target = kept(self.target[rows])
+            copy.target = read_only(self.target[rows])
         elif self.target is not None:
             copy.target = _selected(self.target, rows, self.n_rows, self.period)
         return copy
@@ -386,7 +387,7 @@ class Constraint:
     def renumbered(self, new_index: IntArray) -> Self:
         """Copy with atom a replaced by new_index[a]."""
         copy = self.with_target(self.target)
-        copy.atoms = kept(np.asarray(new_index, dtype=np.int64)[self.atoms])
+        copy.atoms = read_only(np.asarray(new_index, dtype=np.int64)[self.atoms])
         return copy
 
     def row_name(self, row: int) -> str:
@@ -426,7 +427,7 @@ class Constraint:
         Raises
         ------
         InputError
-            If an entry is missing, unknown or of the wrong shape.
+            If an entry is missing or unknown.
         """
         names = {"family", "atoms", "target", *cls.per_row, *cls.shared}
         found = set(data) - {"units"}
@@ -447,7 +448,7 @@ class Constraint:
 
 @functools.cache
 def _compiled(row: Callable[[Any, Any, Any, Any], None]) -> Any:
-    return njit(cache=True, error_model="numpy")(row)
+    return njit(cache=has_a_file(row), error_model="numpy")(row)
 
 
 def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
@@ -492,13 +493,7 @@ def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:
-    """One constraint, or several, as a list.
-
-    Raises
-    ------
-    InputError
-        Something else.
-    """
+    """One constraint, or several, as a list; `InputError` for something else."""
     found: list[Any]
     found = [given] if isinstance(given, Constraint | str) or not isinstance(given, Iterable) else list(given)
     for entry in found:

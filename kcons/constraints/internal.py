@@ -12,7 +12,7 @@ import numpy as np
 from numpy import arctan2, sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANGLE, kept, numbers
+from kcons.constraints.arguments import ANGLE, numbers, read_only
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
@@ -141,7 +141,7 @@ class DistanceDifference(Constraint):
             raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
         if self.n_rows and {slot for pair in self.slots for slot in pair} != set(range(self.width)):
             raise InputError("DistanceDifference: slots and atoms do not belong together", item="slots")
-        self.links = kept(np.array(_walk(self.slots)[1], dtype=np.int64))
+        self.links = read_only(np.array(_walk(self.slots)[1], dtype=np.int64))
         self.alike = 2 + 3 * n
         self.positive = "target" if min(self.weights) > 0 else ""
 

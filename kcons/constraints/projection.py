@@ -401,14 +401,9 @@ def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
 
 
 class _Root:
-    """M^1/2: of a diagonal its square roots, of a full M the Cholesky factor L, M = L L^T."""
+    """M^1/2: the Cholesky factor L, M = L L^T, of a diagonal M its square roots."""
 
     def __init__(self, masses: ArrayLike, n: int) -> None:
-        self.diagonal: FloatArray | None = None
-        if _real(masses, "masses").shape != (n, n) or n == 1:
-            self.mass = _mass_diagonal(masses, n)
-            self.diagonal = np.sqrt(self.mass)
-            return
         try:
             self.factor = np.linalg.cholesky(_mass_matrix(masses, n))
         except np.linalg.LinAlgError:
@@ -420,24 +415,18 @@ class _Root:
 
     def weighted(self, A: FloatArray) -> FloatArray:
         """B = A L^-T."""
-        if self.diagonal is not None:
-            return A / self.diagonal
         return np.asarray(scipy.linalg.solve_triangular(self.factor, A.T, lower=True).T)
 
     def from_weighted(self, x: FloatArray) -> FloatArray:
         """L^-T x."""
-        if self.diagonal is not None:
-            return (x.T / self.diagonal).T
         return np.asarray(scipy.linalg.solve_triangular(self.factor, x, lower=True, trans="T"))
 
     def times(self, x: FloatArray) -> FloatArray:
         """L x."""
-        return (x.T * self.diagonal).T if self.diagonal is not None else self.factor @ x
+        return np.asarray(self.factor @ x)
 
     def solve(self, x: FloatArray) -> FloatArray:
         """M^-1 x."""
-        if self.diagonal is not None:
-            return x / self.mass
         return np.asarray(scipy.linalg.cho_solve((self.factor, True), x))
 
 

@@ -20,9 +20,9 @@ from kcons.constraints.arguments import (
     Lengths,
     PositiveLengths,
     atom_column,
-    kept,
     numbers,
     out_of_range,
+    read_only,
     unit,
 )
 from kcons.constraints.constraint import Constraint, RowKind
@@ -337,4 +337,4 @@ def _held(item: LinearRows, point: ArrayLike) -> FloatArray:
     wrong = out_of_range(points)
     if wrong is not None:
         raise InputError(f"{item.family}: point is {wrong[1]}", item="point")
-    return kept(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))
+    return read_only(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))

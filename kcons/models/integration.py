@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Radau, solve_ivp
 
-from kcons.constraints.arguments import FloatArray, lent, numbers
+from kcons.constraints.arguments import FloatArray, numbers, read_only_view
 from kcons.constraints.target import WRONG
 from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 
@@ -167,7 +167,7 @@ def called(
 
     It can read arrays among its arguments and not change them.
     """
-    value = numbers(function(*(lent(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
+    value = numbers(function(*(read_only_view(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
     if value.shape != shape and not (scalar and value.shape == ()):
         raise InputError(f"{item} returned shape {value.shape}, not {shape}", item=item)
     return np.broadcast_to(value, shape)
@@ -189,7 +189,7 @@ def jacobian_by_differences(
             up, down = X.copy(), X.copy()
             up[k] += part
             down[k] -= part
-            ends = [numbers(velocity(t, lent(at)), "velocity") for at in (up, down)]
+            ends = [numbers(velocity(t, read_only_view(at)), "velocity") for at in (up, down)]
             slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
         first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
         columns.append((16 * second - first) / 15)

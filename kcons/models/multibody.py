@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import lapack
 
-from kcons.constraints.arguments import TAKES_TIME, FloatArray, IntArray, check_call, lent, numbers, positive
+from kcons.constraints.arguments import TAKES_TIME, FloatArray, IntArray, check_call, numbers, positive, read_only_view
 from kcons.constraints.target import WRONG, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import (
     ConstraintError,
@@ -241,11 +241,11 @@ class Multibody:
         latest: dict[str, Any] = {}
 
         def project(t: float, y: FloatArray) -> FloatArray:
-            latest["place"] = place = self._placed(lent(y[:n]), t, rank)
+            latest["place"] = place = self._placed(read_only_view(y[:n]), t, rank)
             return np.concatenate([place.q, self._tangent(place, y[n:])])
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            place, q, v = latest["place"], lent(y[:n]), lent(y[n:])
+            place, q, v = latest["place"], read_only_view(y[:n]), read_only_view(y[n:])
             if place.t != t or not np.array_equal(place.q, q):
                 place = self._place(q, t, rank)
             f = self._called("force", (n,), q, v, t)
@@ -255,7 +255,7 @@ class Multibody:
             latest["steps"] += 1
 
         start = project(t0, np.concatenate([q, v]))
-        self._motion(latest["place"], lent(start[n:]))  # what is wrong at the start is told at once
+        self._motion(latest["place"], read_only_view(start[n:]))  # what is wrong at the start is told at once
         latest["steps"] = 0
         options |= {"t_eval": wanted, "rtol": rtol, "atol": atol}
         ode = integrate(slope, (t0, t1), start, solver, project, count, **options)
@@ -266,7 +266,8 @@ class Multibody:
             )
         q, v = np.split(np.reshape(ode.y, (2 * n, -1)).T, 2, axis=1)
         motions = [
-            self._motion(self._place(lent(x), t, rank), lent(w)) for t, x, w in zip(ode.t, q, v, strict=True)
+            self._motion(self._place(read_only_view(x), t, rank), read_only_view(w))
+            for t, x, w in zip(ode.t, q, v, strict=True)
         ] or [(np.zeros(n), np.zeros(self.m or 0))]
         a, multipliers = (np.array(part)[: len(q)] for part in zip(*motions, strict=True))
         return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev, latest["steps"])
@@ -326,7 +327,7 @@ class Multibody:
                 break
             step = place.solve(np.zeros(len(q)), -g)
             for part in PARTS if off > accepted else PARTS[:1]:
-                moved = lent(place.q + part * step)
+                moved = read_only_view(place.q + part * step)
                 there = self._g(moved, t)
                 left = _largest(there / place.size)
                 if left < (1.0 - 0.5 * part) * off:
@@ -429,7 +430,7 @@ class Multibody:
                 )
             if not np.isfinite(array).all():
                 raise InputError(f"{item}[{int(np.argmin(np.isfinite(array)))}] is not finite", item=item)
-            found.append(lent(array))
+            found.append(read_only_view(array))
         self._check_functions(found[0], t)
         return found[0], found[1]
 

@@ -61,7 +61,7 @@ class Failures:
         if error is not None or row < 0:
             return error
         item, k = self._rows.locate(row)
-        if item.family != "Distance" or np.linalg.norm(self._legs(item, k, list(arrays.values())[-1])) > 0:
+        if not item.holds_length or np.linalg.norm(self._legs(item, k, list(arrays.values())[-1])) > 0:
             return None
         i, j = self._named(item.atoms[k])
         return SingularGeometryError(

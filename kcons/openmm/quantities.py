@@ -12,7 +12,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraints.arguments import ANY, Unitless, has_units, shown
+from kcons.constraints.arguments import ANY, Unitless, has_units, quantity_text
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
@@ -36,7 +36,7 @@ def plain(value: Any, of: unit.Unit, item: str) -> Any:
     if not unit.is_quantity(value) or not value.unit.is_compatible(of):
         symbol = of.get_symbol()
         symbol = f"1{symbol}" if symbol.startswith("/") else symbol
-        raise InputError(f"{item} is {shown(value)}; give it in {symbol}", item=item)
+        raise InputError(f"{item} is {quantity_text(value)}; give it in {symbol}", item=item)
     return value.value_in_unit(of)
 
 

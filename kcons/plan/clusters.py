@@ -188,8 +188,8 @@ def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntAr
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
         rows = slice(start, start + item.n_rows)
         kinds[rows] = item.kind
-        if item.windings is not None:  # whole cells between the atoms of a row: for no compiled solver
-            kinds[start + np.flatnonzero(item.windings.any(axis=(1, 2)))] = RowKind.INTERPRETED
+        if item.cell_offsets is not None:  # whole cells between the atoms of a row: for no compiled solver
+            kinds[start + np.flatnonzero(item.cell_offsets.any(axis=(1, 2)))] = RowKind.INTERPRETED
         if item.kind == RowKind.DISTANCE:
             pairs[rows] = item.atoms
     return kinds, pairs

@@ -23,7 +23,7 @@ _GROUND = -1
 
 def fixed_atoms(constraint_set: ConstraintSet) -> IntArray:
     """Atoms that FixedAtoms of the set hold, sorted."""
-    fixed = [c.atoms[:, 0] for c in constraint_set.constraints if c.family == "FixedAtoms"]
+    fixed = [c.atoms[:, 0] for c in constraint_set.constraints if c.fixes_atoms]
     return np.unique(np.concatenate(fixed)) if fixed else np.zeros(0, np.int64)
 
 
@@ -48,7 +48,7 @@ def row_blocks(
     ground = fixed_atoms(constraint_set)
     ends: list[tuple[IntArray, IntArray, IntArray, bool]] = []
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-        if not item.holonomic or item.family == "FixedAtoms" or not accept(item) or item.n_rows == 0:
+        if not item.holonomic or item.fixes_atoms or not accept(item) or item.n_rows == 0:
             continue
         numbers = np.arange(start, start + item.n_rows)
         nodes = item.atoms

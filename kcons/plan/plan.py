@@ -346,7 +346,7 @@ def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
     atoms: list[IntArray] = []
     rows: list[IntArray] = []
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-        if item.family == "FixedAtoms":
+        if item.fixes_atoms:
             atoms.append(item.atoms[::3, 0])
             rows.append(start + np.arange(item.n_rows))
     if not atoms:

@@ -104,7 +104,7 @@ class GeneralClusters:
         self._scale = self.subset.scale
         self._held = self.subset.holonomic
         #: Whether rows close through the boundary of the cell, so that whole positions alone do not tell their images.
-        self.winds = any(item.windings is not None for item in self.subset.constraints)
+        self.winds = any(item.cell_offsets is not None for item in self.subset.constraints)
         self._batches = self._make_batches(labels)
 
     def _make_batches(self, labels: IntArray) -> list[_Batch]:

@@ -15,7 +15,15 @@ from weakref import ReferenceType, ref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, check_call, finite_array, finite_number, lent, numbers, refuse_other
+from kcons.constraints.arguments import (
+    as_array,
+    check_call,
+    finite_array,
+    finite_number,
+    numbers,
+    read_only_view,
+    refuse_other,
+)
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
@@ -188,7 +196,7 @@ class _Shown(State):
 
 
 def _lent(name: str) -> property:
-    return property(lambda self: None if vars(self)[name] is None else lent(vars(self)[name]))
+    return property(lambda self: None if vars(self)[name] is None else read_only_view(vars(self)[name]))
 
 
 for _name in ("positions", "velocities", "forces", "remainder", "thermostat", "barostat"):
@@ -400,7 +408,11 @@ class System:
         """
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
-        raw = self.force(lent(x), lent(v), time) if self.velocity_dependent else self.force(lent(x), time)
+        raw = (
+            self.force(read_only_view(x), read_only_view(v), time)
+            if self.velocity_dependent
+            else self.force(read_only_view(x), time)
+        )
         f = self.accepted(raw, step, copy)
         if finite:
             check_finite(f, "force", step)
@@ -461,7 +473,9 @@ class System:
         """Kinetic plus potential energy; needs `potential` unless there are no forces."""
         if self.potential is None and self.force is not None:
             raise InputError("this System has no potential; pass potential=... to follow the energy", item="potential")
-        potential = 0.0 if self.potential is None else float(self.potential(lent(state.positions), state.time))
+        potential = (
+            0.0 if self.potential is None else float(self.potential(read_only_view(state.positions), state.time))
+        )
         return self.kinetic_energy(state.velocities) + potential
 
     # -- inner ----------------------------------------------------------------------------------

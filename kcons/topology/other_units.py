@@ -8,15 +8,8 @@ from typing import TypeVar
 import numpy as np
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import ANGLE, LENGTH, read_only
 from kcons.errors import UnsupportedError
-
-#: Families whose targets are lengths or positions, those whose targets are angles, and what else has a length.
-_LENGTHS = {
-    "Distance", "DistanceDifference", "CenterDistance", "CenterOfMass", "RadiusOfGyration", "LinearCombination",
-    "LinearRelation", "FixedAtoms", "Plane", "Line", "Sphere", "Cylinder", "Torus", "Ellipsoid",
-}  # fmt: skip
-_ANGLES = {"Angle", "Dihedral"}
-_DATA = {"center": 1, "point": 1, "major_radius": 1, "inverse_axes": -1}
 
 C = TypeVar("C", bound=Constraint)
 
@@ -31,7 +24,7 @@ def rescaled(constraint: C, factor: float) -> C:
     """
     if factor == 1.0:
         return constraint
-    if constraint.moving or constraint.family not in _LENGTHS | _ANGLES:
+    if constraint.moving or constraint.held not in (LENGTH, ANGLE):
         what = "a target that moves" if constraint.moving else "own functions or velocities"
         raise UnsupportedError(
             f"{constraint!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
@@ -39,10 +32,9 @@ def rescaled(constraint: C, factor: float) -> C:
     copy = constraint.with_target(None)
     if constraint.target is not None:
         target = np.asarray(constraint.target)
-        copy.target = target.copy() if constraint.family in _ANGLES else target * factor
-    for name, power in _DATA.items():
-        if name in constraint.per_row:
-            setattr(copy, name, getattr(constraint, name) * factor**power)
+        copy.target = target.copy() if constraint.held is ANGLE else target * factor
+    for name, power in constraint.length_powers.items():
+        setattr(copy, name, read_only(getattr(constraint, name) * factor**power))
     copy._settle()
     return copy
 

@@ -407,7 +407,7 @@ def _refuse_torn(snapshot: Snapshot, bonds: IntArray) -> None:
 
 
 def _check_masses(topology: Topology, rows: Sequence[Constraint]) -> None:
-    used = np.concatenate([item.atoms.ravel() for item in rows if item.family != "FixedAtoms"] or [np.zeros(0, int)])
+    used = np.concatenate([item.atoms.ravel() for item in rows if not item.fixes_atoms] or [np.zeros(0, int)])
     used = used[used < topology.n_atoms]
     bad = used[~(topology.masses[used] > 0)]
     if len(bad):

@@ -30,9 +30,9 @@ from kcons.constraints.arguments import (
     check_pairs,
     finite_number,
     generator_of,
-    lent,
     numbers,
     positive,
+    read_only_view,
     seed_from,
     whole_number,
 )
@@ -109,7 +109,7 @@ def test_arrays_that_kernels_can_take_are_not_copied() -> None:
 
 def test_kernels_never_see_arrays_that_cannot_be_written_to() -> None:
     """Numba would compile each of them once more."""
-    assert as_array(lent(X), X.shape, "places").flags.writeable
+    assert as_array(read_only_view(X), X.shape, "places").flags.writeable
 
 
 WAYS = {

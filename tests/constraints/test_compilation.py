@@ -263,6 +263,8 @@ def names_defined_by(source: Path) -> set[str]:
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("numba"):
+            found |= {alias.name for alias in node.names}  # kernels are kept for one version of Numba
         elif not isinstance(node, ast.Import | ast.ImportFrom):
             found |= {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
     return found

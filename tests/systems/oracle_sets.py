@@ -156,7 +156,7 @@ def same_dynamics(s: Setup) -> None:
     lam = motion.multipliers(s.x, s.v, s.f)
     close((s.A.T @ lam).reshape(z.shape) / root_m, z / root_m, size, s.tolerance, "A^T lambda")
     # Fixed atoms have infinite mass in the engine: where rows depend, theirs do not share in the least norm.
-    fixed = any(c.family == "FixedAtoms" for c in s.constraint_set.constraints)
+    fixed = any(c.fixes_atoms for c in s.constraint_set.constraints)
     if s.rank == len(s.A) or not fixed:
         expected = projection.multipliers(s.A, s.masses, s.f, s.b)
         units = np.linalg.norm(s.A / np.repeat(root_m, 3), axis=1)
@@ -200,7 +200,7 @@ def same_position_projection(s: Setup, rng: np.random.Generator, step: float) ->
     correction = (x - x_new).ravel()
     size = np.abs(correction).max() + EPS * np.abs(x).max() / step
     fixed = np.concatenate(
-        [c.atoms.ravel() for c in s.constraint_set.constraints if c.family == "FixedAtoms"] or [np.zeros(0, int)]
+        [c.atoms.ravel() for c in s.constraint_set.constraints if c.fixes_atoms] or [np.zeros(0, int)]
     )
     movable = ~np.isin(np.arange(len(x)), fixed)
     moving = np.repeat(movable, 3)

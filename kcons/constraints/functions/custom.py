@@ -17,9 +17,9 @@ from kcons.constraints.arguments import (
     FloatArray,
     atom_column,
     check_call,
-    lent,
     numbers,
     positive,
+    read_only_view,
     unit,
 )
 from kcons.constraints.constraint import Constraint, RowKind
@@ -75,7 +75,7 @@ class PythonRows(Constraint, base=True):
         """Results of a user's function for all rows, shape (n_rows, *shape)."""
         out = np.empty((self.n_rows, *shape))
         for k in range(self.n_rows):
-            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
+            found = function(*(read_only_view(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
             out[k] = self._checked(found, k, name, shape)
         return out
 
@@ -185,22 +185,22 @@ class Custom(PythonRows):
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         if self.gradient_function is None:
-            displaced, step = _displaced(r[None], self._length(r[None]))
-            values = np.array([self.row_value(k, place, time) for place in lent(displaced[:, 0])])
-            return self._differences(values[:, None], step)[0]
+            step = 1e-3 * float(self._length(r[None])[0])
+            places = read_only_view(r + step * _along(self.width))  # the function may keep what it sees
+            values = self._from_the_first(np.array([self.row_value(k, place, time) for place in places]))
+            return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
         found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
         return np.asarray(self._checked(found, k, "gradient", r.shape))
 
     def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
-        displaced, step = _displaced(r, self._length(r))
-        return self._differences(np.array([self.measure(places, time) for places in displaced]), step)
+        step = 1e-3 * self._length(r)
+        places = r + step[:, None, None] * _along(self.width)[:, None]
+        values = self._from_the_first(np.array([self.measure(place, time) for place in places]))
+        slope = np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(-1, self.n_rows) / step
+        return np.ascontiguousarray(slope.T).reshape(r.shape)
 
-    def _differences(self, values: FloatArray, step: FloatArray) -> FloatArray:
-        """Gradients from the values at the places of `_displaced`, shape (12 width, n)."""
-        if self.period is not None:
-            values = nearest_image(values - values[0], self.period)
-        slope = np.tensordot(_DIFFERENCE, values.reshape(4, 3 * self.width, -1), 1) / step
-        return np.ascontiguousarray(slope.T).reshape(-1, self.width, 3)
+    def _from_the_first(self, values: FloatArray) -> FloatArray:
+        return values if self.period is None else nearest_image(values - values[0], self.period)
 
     def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
         """Differenced change of the value along a direction of unit length."""
@@ -393,7 +393,7 @@ class ImplicitSurface(Custom):
         return np.asarray(self.gradient(r[None], time)[0])
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        found = function(*(lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
+        found = function(*(read_only_view(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
         if name == "time_derivatives":
             found = np.stack([np.broadcast_to(numbers(part, name), (self.n_rows,)) for part in found], axis=-1)
         result = numbers(found, f"ImplicitSurface: {name}")
@@ -466,7 +466,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         return np.zeros(self.n_rows), self._call(self.coefficients, "coefficients", shape, r, *self._time(time))
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
-        found = self.coefficients(lent(r), *self._time(time))
+        found = self.coefficients(read_only_view(r), *self._time(time))
         return np.asarray(self._checked(found, k, "coefficients", (self.width, 3)))
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
@@ -476,7 +476,7 @@ class CustomVelocity(PythonRows, VelocityRows):
     def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         """Rate of the coefficients of row `k` along v."""
         if self.derivative is not None:
-            found = self.derivative(lent(r), lent(v), *self._time(time))
+            found = self.derivative(read_only_view(r), read_only_view(v), *self._time(time))
             return np.asarray(self._checked(found, k, "derivative", r.shape))
         speed = float(np.sqrt(np.sum(v * v)))
         if speed == 0:
@@ -519,14 +519,8 @@ class CustomVelocity(PythonRows, VelocityRows):
 
 @cache
 def _along(width: int) -> FloatArray:
-    """Displacements of `_PLACES` by coordinates, shape (12 width, 1, width, 3)."""
-    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, 1, width, 3)
-
-
-def _displaced(r: FloatArray, length: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where a function is taken for its gradient at `r`, shape (n, width, 3), and the steps, shape (n,)."""
-    step = 1e-3 * length
-    return r + step[:, None, None] * _along(r.shape[1]), step
+    """Displacements of `_PLACES` by coordinates, shape (12 width, width, 3)."""
+    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, width, 3)
 
 
 def _contract(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -242,7 +242,7 @@ class Descent:
         self.evaluations = 0
         free = np.ones(motion.n_atoms, dtype=bool)
         for item in motion.constraint_set.constraints:
-            if item.family == "FixedAtoms":
+            if item.fixes_atoms:
                 free[item.atoms.ravel()] = False
         self.columns: IntArray = np.flatnonzero(np.repeat(free, 3))
 

@@ -121,7 +121,7 @@ class Sampler(ABC):
         self.coordinates = named(coordinates)
         self.names = tuple(self.coordinates)
         rows = self.coordinates.values()
-        self.scales = np.array([angstrom if c.held is LENGTH and c.family != "Formula" else 1.0 for c in rows])
+        self.scales = np.array([angstrom if c.held is LENGTH else 1.0 for c in rows])
         self.angles = tuple({ANGLE: True, LENGTH: False}.get(c.held) for c in rows)
 
     @property

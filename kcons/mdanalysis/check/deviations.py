@@ -20,6 +20,7 @@ from MDAnalysis.lib.mdamath import triclinic_vectors
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import ANGLE
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -124,11 +125,11 @@ class RowTable:
         #: coordinates count as lengths); what a tolerance is a part of: the length held, 1 rad.
         self.measured = _by_row(given, [item.target is None for item in given])
         angular = _by_row(given, [item.period is not None for item in given])
-        self.units = _by_row(given, [int(i.period is not None or i.family in ("Angle", "Dihedral")) for i in given])
+        self.units = _by_row(given, [int(i.period is not None or i.held is ANGLE) for i in given])
         self.sizes = np.where(angular, 1.0, held.scale)
         # Compiled code takes nearest images; whole rows may be longer than half the cell, and are for the set.
         plain = [
-            np.full(item.n_rows, item.family == "Distance" and not item.moving)
+            np.full(item.n_rows, item.holds_length and not item.moving)
             & ~(np.zeros(item.n_rows, dtype=bool) if item.whole is None else item.whole)
             for item in held.constraints
         ]

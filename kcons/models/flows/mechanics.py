@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
-from kcons.constraints.arguments import FloatArray, check_call, lent, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, check_call, numbers, read_only_view, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows.flow import Flow
 from kcons.models.integration import STEP, called, check_derivative, jacobian_by_differences
@@ -55,7 +55,7 @@ class HamiltonianFlow(Flow):
 
     def _of(self, function: Callable[..., Any], X: FloatArray, t: float) -> Any:
         """A function of the user at X."""
-        X = lent(X)
+        X = read_only_view(X)
         return function(X[: self.f], X[self.f :], *((t,) if self.time_dependent else ()))
 
     def energy(self, X: ArrayLike, t: float = 0.0) -> float:

@@ -44,9 +44,9 @@ def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | 
     (the third side of a rigid triangle, the ends of a chain). Without given ones, also what the distances suggest
     between atoms that held distances do not join.
     """
-    tables = [item.atoms for item in held.constraints if item.family == "Distance"]
+    tables = [item.atoms for item in held.constraints if item.holds_length]
     rows = np.sort(np.concatenate([*tables, np.zeros((0, 2), np.int64)]), axis=1)
-    targets = [item.target_at(time) for item in held.constraints if item.family == "Distance"]
+    targets = [item.target_at(time) for item in held.constraints if item.holds_length]
     sure = given
     if sure is None:
         sure = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
@@ -139,7 +139,7 @@ class Geometry:
             off = item.atoms[miss > OFF]
             if item.family in ("Angle", "Dihedral", "CenterDistance") and len(off):
                 return True
-            if item.family == "Distance" and not all(self.pieces.bonded(i, k) for i, k in off.tolist()):
+            if item.holds_length and not all(self.pieces.bonded(i, k) for i, k in off.tolist()):
                 return True
         return False
 
@@ -236,7 +236,7 @@ class Geometry:
         """The start with fixed atoms in their places; a new array."""
         x = self.start.copy()
         for item in self.held.constraints:
-            if item.family == "FixedAtoms":
+            if item.fixes_atoms:
                 x[item.atoms[::3, 0]] = item.target_at(self.time).reshape(-1, 3)
         return x
 
@@ -262,7 +262,7 @@ class Geometry:
                     legs |= {(j, i), (j, k)}
             elif isinstance(item, DistanceDifference):  # an atom that goes from one neighbor to another
                 legs |= {leg for i, k in item.pairs[off].reshape(-1, 2).tolist() for leg in ((i, k), (k, i))}
-            elif item.family == "Distance":
+            elif item.holds_length:
                 for i, k in item.atoms[off].tolist():
                     for j in self.between(i, k):
                         legs |= {(j, i), (j, k)}

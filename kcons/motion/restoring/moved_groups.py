@@ -218,7 +218,7 @@ class _Motions:
         places = {
             int(a): item.target_at(self.time)[3 * n : 3 * n + 3]
             for item in self.held.constraints
-            if item.family == "FixedAtoms"
+            if item.fixes_atoms
             for n, a in enumerate(item.atoms[::3, 0])
         }
         for molecule in self.pieces.molecules:

@@ -185,7 +185,7 @@ class Engine:
         self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
         #: Whether the times of a drift matter, or its length.
         self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
-        resting = [c.atoms.ravel() for c in held.constraints if c.family == "FixedAtoms"]
+        resting = [c.atoms.ravel() for c in held.constraints if c.fixes_atoms]
         fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
         #: Which of the carried particles do not move.
         self._fixed = np.searchsorted(self.atoms, fixed)

@@ -432,7 +432,7 @@ def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tu
     touched = np.unique(np.concatenate(used))
     still = touched[touched < len(masses)]
     still = still[masses[still] == 0]
-    fixed = [item.atoms.ravel() for item in given if item.family == "FixedAtoms"]
+    fixed = [item.atoms.ravel() for item in given if item.fixes_atoms]
     still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
     return (*given, FixedAtoms(still)) if len(still) else given
 

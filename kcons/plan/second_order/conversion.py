@@ -44,7 +44,7 @@ _INTERNAL = frozenset({"Distance", "Angle", "Dihedral", "LinearRelation", "Linea
 _LEVELS: tuple[Callable[[Constraint], bool], ...] = (
     lambda item: True,
     lambda item: item.family in _INTERNAL and item.translation_invariant,
-    lambda item: item.family == "Distance",
+    lambda item: item.holds_length,
 )
 
 
@@ -169,7 +169,7 @@ class _Stack:
             return [], done
         pairs = np.full((constraint_set.n_rows, 2), -1)
         for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-            if item.family == "Distance" and not isinstance(item.target, MovingTarget):
+            if item.holds_length and not isinstance(item.target, MovingTarget):
                 pairs[start : start + item.n_rows] = item.atoms
         sides = pairs[self.rows]
         plain = (sides >= 0).all(axis=(1, 2)) & ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)

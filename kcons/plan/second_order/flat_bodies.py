@@ -189,7 +189,7 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
     pairs = atoms[held]
     for k in inside:
         item, row = block.part.locate(int(k))
-        if item.family == "Distance":
+        if item.holds_length:
             same = np.flatnonzero((np.sort(pairs, axis=1) == np.sort(item.atoms[row])).all(axis=1))
             # A base distance that was held stays at its own target, to the last bit.
             lengths[same] = np.asarray(item.target)[row]

@@ -122,7 +122,7 @@ def spheres_of(motion: Motion) -> FloatArray | None:
         if isinstance(item, Sphere):
             held.append(item.atoms[:, 0])
             found[held[-1], :3], found[held[-1], 3] = item.center, item.target_at(0.0)
-        elif item.family == "FixedAtoms":
+        elif item.fixes_atoms:
             resting.append(item.atoms.ravel())
         else:
             return None

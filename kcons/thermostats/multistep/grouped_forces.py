@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kcons.constraints.arguments import lent
+from kcons.constraints.arguments import read_only_view
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
@@ -99,7 +99,7 @@ class GroupedForces:
         if not name or not isinstance(force, ForceGroups):
             self.now[name] = system.forces(x, x, time, step)
             return
-        f = system.accepted(force.of(name, lent(x), time), step, True)
+        f = system.accepted(force.of(name, read_only_view(x), time), step, True)
         check_finite(f, "force", step)
         self.now[name] = f
 

@@ -136,7 +136,7 @@ def find_pieces(
         bonds = check_pairs(molecules, n_atoms)
         links.append(bonds)
         nearest.append(bonds)
-    wound = any(c.windings is not None and c.windings.any() for c in constraint_set.constraints)
+    wound = any(c.cell_offsets is not None and c.cell_offsets.any() for c in constraint_set.constraints)
     label = _labels(links, n_atoms)
     rows = rows_open(motion, positions, time)
     opened = np.ones((int(label.max()) + 1, 3), dtype=bool)

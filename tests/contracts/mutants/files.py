@@ -75,13 +75,13 @@ MUTANTS = [
         "tests/mdanalysis/check/test_deviations.py::test_other_frames_that_are_off_are_not_the_first_alone",
     ),
     (
-        "constraints/periodic/in_cell.py",
+        "constraints/constraint_set.py",
         "change = change[self.lattice[1].any(axis=0)]",
         "change = change[:]",
-        "tests/constraints/periodic/test_in_cell.py::test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
+        "tests/constraints/periodic/test_images.py::test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
     ),
     (
-        "constraints/periodic/in_cell.py",
+        "constraints/constraint_set.py",
         "return np.where(same[:, None, None], near, r)",
         "return r",
         "tests/constraints/periodic/test_images.py::test_lengths_found_far_away_can_be_held_near_the_origin",
@@ -160,7 +160,7 @@ MUTANTS = [
         "tests/motion/test_failures.py::test_a_dihedral_that_is_passed_in_small_parts_is_not_named",
     ),
     (
-        "constraints/periodic/in_cell.py",
+        "constraints/constraint_set.py",
         "return x[item.atoms] if self.moved is None",
         "return whole[item.atoms] if self.moved is None",
         "tests/constraints/periodic/test_places.py::test_a_place_of_several_atoms_does_not_hang_on_what_ties_them",
