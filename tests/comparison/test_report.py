@@ -18,7 +18,7 @@ from kcons.errors import InputError
 def table():
     names = ["rattle", "suzuki4", "blanes-moan4", "kahan-li6", "blanes-moan6", "extrapolation", "dop853", "ase-kcons"]
     names += ["ase-bonds", "verlet", "openmm-verlet", "openmm-kcons-rattle", "openmm-verlet-1e-12"]
-    return compare(test_systems.build("dumbbells", 2).shortened(2), names, rounds=1, budget=10)
+    return compare(test_systems.build("dumbbells", 2).shortened(10), names, rounds=1, budget=10)
 
 
 def test_the_text_has_at_most_thirty_lines():
