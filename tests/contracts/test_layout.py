@@ -138,7 +138,7 @@ def test_there_is_one_tolerance_of_ranks():
     places = [
         path.relative_to(PACKAGE).as_posix() for path in FILES if defined.search(path.read_text(encoding="utf-8"))
     ]
-    assert [place for place in places if place != "constraints/projection.py"] == ["solvers/rank_revealing.py"]
+    assert [place for place in places if place != "constraints/projection.py"] == ["solvers/tolerances.py"]
 
 
 def test_importing_the_package_imports_nothing_else():
