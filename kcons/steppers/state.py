@@ -25,7 +25,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
 from kcons.steppers.stages.compiled_operations import beyond, check_finite
 from kcons.steppers.stages.friction import Friction
-from kcons.steppers.stages.packed_system import PackedSystem, more_tables, spheres_of, tables_without_rows
+from kcons.steppers.stages.packed_system import PackedSystem, spheres_of, tables_without_rows
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -485,9 +485,14 @@ class System:
 
     @cached_property
     def _more_tables(self) -> tuple[NDArray[Any], ...]:
-        held = self._free_of_origin
+        """What is behind the rows in the tables of kernels.
+
+        1/m; atoms none of which is far from the first where the system is near the origin (none: it always is); how
+        many times farther from the origin than from any other the first has to be then; great circles.
+        """
+        held, spheres = self._free_of_origin, self.great_circles
         atoms = np.zeros(0, dtype=np.int64) if held is None else np.append(self.anchor, held)
-        return more_tables(self.weights, atoms, self.far, self.great_circles)
+        return self.weights.ravel(), atoms, np.array([self.far]), np.zeros(0) if spheres is None else spheres.ravel()
 
     @cached_property
     def packed(self) -> PackedSystem | None:

@@ -44,7 +44,7 @@ def engine(
     motion = Motion(ConstraintSet(rows, x, m, **options), x)
     given = packed_rows(motion)
     assert given is not None, "too many rows"
-    found = given.tables
+    found = given[0]
     set_lattice(found, motion.lattice)
     if cell is not None:
         # Bonds through the walls of the cell.

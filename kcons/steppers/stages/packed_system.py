@@ -6,7 +6,7 @@ with its solver, behind one array of numbers.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +39,13 @@ class PackedSystem:
     Parameters
     ----------
     motion : Motion
-    found : PackedRows
+    found : tuple
         From `packed_rows`.
     more : tuple of ndarray
-        What is behind the rows, see `more_tables`.
+        What is behind the rows, see `System`.
     """
 
-    def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
+    def __init__(self, motion: Motion, found: tuple[FloatArray, list[CalledSolver]], more: Any) -> None:
         self.motion, self._more = motion, more
         self._tables, self._called = found
         self._cell, self._sources = motion.cell, motion.sources
@@ -84,25 +84,6 @@ class PackedSystem:
             self.motion.took(int(iterations))
 
 
-def more_tables(
-    weights: FloatArray, held: IntArray, far: float, spheres: FloatArray | None
-) -> tuple[NDArray[Any], ...]:
-    """What is behind the rows in the tables.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (n_atoms, 3)
-        1/m.
-    held : ndarray of int
-        Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
-    far : float
-        The system is far if the first is this many times farther from the origin than from any other.
-    spheres : ndarray, shape (n_atoms, 4), or None
-        From `spheres_of`.
-    """
-    return weights.ravel(), held, np.array([far]), np.zeros(0) if spheres is None else spheres.ravel()
-
-
 def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
     """The tables where all rows are left to the engine."""
     none = np.zeros((0, 2), dtype=np.int64)
@@ -133,15 +114,11 @@ def spheres_of(motion: Motion) -> FloatArray | None:
     return found
 
 
-class PackedRows(NamedTuple):
-    """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
+def packed_rows(motion: Motion, *more: NDArray[Any]) -> tuple[FloatArray, list[CalledSolver]] | None:
+    """The tables of all rows, with `more` behind them, and the solvers that kernels call by what stands there.
 
-    tables: FloatArray
-    called: list[CalledSolver]
-
-
-def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
-    """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
+    These are to be kept as long as the tables. None where there are rows that the kernels do not know, or too many.
+    """
     plan, held = motion.plan, motion.constraint_set
     if held.moving or plan.loose is not None or any(plan.whole):
         return None
@@ -180,7 +157,7 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     lengths = held.target(0.0)[others]
     places, numbers = plan.pinned_targets(None), held.touched if compact else None
     given = triangles, chains, pairs, lengths, inverse_masses, pinned, places
-    return PackedRows(packed(*given, *more, numbers=numbers, late=plan.late[others], called=called), called)
+    return packed(*given, *more, numbers=numbers, late=plan.late[others], called=called), called
 
 
 def _solver_like(
