@@ -18,7 +18,17 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.called_solvers import address_of
 from kcons.steppers.operations import Fly, Kick, Operation
 from kcons.steppers.stages import compiled_operations as kernel
-from kcons.steppers.stages.compiled_operations import ADDRESS, CALL, FUNCTION, PYTHON, WIDTH
+from kcons.steppers.stages.compiled_operations import (
+    ADDRESS,
+    CALL,
+    COUNT,
+    FUNCTION,
+    ITERATIONS,
+    PAIRS,
+    PYTHON,
+    ROOM,
+    WIDTH,
+)
 
 #: Operations that show positions to a force function, after which they are not written to again.
 SHOWN = ("evaluate", "settle")
@@ -104,13 +114,13 @@ class Program:
 
     @property
     def numbers(self) -> FloatArray:
-        """What the kernel reads of the rows."""
+        """What a room begins with, of which the kernel reads the rows."""
         if self._numbers is None:
-            table = np.zeros((len(self.rows), WIDTH))
-            for line, row in zip(table, self.rows, strict=True):
+            self._numbers = np.zeros(ROOM + WIDTH * len(self.rows))
+            self._numbers[PAIRS], self._numbers[ITERATIONS], self._numbers[COUNT] = self.pairs, -1.0, len(self.rows)
+            for line, row in zip(self._numbers[ROOM:].reshape(-1, WIDTH), self.rows, strict=True):
                 line[:ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
                 line[ADDRESS] = 0 if row.verb != CALL else address_of(row.function, FUNCTION)
-            self._numbers = table.ravel()
         return self._numbers
 
     def __getstate__(self) -> dict[str, Any]:
