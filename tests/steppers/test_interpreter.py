@@ -13,7 +13,7 @@ from stepper_systems import rotor, system_of
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Angle, Custom, Distance, FixedAtoms, ImplicitSurface, MovingTarget, Plane, Sphere
 from kcons.errors import ConvergenceError, ImageError, InputError, KconsError, NonFiniteError
-from kcons.solvers.sparse.step_control import MANY_ITERATIONS
+from kcons.solvers.tolerances import MANY_ITERATIONS
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,

@@ -23,10 +23,9 @@ from numba.extending import intrinsic
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
-from kcons.solvers.called_solvers import caller_of
-from kcons.solvers.fused_distances import MORE, packed_positions, packed_tangents
+from kcons.solvers.called_solvers import MORE, caller_of, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import bits, flat, integers, piece, view
-from kcons.solvers.sparse.step_control import MANY_ITERATIONS
+from kcons.solvers.tolerances import MANY_ITERATIONS
 
 #: What a row tells the kernel to do: nothing, since it is for Python; take the kick, which all do; fly; fly along great
 #: circles; project velocities; call a function; end a step.

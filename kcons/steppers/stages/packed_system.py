@@ -1,12 +1,12 @@
 """What compiled steps know of a system: 1/m, spheres, how far is far, and its rows where kernels know all of them.
 
-The tables are those of `solvers.fused_distances`: rigid triangles, chains and rows of all kinds that are at rest, each
+The tables are those of `solvers.called_solvers`: rigid triangles, chains and rows of all kinds that are at rest, each
 with its solver, behind one array of numbers.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,13 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import Motion
-from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.called_solvers import Addressable, CalledSolver, pack_solver_tables, set_lattice
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver
-from kcons.solvers.distance_clusters import DistanceClusters
-from kcons.solvers.fused_distances import packed, set_lattice
+from kcons.solvers.distance_clusters import SimdClusterSolver
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
+from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 from kcons.solvers.sparse.row_functions import COUNT
 
@@ -39,13 +39,13 @@ class PackedSystem:
     Parameters
     ----------
     motion : Motion
-    found : tuple
+    found : PackedRows
         From `packed_rows`.
     more : tuple of ndarray
         What is behind the rows, see `System`.
     """
 
-    def __init__(self, motion: Motion, found: tuple[FloatArray, list[CalledSolver]], more: Any) -> None:
+    def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
         self.motion, self._more = motion, more
         self._tables, self._called = found
         self._cell, self._sources = motion.cell, motion.sources
@@ -87,7 +87,7 @@ class PackedSystem:
 def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
     """The tables where all rows are left to the engine."""
     none = np.zeros((0, 2), dtype=np.int64)
-    return packed(None, None, none, np.zeros(0), np.zeros(0), none[:, 0], np.zeros((0, 3)), *more)
+    return pack_solver_tables([], none[:, 0], np.zeros((0, 3)), *more)
 
 
 def spheres_of(motion: Motion) -> FloatArray | None:
@@ -114,11 +114,15 @@ def spheres_of(motion: Motion) -> FloatArray | None:
     return found
 
 
-def packed_rows(motion: Motion, *more: NDArray[Any]) -> tuple[FloatArray, list[CalledSolver]] | None:
-    """The tables of all rows, with `more` behind them, and the solvers that kernels call by what stands there.
+class PackedRows(NamedTuple):
+    """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
 
-    These are to be kept as long as the tables. None where there are rows that the kernels do not know, or too many.
-    """
+    tables: FloatArray
+    called: list[Addressable]
+
+
+def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
+    """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
     if held.moving or plan.loose is not None or any(plan.whole):
         return None
@@ -134,9 +138,9 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> tuple[FloatArray, list[C
     triangles: RigidTriangles | None = None
     chains: Chains | None = None
     rows: list[IntArray] = [np.zeros(0, dtype=np.int64)]
-    mixed = [solver for solver in plan.solvers if not isinstance(solver, DistanceClusters)]
+    mixed = [solver for solver in plan.solvers if not isinstance(solver, SimdClusterSolver | SparseDistances)]
     for solver in plan.solvers:
-        if isinstance(solver, DistanceClusters):
+        if isinstance(solver, SimdClusterSolver | SparseDistances):
             if triangles is None and not compact and not mixed and isinstance(solver, RigidTriangles):
                 triangles = solver
             elif chains is None and not mixed and isinstance(solver, Chains):
@@ -152,12 +156,16 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> tuple[FloatArray, list[C
     if mixed and (held.images is not None or sum(len(each.rows) for each in mixed) > MOST_ROWS):
         return None
     # Solvers of their own, for the atoms of the whole system: those of the plan may be at work for another one.
-    called = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
-    pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
-    lengths = held.target(0.0)[others]
-    places, numbers = plan.pinned_targets(None), held.touched if compact else None
-    given = triangles, chains, pairs, lengths, inverse_masses, pinned, places
-    return packed(*given, *more, numbers=numbers, late=plan.late[others], called=called), called
+    called: list[Addressable] = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
+    if len(others):
+        pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64)
+        numbers, lengths = np.arange(len(others)), held.target(0.0)[others]
+        called.append(SparseDistances(numbers, pairs, lengths, inverse_masses, plan.late[others]))
+    if triangles is not None:
+        called.append(triangles.packed())
+    if chains is not None:
+        called.append(chains.packed(held.touched if compact else None))
+    return PackedRows(pack_solver_tables(called, pinned, plan.pinned_targets(None), *more), called)
 
 
 def _solver_like(

@@ -8,14 +8,14 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError
-from kcons.motion import failures
-from kcons.motion.restoring.nearest_point import FarStart, Rescuers, Work
+from kcons.motion.failures import Failures
+from kcons.motion.restoring.nearest_point import DampedFallback, FarStart, IterationBudget
 from kcons.plan.plan import Plan
-from kcons.solvers.cluster_solver import Request, go_on
-from kcons.solvers.sparse.step_control import MANY_ITERATIONS
+from kcons.solvers.cluster_solver import Request, resume
+from kcons.solvers.tolerances import MANY_ITERATIONS
 
 
-class LocalProjections:
+class SolverSequence:
     """Projections of the atoms that a plan knows.
 
     Parameters
@@ -30,6 +30,7 @@ class LocalProjections:
     ----------
     iterations : list of int
         What each solver took the last time, for reports.
+    failures : Failures
     unchecked : ndarray or None
         A cell before the present one, until positions have shown that no row has another image for it.
     """
@@ -43,7 +44,8 @@ class LocalProjections:
         self._placed = rows.placed
         self._several = len(plan.solvers) > 1 or len(plan.pinned) > 0
         self.iterations = [0] * len(plan.solvers)
-        self._rescuers = Rescuers(rows, plan, numbers)
+        self.failures = Failures(rows, plan, numbers)
+        self._fallback = DampedFallback(rows, plan, self.failures)
 
     def positions(
         self,
@@ -95,10 +97,10 @@ class LocalProjections:
                 asked = request if lattice is None else plan.asked_of(k, request)
                 outcome = solver.positions(asked, lam)
                 if not outcome.converged:
-                    outcome = self._rescuers.rescue(solver, outcome, asked, lam)
+                    outcome = self._fallback.solve(solver, outcome, asked, lam)
                 if outcome.iterations > MANY_ITERATIONS:
                     # A far start leaves the rounding of its size; once more from the near end removes it.
-                    go_on(solver.positions, asked, lam)
+                    resume(solver.positions, asked, lam)
                 self.iterations[k] = outcome.iterations
                 found.append(lam)
             if images is not None:
@@ -154,7 +156,7 @@ class LocalProjections:
             if not outcome.converged:
                 if saved is not None:
                     np.copyto(y, saved)
-                raise failures.tangents_failed(self.rows, self.numbers, x, y, outcome, solver, what, plan)
+                raise self.failures.tangents(x, y, outcome, solver, what)
             found.append(lam)
         if multipliers is not None:
             self._collect(found, multipliers)
@@ -170,24 +172,15 @@ class LocalProjections:
         """c of A v = c at local positions; None if it is 0."""
         return self.rows.velocity_target(x, time) if self.plan.driven else None
 
-    def nearest(self, x: FloatArray, time: float, work: Work) -> float:
-        """Bring `x` to the nearest point on the constraints in the mass metric, in place, for no more than `work`.
+    def nearest(self, x: FloatArray, time: float, budget: IterationBudget) -> float:
+        """Bring `x` to the nearest point on the constraints in the mass metric, in place, for no more than `budget`.
 
         What it returns is said at `FarStart.restore`.
         """
         if len(self.plan.pinned):
             x[self.plan.pinned] = self.plan.pinned_targets(self.rows.target(time) if self._moving else None)
-        start = FarStart(
-            self.rows,
-            self.plan,
-            self.numbers,
-            self.positions,
-            self.tangents,
-            work,
-            lambda: max(self.iterations, default=0),
-        )
-        self._rescuers.work = work
+        self._fallback.budget = budget
         try:
-            return start.restore(x, time)
+            return FarStart(self, budget, time).restore(x)
         finally:
-            self._rescuers.work = None
+            self._fallback.budget = None

@@ -10,7 +10,7 @@ from ase import units
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
-from kcons.ase.pressure.atoms_system import AtomsSystem
+from kcons.ase.pressure import AtomsSystem
 from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure

@@ -1,4 +1,4 @@
-"""Atoms as a system whose cell can change."""
+"""Pressure of atoms with constraints: the stress of the constraint forces, and cells that change."""
 
 from __future__ import annotations
 
@@ -9,15 +9,36 @@ from ase import Atoms
 from ase.calculators.calculator import PropertyNotImplementedError
 from numpy.typing import ArrayLike
 
+from kcons.ase.respect import require_on_surface
+from kcons.ase.topology import velocities_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.thermostats.pressure import CellSystem
+from kcons.thermostats.pressure import CellSystem, constraint_virial
 
-_WITHOUT_STRESS = (
-    "the calculator has no stress; use MonteCarloBarostat, or virial='difference' of a reporter, which take energies "
-    "alone"
-)
+#: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
+VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
+_BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, which take energies alone"
+
+
+def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
+    """`constraint_virial` at the present positions and momenta, which are zero where there are none.
+
+    Raises
+    ------
+    UnsupportedError
+        The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
+        StrainFilter, does not respect them.
+    """
+    x = atoms.arrays["positions"]
+    try:
+        require_on_surface(motion.constraint_set, x, time)
+    except InputError as error:
+        raise UnsupportedError(
+            f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
+            "them. Relax cells with FrechetCellFilter, or restore the atoms first"
+        ) from error
+    return constraint_virial(motion, x, velocities_of(atoms), forces, time)
 
 
 class AtomsSystem(CellSystem):
@@ -72,13 +93,10 @@ class AtomsSystem(CellSystem):
 
     def _stress(self, x: FloatArray, time: float, cell: FloatArray) -> FloatArray:
         if self._stressless:
-            raise UnsupportedError(
-                "forces that constraints of ASE add have no stress; use MonteCarloBarostat, or virial='difference' of "
-                "a reporter, which take energies alone"
-            )
+            raise UnsupportedError(f"forces that constraints of ASE add have no stress; {_BY_ENERGIES}")
         self.atoms.arrays["positions"][...] = x
         try:
             found = self.atoms.get_stress(voigt=False, apply_constraint=False)
         except PropertyNotImplementedError as error:
-            raise UnsupportedError(_WITHOUT_STRESS) from error
+            raise UnsupportedError(f"the calculator has no stress; {_BY_ENERGIES}") from error
         return np.asarray(found, dtype=float)
