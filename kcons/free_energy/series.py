@@ -228,7 +228,7 @@ class Recorder:
             )
 
     def __call__(self, state: State) -> None:
-        x, v, forces = self.system.taken(state)  # in the cell of the state
+        x, v, forces = self.system.kernel_arrays(state)  # in the cell of the state
         if forces is None:
             forces = self.system.forces(x, v, state.time, state.step)
         self.series.append(self.coordinates.sample(x, v, forces, state.time))

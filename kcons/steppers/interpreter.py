@@ -185,7 +185,7 @@ class Interpreter:
     ) -> None:
         self.system, self.dt, self.program, self.start = system, dt, program, start
         self.steps = 1 if start.remainder is not None else steps
-        x, v, f = system.taken(start)
+        x, v, f = system.kernel_arrays(start)
         self.shape = shape = x.shape
         self.shift: FloatArray | None = None
         if start.remainder is not None:

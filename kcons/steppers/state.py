@@ -33,7 +33,7 @@ FAR = 8.0
 #: Residual of initial positions (by the row's scale) and velocities (by the speed) that is taken for rounding.
 START_TOLERANCE = 1e-9
 
-#: What the stages of a step together round, of its kick.
+#: Rounding of velocities in all stages of a step, relative to its kick.
 KICK_ROUNDING = 64 * float(np.finfo(float).eps)
 
 _FLOAT = np.dtype(np.float64)
@@ -171,7 +171,7 @@ class State:
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
 
-    def shown(self) -> State:
+    def read_only(self) -> State:
         """The same state for a function of the user, who can read its arrays and not change them."""
         view = object.__new__(_Shown)
         object.__setattr__(view, "__dict__", vars(self))
@@ -422,7 +422,7 @@ class System:
             )
         return f
 
-    def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    def kernel_arrays(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Positions, velocities and forces of a state, as the kernels can take them.
 
         Raises
@@ -446,7 +446,7 @@ class System:
         """The state with its forces filled in."""
         if state.has_forces_of(self):
             return state
-        x, v, _ = self.taken(state)
+        x, v, _ = self.kernel_arrays(state)
         origin = ref(self), state.positions, state.velocities, state.time
         return replace(state, forces=self.forces(x, v, state.time, state.step), origin=origin)
 
@@ -527,7 +527,7 @@ class System:
 
         Where rows know a place in space, they take all positions as they are.
         """
-        x, _, _ = self.taken(state)
+        x, _, _ = self.kernel_arrays(state)
         if state.remainder is None or self._free_of_origin is None:
             return x, None
         shift = x[self.anchor]
