@@ -120,7 +120,8 @@ class Program:
             self._numbers[PAIRS], self._numbers[ITERATIONS], self._numbers[COUNT] = self.pairs, -1.0, len(self.rows)
             for line, row in zip(self._numbers[ROOM:].reshape(-1, WIDTH), self.rows, strict=True):
                 line[:ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
-                line[ADDRESS] = 0 if row.verb != CALL else address_of(row.function, FUNCTION)
+                if row.verb in (CALL, kernel.CIRCLE):
+                    line[ADDRESS] = address_of(row.function, FUNCTION if row.verb == CALL else kernel.CIRCLES)
         return self._numbers
 
     def __getstate__(self) -> dict[str, Any]:
@@ -148,7 +149,8 @@ def _rows(
             for length, end in zip(operation.flights, operation.ends, strict=True):
                 left -= 1
                 there, group = 1 + left % 2, groups.get(kick.group, 0)
-                yield Row(verb, what, here, there, length, kick.fraction, group, time, end, 0, operation)
+                passed = length, kick.fraction, group, time, end
+                yield Row(verb, what, here, there, *passed, 0, operation, kernel.fly_circles)
                 here, time, kick = there, end, Kick(0.0)
         else:
             what = CALL if verb in functions else kernel.PROJECT if verb == "project" else PYTHON

@@ -46,8 +46,8 @@ MUTANTS = [
     ),
     (
         "steppers/program.py",
-        "group, time, end, 0, operation)",
-        "group, time, 1.0, 0, operation)",
+        "kick.fraction, group, time, end\n",
+        "kick.fraction, group, time, 1.0\n",
         "tests/thermostats/test_langevin.py::test_each_substep_meets_targets_at_its_own_time",
     ),
     (
