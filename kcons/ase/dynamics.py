@@ -203,7 +203,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
         Its arrays cannot be changed; the atoms' own can.
         """
-        return self._start(self._systems()).shown()
+        return self._start(self._systems()).read_only()
 
     @property
     def motion(self) -> Motion:

@@ -252,7 +252,7 @@ class Recorder:
         self._collector = Collector(coordinates, series)
 
     def __call__(self, state: State) -> None:
-        x, v, forces = self.system.taken(state)  # in the cell of the state
+        x, v, forces = self.system.kernel_arrays(state)  # in the cell of the state
         if forces is None:
             forces = self.system.forces(x, v, state.time, state.step)
         self._collector.add(x, v, forces, state.time)

@@ -23,7 +23,6 @@ from kcons.steppers.stages.compiled_operations import (
     FAR,
     ITERATIONS,
     LENGTH,
-    PAIRS,
     PYTHON,
     ROOM,
     WIDTH,
@@ -169,7 +168,7 @@ class Interpreter:
     __slots__ = (
         *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
-        *("table", "far"),
+        "far",
     )
 
     #: Whether forces are those of the System's function, all at once.
@@ -185,39 +184,38 @@ class Interpreter:
         numbers: FloatArray = _EMPTY,
     ) -> None:
         self.system, self.dt, self.program, self.start = system, dt, program, start
-        self.steps, self.made, self.number = 1 if start.remainder is not None else steps, 0, start.step + 1
-        x, v, f = system.taken(start)
+        self.steps = 1 if start.remainder is not None else steps
+        x, v, f = system.kernel_arrays(start)
         self.shape = shape = x.shape
         self.shift: FloatArray | None = None
         if start.remainder is not None:
             x, self.shift = system.near_origin(start)
-        self.begun = self.x = x
+        self.x = x
         self.push = self.v = v.copy()
         self.spare = self.out = np.empty(shape)
         self.known = f is not None
         self.forces: FloatArray = np.zeros(shape) if f is None or system.force is None else f
         self.low: FloatArray | None = None
-        size = 3 * x.size if program.pairs else 0
-        self.room = room = np.zeros(ROOM + size + len(numbers))
-        room[PAIRS], room[ITERATIONS] = program.pairs, -1.0
-        if size:
-            self.low, self.push, self.spare = room[ROOM : ROOM + size].reshape(3, *shape)
-        self.numbers = room[ROOM + size :]
-        self.numbers[:] = numbers
-        self.table = program.numbers
+        begin = len(program.numbers)
+        first = begin + (3 * x.size if program.pairs else 0)
+        self.room = room = np.zeros(first + len(numbers))
+        room[:begin] = program.numbers
+        self.numbers = room[first:]
+        if len(numbers):
+            room[first:] = numbers
+        if program.pairs:
+            self.low, self.push, self.spare = room[begin:first].reshape(3, *shape)
         if system.friction is not None:  # flights take another time than their length
-            self.table = self.table.copy()
             for k, row in enumerate(program.rows):
                 if row.name == "fly":
-                    self.table[WIDTH * k + LENGTH] = self.length(row) / dt
+                    room[ROOM + WIDTH * k + LENGTH] = self.length(row) / dt
         self.then, self.left_over_then = start.time, start.time_remainder
-        self._look_ahead()
+        self.made, self.number = -1, start.step
+        self._next_step()
 
     def resume(self, state: State, steps: int) -> None:
         """Get ready for more steps, from the state that the last ones have ended in."""
-        self.start, self.steps, self.made = state, steps, 0
-        self.number += 1
-        self.begun = self.x = state.positions
+        self.start, self.steps, self.made, self.x = state, steps, -1, state.positions
         self.v, self.out = state.velocities.copy(), np.empty(self.shape)
         if self.low is None:
             self.push, self.spare = self.v, self.out
@@ -225,7 +223,7 @@ class Interpreter:
             self.low.fill(0.0)
         if self.simple and state.forces is not None:
             self.forces = state.forces  # those of the function may be in an array that it uses again
-        self._look_ahead()
+        self._next_step()
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -258,75 +256,77 @@ class Interpreter:
         """Go through the program; where the positions are in the end."""
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
         system, program, dt, v, room, shape = self.system, self.program, self.dt, self.v, self.room, self.shape
-        packed, force, numbers, run, at = system.packed, system.force, self.table, _compiled(), 0
+        packed, force, shift, run, at = system.packed, system.force, self.shift, _compiled(), 0
         given, held = system.motion.sources
         room[ENGINE] = packed is None
         tables = system.tables_without_rows if packed is None else packed.tables
-        simple, cell = self.simple and not system.velocity_dependent, held.lattice
+        simple, cell, last = self.simple and not system.velocity_dependent, held.lattice, self.steps - 1
+        shown, ends, flies = program.shown, program.ends, program.flies
         new, array, double, end = np.empty, np.ndarray, _FLOAT, len(program.rows) - 1
+        x, out, forces, more = self.x, self.out, self.forces, self.made < last
         while True:
-            more = self.made + 1 < self.steps
-            found = run(at, more, dt, numbers, self.x, self.out, v, self.forces, room, tables)
-            last, at = at, found if found >= 0 else -1 - found
-            if at < last:
+            begun, found = at, run(at, more, dt, x, out, v, forces, room, tables)
+            at = found if found >= 0 else -1 - found
+            if at < begun:
+                self.x = x
                 self._next_step()
-            if simple and program.shown[at]:  # `evaluate`, in less time
-                x = self.x = self.out
-                until = program.ends[at]
-                if more or program.flies[at]:
-                    self.out = new(shape)
+                more = self.made < last
+            if simple and shown[at]:  # `evaluate`, in less time
+                x = out
                 if force is not None:
                     # The function can neither write to it nor will anybody else: it may keep what it sees.
                     x.setflags(False)  # type: ignore[call-arg]
+                    until, there, self.out = ends[at], x, x
                     now = self.then if until == 1.0 else self.time + (until * dt + self.left_over)
-                    there = x
-                    if self.shift is not None:
-                        there = x + self.shift
+                    if shift is not None:
+                        there = x + shift
                         there.setflags(False)  # type: ignore[call-arg]
                     raw: Any = force(there, now)
                     # What System.accepted finds most often.
                     usual = type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray
-                    self.forces, self.known = raw if usual else system.accepted(raw, self.number, False), True
+                    forces = raw if usual else system.accepted(raw, self.number, False)
+                    self.known = True
                     if held.lattice is not cell or given.lattice is not cell:
                         # It may be a barostat, too.
                         tables, cell = tables if packed is None else packed.tables, held.lattice
-            elif at == end:
-                here = program.rows[end].here
-                if here:
-                    self.x = self.place(here)
+                if more or flies[at]:
+                    out = new(shape)
+                at += 1
+                continue
+            self.x, self.out, self.forces = x, out, forces
+            row = program.rows[at]
+            if at == end:
+                if row.here:
+                    self.x = x = self.place(row.here)
                 if not more or room[FAR]:
                     break
                 # The kernel goes on by itself but where positions are in another array.
-                self.out = new(shape)
+                out, at = new(shape), 0
                 if self.low is not None:
                     self.low.fill(0.0)
                 self._next_step()
-                at = 0
+                more = self.made < last
                 continue
-            else:
-                row = program.rows[at]
-                if found >= 0 and row.verb != PYTHON:
-                    check_finite(self.force_of(row), "force", self.number)
-                if packed is not None and found < 0:
-                    packed.refuse()
-                getattr(self, row.name)(row, found < 0)
-                if packed is not None:
-                    tables = packed.tables
-            at += 1
+            if found >= 0 and row.verb != PYTHON:
+                check_finite(self.force_of(row), "force", self.number)
+            if packed is not None and found < 0:
+                packed.refuse()
+            getattr(self, row.name)(row, found < 0)
+            x, out, forces, at = self.x, self.out, self.forces, at + 1
+            if packed is not None:
+                tables = packed.tables
         self.made += 1
         if packed is not None and room[ITERATIONS] != packed.iterations:
             packed.took(room[ITERATIONS])
-        return here
+        return row.here
 
     def _next_step(self) -> None:
+        """Begin the next step: its time is that at which the last one ended, and ends as State.later."""
         self.made += 1
         self.number += 1
         self.begun = self.x
-        self._look_ahead()
-
-    def _look_ahead(self) -> None:
-        """The time where a step begins is that at which the last one ended; the next as State.later."""
-        self.time, self.left_over = time, left_over = self.then, self.left_over_then
+        self.time = time = self.then
+        self.left_over = left_over = self.left_over_then
         change = self.dt + left_over
         self.then = then = time + change
         part = then - time

@@ -46,7 +46,7 @@ class _Generator(threading.local):
 _GENERATOR = _Generator()
 
 
-def wound(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
+def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
     """The generator of this thread at the stretch of the key's stream that belongs to a part of a step."""
     generator = _GENERATOR
     generator.key[:] = key
@@ -99,7 +99,7 @@ class SeededBath(Interpreted):
 
     def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
         """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
-        return wound((self.seed, 0), number, part).standard_normal(shape)
+        return noise_generator((self.seed, 0), number, part).standard_normal(shape)
 
 
 class Langevin(SeededBath):

@@ -36,17 +36,19 @@ PYTHON, KICK, FLY, CIRCLE, PROJECT, CALL, END = range(7)
 VERB, HERE, THERE, LENGTH, PUSH, GROUP, ADDRESS = range(7)
 WIDTH = 7
 #: What a room begins with: whether what rounding takes is kept, whether rows are left to the engine, the iterations of
-#: the last flight, and whether all was far from the origin at the end of the last step.
-PAIRS, ENGINE, ITERATIONS, FAR, ROOM = range(5)
+#: the last flight, whether all was far from the origin at the end of the last step, and how many operations there are.
+PAIRS, ENGINE, ITERATIONS, FAR, COUNT, ROOM = range(6)
 
 _POINTS, _NUMBERS = numba.float64[:, ::1], numba.float64[::1]
 #: Of functions that programs call, (x, v, forces, time, numbers, tables): 0, or what else than 0 says that nothing has
 #: been done. `numbers` are what a room ends with.
 FUNCTION = numba.int64(_POINTS, _POINTS, _NUMBERS, numba.float64, _NUMBERS, _NUMBERS)
-_call = caller_of(FUNCTION)
-_PERFORM = (
-    *(numba.int64, numba.boolean, numba.float64, _NUMBERS, _POINTS, _POINTS, _POINTS, _POINTS, _NUMBERS, _NUMBERS),
+#: Of flights along great circles, which are compiled where there are any: as `fly`, with spheres; 0 for bad forces.
+CIRCLES = numba.int64(
+    *(_POINTS, _NUMBERS, _POINTS, _POINTS, numba.float64, _NUMBERS, _NUMBERS, numba.float64, _POINTS, _NUMBERS)
 )
+_call, _fly_circles = caller_of(FUNCTION), caller_of(CIRCLES)
+_PERFORM = (*(numba.int64, numba.boolean, numba.float64, _POINTS, _POINTS, _POINTS, _POINTS, _NUMBERS, _NUMBERS),)
 
 
 def kernel() -> Any:
@@ -64,7 +66,7 @@ def tangents() -> Any:
 
 
 @njit(cache=True, nogil=True)
-def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ignore[no-untyped-def]
+def perform(at, more, dt, x, out, v, forces, room, tables):  # type: ignore[no-untyped-def]
     """Make operations from number `at` on.
 
     Parameters
@@ -73,16 +75,14 @@ def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ig
     more : bool
         Whether another step may follow at the end of this one.
     dt : float
-    program : ndarray, flat
-        `WIDTH` numbers for each operation.
     x, out : ndarray, shape (n_atoms, 3)
         Where forces were evaluated last, which is not written to, and room for where they will be next.
     v : ndarray, shape (n_atoms, 3)
         Changed in place.
     forces : ndarray, shape (n_groups n_atoms, 3)
     room : ndarray, flat
-        `ROOM` numbers, with pairs three arrays of the size of v (what rounding took from positions and from velocities,
-        and room for positions), and numbers of the functions that the program calls.
+        `ROOM` numbers, `WIDTH` for each operation, with pairs three arrays of the size of v (what rounding took from
+        positions and from velocities, and room for positions), and numbers of the functions that the program calls.
     tables : ndarray
         Of `kcons.steppers.stages.packed_system`.
 
@@ -94,11 +94,12 @@ def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ig
     """
     header, n = integers(tables), v.size
     weights, held = piece(tables, header, MORE), piece(header, header, MORE + 1)
-    program, forces, room = flat(program), flat(forces), flat(room)
+    forces, room = flat(forces), flat(room)
     x, out, v = _points(flat(x), 0, n), _points(flat(out), 0, n), _points(flat(v), 0, n)
-    pairs, engine, low, push, spare, first = room[PAIRS] != 0.0, room[ENGINE] != 0.0, weights, v, v, ROOM
+    first = ROOM + WIDTH * int(room[COUNT])
+    program, pairs, engine, low, push, spare = room[ROOM:first], room[PAIRS] != 0.0, room[ENGINE] != 0.0, weights, v, v
     if pairs:
-        low, push, spare = room[ROOM : ROOM + n], _points(room, ROOM + n, n), _points(room, ROOM + 2 * n, n)
+        low, push, spare = room[first : first + n], _points(room, first + n, n), _points(room, first + 2 * n, n)
         first += 3 * n
     numbers, k = room[first:], at
     while True:
@@ -119,7 +120,8 @@ def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ig
         if verb in (FLY, CIRCLE):
             there = _place(program[row + THERE], x, out, spare)
             if verb == CIRCLE:
-                sound = fly_circles(here, low, v, push, kick, f, weights, h, there, piece(tables, header, MORE + 3))
+                given = (here, low, v, push, kick, f, weights, h, there, piece(tables, header, MORE + 3))
+                sound = _fly_circles(int(program[row + ADDRESS]), given) != 0
             elif pairs:
                 sound = fly(here, low, v, push, kick, f, weights, h, there)
             else:
@@ -304,7 +306,7 @@ def fly_circles(x, x_low, v, push, kick, f, weights, h, out, spheres):  # type: 
             if r < 0.0:
                 there, a_low[j] = a[j], 0.0
             c[j] = there
-    return sound
+    return 1 if sound else 0
 
 
 @njit(cache=True, nogil=True)

@@ -42,7 +42,7 @@ class PackedSystem:
     found : PackedRows
         From `packed_rows`.
     more : tuple of ndarray
-        What is behind the rows, see `more_tables`.
+        What is behind the rows, see `System`.
     """
 
     def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
@@ -82,25 +82,6 @@ class PackedSystem:
         self.iterations = iterations
         if iterations >= 0:
             self.motion.took(int(iterations))
-
-
-def more_tables(
-    weights: FloatArray, held: IntArray, far: float, spheres: FloatArray | None
-) -> tuple[NDArray[Any], ...]:
-    """What is behind the rows in the tables.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (n_atoms, 3)
-        1/m.
-    held : ndarray of int
-        Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
-    far : float
-        The system is far if the first is this many times farther from the origin than from any other.
-    spheres : ndarray, shape (n_atoms, 4), or None
-        From `spheres_of`.
-    """
-    return weights.ravel(), held, np.array([far]), np.zeros(0) if spheres is None else spheres.ravel()
 
 
 def tables_without_rows(*more: NDArray[Any]) -> FloatArray:

@@ -18,7 +18,7 @@ from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.langevin import wound
+from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
 from kcons.thermostats.pressure.strains import Kind, Strains
@@ -247,7 +247,7 @@ class Barostat:
                 f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
                 "atoms overlap, or the force field returns what is no energy"
             )
-        numbers = wound((self.seed, 1), state.step)
+        numbers = noise_generator((self.seed, 1), state.step)
         trial, drawn = self._trial(system, pieces, before, state, thermal_energy, dt, numbers), numbers.random()
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)

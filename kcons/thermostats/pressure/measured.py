@@ -111,7 +111,7 @@ def instantaneous_pressure(
                 f"pieces are those of {len(pieces.label)} atoms, and the system has {system.n_atoms}; find its own",
                 item="pieces",
             )
-    x, v, _ = system.taken(state)
+    x, v, _ = system.kernel_arrays(state)
     cell = system.cell
     volume = system.volume
     if virial == "atomic":

@@ -71,7 +71,10 @@ MUTANTS = {
         ("half = «→-»0.5 * (bx * gx", "test_row_functions.py::test_gradients_of_rows_of_velocities[KnifeEdge]"),
     ],
     "steppers/program.py": [
-        ("group, time, «end→1.0», 0, operation)", "test_langevin.py::test_each_substep_meets_targets_at_its_own_time"),
+        (
+            "kick.fraction, group, time, «end→1.0»\n",
+            "test_langevin.py::test_each_substep_meets_targets_at_its_own_time",
+        ),
         (
             'row.name == "evaluate"« and row.here == 1→»',
             "test_interpreter.py::test_kicks_in_succession_and_before_other_operations",

@@ -246,12 +246,15 @@ def test_far_from_the_origin_it_is_the_same(offset: float) -> None:
     np.testing.assert_allclose(end.velocities, known.velocities, rtol=0, atol=1e-11)
 
 
-def test_without_friction_nothing_changes() -> None:
+def test_without_friction_nothing_changes_and_thermostats_refuse_it() -> None:
     system, start = pendulum(0.0)
     assert system.friction is None
-    still = System(system.motion, system.force)
-    a, b = run(system, start, 0.1, 5), run(still, start, 0.1, 5)
+    a, b = run(system, start, 0.1, 5), run(System(system.motion, system.force), start, 0.1, 5)
     np.testing.assert_array_equal(a.positions, b.positions)
+    system, start = pendulum(0.5)
+    for thermostat in (Langevin(1.0, 0.5, 1), NoseHooverChain(1.0, 5.0), Isokinetic()):
+        with pytest.raises(UnsupportedError, match="give the rate to Langevin"):
+            run(system, start, 0.01, 1, stepper=thermostat)
 
 
 # -- refusals ---------------------------------------------------------------------------------------
@@ -272,13 +275,6 @@ def test_bad_rates(friction, message: str) -> None:
     system, _ = pendulum(0.0)
     with pytest.raises(InputError, match=message):
         System(system.motion, friction=friction)
-
-
-@pytest.mark.parametrize("thermostat", [Langevin(1.0, 0.5, 1), NoseHooverChain(1.0, 5.0), Isokinetic()], ids=repr)
-def test_thermostats_refuse_it(thermostat) -> None:
-    system, start = pendulum(0.5)
-    with pytest.raises(UnsupportedError, match="give the rate to Langevin"):
-        run(system, start, 0.01, 1, stepper=thermostat)
 
 
 @pytest.mark.parametrize("stepper", [ProjectedVerlet(), ProjectedRungeKutta4()], ids=repr)
