@@ -1,5 +1,6 @@
 """Thermostats on constraints. Each is a stepper.
 
+- `bodies`: what rows tie together, and what may move as one
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats

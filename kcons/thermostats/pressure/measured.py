@@ -13,8 +13,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats.pressure.barostat import Place
-from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
+from kcons.thermostats.pressure.barostat import Place, energy_by_strain
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Pieces, find_pieces, lattice_of
 

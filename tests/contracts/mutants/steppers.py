@@ -297,7 +297,7 @@ MUTANTS = [
         "tests/thermostats/test_freedom.py::test_bodies_that_feel_another_are_not[gas]",
     ),
     (
-        "thermostats/pressure/cell_rescaling.py",
+        "thermostats/pressure/barostat.py",
         "spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)",
         "pass",
         "tests/thermostats/pressure/test_cell_rescaling.py::test_noise_of_few_pieces_stays_within_what_a_trial_may_change"

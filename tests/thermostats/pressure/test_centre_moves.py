@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pressure_systems import METHANE, gas
 
-from kcons.thermostats.pressure.centre_moves import displacements, work_of_shapes
+from kcons.thermostats.pressure.pieces import displacements, work_of_shapes
 from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
 
 CHANGE = 0.1 * np.random.default_rng(4).standard_normal((3, 3))

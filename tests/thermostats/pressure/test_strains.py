@@ -10,12 +10,12 @@ from pressure_systems import p_value
 from scipy import stats
 
 from kcons.errors import InputError
-from kcons.thermostats.pressure.strains import GENERATORS, Strains
+from kcons.thermostats.pressure.barostat import GENERATORS, Strains
 
 
 def chain(kind, n, log_weight, steps, size=0.5, seed=1):
     """Metropolis' walk over cells, accepted as the barostats do."""
-    strains, rng = Strains.of(kind), np.random.default_rng(seed)
+    strains, rng = Strains(kind), np.random.default_rng(seed)
     h, found = np.eye(3), np.empty((steps, 3, 3))
     for k in range(steps):
         e = size * (2 * rng.random(len(strains)) - 1)
@@ -53,7 +53,7 @@ def test_a_turned_cell_is_strained_in_its_own_frame():
     rng = np.random.default_rng(3)
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
-    strains = Strains.of("flexible")
+    strains = Strains("flexible")
     h, e = np.tril(rng.standard_normal((3, 3))) + 3 * np.eye(3), 0.05 * rng.standard_normal(6)
     assert strains.frame(h) is None
     frame = strains.frame(h @ turn)
@@ -65,4 +65,4 @@ def test_a_turned_cell_is_strained_in_its_own_frame():
 
 def test_unknown_kind():
     with pytest.raises(InputError, match="'isotropic'"):
-        Strains.of("round")
+        Strains("round")
