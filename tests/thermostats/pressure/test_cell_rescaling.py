@@ -13,10 +13,8 @@ from kcons.errors import InputError
 from kcons.thermostats import mean
 from kcons.thermostats.langevin import wound
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
-from kcons.thermostats.pressure.barostat import Place
-from kcons.thermostats.pressure.barostat import energy_by_strain
+from kcons.thermostats.pressure.barostat import Place, Strains, energy_by_strain
 from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
-from kcons.thermostats.pressure.barostat import Strains
 
 
 @pytest.mark.parametrize("tau", [2.0, 30.0])
