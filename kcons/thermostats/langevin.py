@@ -44,8 +44,8 @@ class _Generator(threading.local):
 _GENERATOR = _Generator()
 
 
-def wound(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
-    """The generator of this thread at the stretch of the key's stream that belongs to a part of a step."""
+def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
+    """This thread's generator of numbers that are a function of a key, the number of a step and its part."""
     generator = _GENERATOR
     generator.key[:] = key
     generator.counter[2:] = number, part
@@ -97,7 +97,7 @@ class SeededBath(Interpreted):
 
     def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
         """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
-        return wound((self.seed, 0), number, part).standard_normal(shape)
+        return noise_generator((self.seed, 0), number, part).standard_normal(shape)
 
 
 class Langevin(SeededBath):
@@ -253,7 +253,7 @@ class LangevinStep(Interpreter):
         keep = math.exp(-thermostat.friction * dt)
         spread = math.sqrt(-math.expm1(-2 * thermostat.friction * dt) * thermostat.thermal_energy)
         noise = self.numbers[MASSES + self.v.size :].reshape(self.v.shape)
-        wound((thermostat.seed, 0), self.number, row.number).standard_normal(out=noise)
+        noise_generator((thermostat.seed, 0), self.number, row.number).standard_normal(out=noise)
         noise *= spread * system.root_weights
         self.numbers[KEEP] = keep
         driven = system.motion.plan.driven

@@ -41,7 +41,7 @@ from kcons.thermostats.bodies import UNCHANGED, bodies, row_changes
 from kcons.thermostats.configurational_temperature import temperature
 from kcons.thermostats.correlated_series import FEWEST, Estimate
 from kcons.thermostats.freedom import atom_numbers
-from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.isokinetic.step import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Typical move for a difference, as a share of the distance to the next atom.
@@ -367,7 +367,7 @@ class TemperatureSplit:
         turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
         whole = np.zeros_like(shift)
         if self._rest is None or self._rest.any():
-            whole = clusters.add_up((f * paced(self._system, x, f, 0.0)).sum(axis=1))
+            whole = clusters.add_up((f * constrained_acceleration(self._system, x, f, 0.0)).sum(axis=1))
         return np.stack([shift, turn, whole])
 
     def _curvatures(self, x: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:

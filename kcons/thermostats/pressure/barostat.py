@@ -28,7 +28,7 @@ from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.langevin import wound
+from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import (
     Held,
@@ -365,7 +365,10 @@ class Barostat:
                 f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
                 "atoms overlap, or the force field returns what is no energy"
             )
-        numbers, attempt = wound((self.seed, 1), state.step), Attempt(system, pieces, state, thermal_energy, dt)
+        numbers, attempt = (
+            noise_generator((self.seed, 1), state.step),
+            Attempt(system, pieces, state, thermal_energy, dt),
+        )
         trial, drawn = self._trial(attempt, before, numbers), numbers.random()
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)

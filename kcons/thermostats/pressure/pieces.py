@@ -135,7 +135,7 @@ def find_pieces(
         bonds = check_pairs(molecules, n_atoms)
         links.append(bonds)
         nearest.append(bonds)
-    wound = any(c.windings is not None and c.windings.any() for c in constraint_set.constraints)
+    around = any(c.windings is not None and c.windings.any() for c in constraint_set.constraints)
     label = connected(_joined(links), n_atoms)[0]
     rows = rows_open(motion, positions, time)
     opened = np.ones((int(label.max()) + 1, 3), dtype=bool)
@@ -172,7 +172,7 @@ def find_pieces(
     lattice = lattice_of(system)
     y = pieces.whole(positions, lattice)
     closing = np.flatnonzero(np.round((y[near[:, 1]] - y[near[:, 0]]) @ lattice[1]).any(axis=1))
-    if wound or len(closing):
+    if around or len(closing):
         pair = f" between atoms {near[closing[0], 0]} and {near[closing[0], 1]}" if len(closing) else ""
         raise UnsupportedError(
             f"what is tied together closes upon itself through the cell{pair}: it fixes the cell. Keep the volume "

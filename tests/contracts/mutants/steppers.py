@@ -311,7 +311,7 @@ MUTANTS = [
     ),
     (
         "thermostats/slow_share.py",
-        "paced(system, there, f, 0.0)",
+        "constrained_acceleration(system, there, f, 0.0)",
         "f * system.weights",
         "tests/thermostats/test_slow_share.py::test_a_rigid_pair_turns_freely_in_a_trap",
     ),
