@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from thermostat_systems import ROWS, distance, isokinetics, molecules, springs
@@ -62,19 +60,6 @@ def test_a_part_of_the_atoms(order) -> None:
         state = following
     inside = 0.5 * system.masses[:15] @ np.einsum("ij,ij->i", state.velocities[:15], state.velocities[:15])
     assert inside == pytest.approx(2.0, rel=1e-14)
-
-
-@ORDERS
-@EVERY
-def test_any_layout_of_the_arrays(name, order) -> None:
-    """Kernels read raw memory."""
-    system, state = molecules(name)
-    thermostat = isokinetics(system, order=order)[0]
-    state = thermostat.start(system, state)
-    expected = thermostat.step(system, state, 0.05)
-    for item in ("positions", "velocities", "forces"):
-        turned = replace(state, **{item: np.asfortranarray(getattr(state, item))})
-        assert distance(thermostat.step(system, turned, 0.05), expected) <= 1e-15
 
 
 @EVERY
@@ -194,23 +179,6 @@ def test_numbers_that_overflow() -> None:
     thermostat = isokinetics(system, kinetic_energy=1e300)[0]
     with pytest.raises(NonFiniteError, match="non-finite position at step 1 on atom 0"):
         thermostat.step(system, state, 1e200)
-
-
-def test_a_new_cell_is_used_at_once() -> None:
-    system, state = molecules("dumbbells", cell=np.diag([9.0, 9.0, 9.0]), pbc=True)
-    x = state.positions.copy()
-    x[1::2] += [9.0, 0, 0]  # each bond through the cell's wall
-    state = replace(state, positions=x)
-    thermostat = isokinetics(system)[0]
-    thermostat.step(system, state, 0.01)
-    system.motion.set_cell(
-        np.diag([12.0, 9.0, 9.0]), positions=x - np.tile([[0.0, 0, 0], [9.0, 0, 0]], (len(x) // 2, 1))
-    )
-    x = x.copy()
-    x[1::2] += [3.0, 0, 0]
-    state = replace(state, positions=x, forces=None, thermostat=None)
-    after = thermostat.step(system, state, 0.01)
-    assert np.abs(system.motion.constraint_set.value(after.positions)).max() <= 1e-13
 
 
 def test_rows_of_mixed_kinds() -> None:
