@@ -393,8 +393,21 @@ def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
     return numbers
 
 
-def refuse_friction(system: System) -> None:
-    """Raise `UnsupportedError` where the system has friction of its own, which takes out heat that no noise brings."""
+def refuse_dissipation(system: System, why: str) -> None:
+    """Refuse friction of the system, which takes out heat that no noise brings, and velocity-dependent forces.
+
+    Parameters
+    ----------
+    system : System
+    why : str
+        What a thermostat lacks for the latter, and what to do.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    if system.velocity_dependent:
+        raise UnsupportedError(f"forces that depend on the velocities have no {why}")
     if system.friction is not None:
         raise UnsupportedError(
             "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "

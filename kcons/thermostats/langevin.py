@@ -11,13 +11,13 @@ import numpy as np
 from kcons.constraints.arguments import finite_number, positive, seed_number, whole_number
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.program import Program, Row
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
 
 #: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, and the factor of
 #: the velocities; after them the masses for each coordinate, 0 for fixed atoms, and noise.
@@ -83,9 +83,7 @@ class SeededBath(Interpreted):
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
+        refuse_dissipation(system, "place in this scheme; use friction")
 
     def depends_on(self, system: System, state: State) -> Any:
         return self.thermal_energy

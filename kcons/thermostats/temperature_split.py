@@ -170,7 +170,9 @@ class Clusters:
             return np.stack([m.ravel() for m in (*moves, *(np.cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
 
         for change in row_changes(self._motion, whole, fields, 0.0, size):
-            tied = ~(np.abs(change) <= UNCHANGED)  # NaN: a surface that is not defined here
+            tied: NDArray[np.bool_] = np.logical_not(
+                np.abs(change) <= UNCHANGED
+            )  # NaN: a surface that is not defined here
             for may, some in ((shifts, tied[:, :3]), (turns, tied[:, 3:])):
                 hit = self.label[touched[some.any(axis=1)[rows]]]
                 may[hit[hit >= 0]] = False

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import positive
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import InputError, OverdeterminedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.interpreter import Interpreter
@@ -25,7 +25,7 @@ from kcons.thermostats.freedom import (
     carried,
     freedom,
     may_be,
-    refuse_friction,
+    refuse_dissipation,
     warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
@@ -162,11 +162,7 @@ class Isokinetic(Splitting):
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError(
-                "forces that depend on the velocities have no closed kick; use Langevin for friction, or leave it out"
-            )
+        refuse_dissipation(system, "closed kick; use Langevin for friction, or leave it out")
 
     # -- steps ----------------------------------------------------------------------------------
 
