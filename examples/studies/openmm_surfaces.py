@@ -83,7 +83,7 @@ def started(system: openmm.System, integrator: openmm.Integrator, x: np.ndarray)
     context.setPositions(x)
     context.setVelocitiesToTemperature(120, 1)
     if isinstance(integrator, SurfaceIntegrator):
-        integrator.apply_velocities(context)
+        integrator.applyVelocityConstraints(context)
     return context
 
 

@@ -3,7 +3,7 @@
 Swap the integrator of a Simulation, and what the System constrains is held to order 2, 4 or 6, together with
 collective variables, surfaces and the constraint objects of kcons.
 
-- `quantities`: numbers with units
+- `quantities`, `states`: numbers with units, and what a Context says of its state
 - `topology`: constraints by name
 - `integrator`: the integrators and the programs they run
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover
@@ -25,13 +25,13 @@ try:
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
     from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
-    from kcons.openmm.integrator.guard import positions_of, velocities_of
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
     from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
     from kcons.openmm.integrator.schemes import SCHEMES
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
+    from kcons.openmm.states import positions_of, velocities_of
     from kcons.openmm.surfaces.formulas import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
     from kcons.openmm.topology import constraints_of

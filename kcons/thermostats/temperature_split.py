@@ -170,11 +170,9 @@ class Clusters:
             return np.stack([m.ravel() for m in (*moves, *(np.cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
 
         for change in row_changes(self._motion, whole, fields, 0.0, size):
-            tied: NDArray[np.bool_] = np.logical_not(
-                np.abs(change) <= UNCHANGED
-            )  # NaN: a surface that is not defined here
-            for may, some in ((shifts, tied[:, :3]), (turns, tied[:, 3:])):
-                hit = self.label[touched[some.any(axis=1)[rows]]]
+            kept: NDArray[np.bool_] = np.asarray(np.abs(change) <= UNCHANGED)  # not NaN: a surface that ends there
+            for may, some in ((shifts, kept[:, :3]), (turns, kept[:, 3:])):
+                hit = self.label[touched[~np.asarray(some.all(axis=1))[rows]]]
                 may[hit[hit >= 0]] = False
         return shifts, turns
 

@@ -101,6 +101,6 @@ def test_bonds_and_angles_are_carried():
         for _ in range(round(0.1 / (10 * dt))):
             integrator.step(10)
             energies.append(total_energy(context))
-        assert part.worst_miss(context) is None
+        assert part.worst_violation(context) is None
         spread.append(np.std(energies))
     assert 1.7 < np.log2(spread[0] / spread[1]) < 2.3

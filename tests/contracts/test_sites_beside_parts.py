@@ -90,7 +90,7 @@ def energy_errors(platform, kind):
         for _ in range(round(0.02 / dt)):
             integrator.step(1)
             energies.append(total_energy(context) - start)
-        assert part.worst_miss(context) is None
+        assert part.worst_violation(context) is None
         assert (context.getState().getTime()._value, context.getStepCount()) == (pytest.approx(0.02), len(energies))
         errors.append(np.sqrt(np.mean(np.square(energies))))
         del context

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.errors import ConvergenceError, InputError
-from kcons.openmm.integrator.guard import positions_of, velocities_of
-from kcons.openmm.integrator.part import Miss, Part
+from kcons.openmm import positions_of, velocities_of
+from kcons.openmm.integrator.part import Part, Violation
 
 
 class HeldCoordinates(Part):
@@ -14,8 +14,6 @@ class HeldCoordinates(Part):
 
     `steepest` is the largest displacement that is accepted in one drift; beyond it the part fails.
     """
-
-    solves_alone = True
 
     def __init__(self, particles, axis, value, n, *, evaluates=False, steepest=np.inf, groups=()):
         self.mask = np.zeros((n, 3))
@@ -49,12 +47,20 @@ class HeldCoordinates(Part):
         if miss > 1e-9:
             raise InputError(f"off the level by {miss:.3g}", item="positions")
 
-    def worst_miss(self, context, velocities=True):
+    def worst_violation(self, context, velocities=True):
         def worst(what, off):
-            return Miss.worst(what, off, 1e-9, lambda k: f"coordinate of {self.particles[k]}", lambda k: [])
+            return Violation.worst(what, off, 1e-9, lambda k: f"coordinate of {self.particles[k]}", lambda k: [])
 
         x, v = (read(context)[self.particles, self.axis] for read in (positions_of, velocities_of))
         return worst("positions", x - self.value) or (worst("velocities", v) if velocities else None)
+
+    def apply_positions(self, context):
+        x = positions_of(context).copy()
+        x[self.particles, self.axis] = self.value
+        context.setPositions(x)
+
+    def apply_velocities(self, context):
+        context.setVelocities(velocities_of(context) * (1 - self.mask))
 
     def failure(self, integrator, step):
         return ConvergenceError("too steep", step=step)

@@ -71,7 +71,7 @@ def started(system, integrator, x, v, platform="Reference"):
     context = context_of(system, integrator, platform)
     context.setPositions(x)
     context.setVelocities(v)
-    integrator.apply_velocities(context)
+    integrator.applyVelocityConstraints(context)
     return context
 
 

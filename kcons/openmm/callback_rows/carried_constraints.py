@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
 
@@ -33,15 +32,13 @@ from kcons.openmm.callback_rows.callbacks import (
     hands_over_all,
 )
 from kcons.openmm.collective.coordinates import free_groups
-from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.part import NEAR, Part, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import require_context, virtual_sites
+from kcons.openmm.integrator.system_checks import groups_in, refuse_agents, require_context, virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
+from kcons.openmm.states import forces_at
 from kcons.openmm.topology import bonds_of
-
-#: Rounding of positions, relative to the shortest row, that a run begins to show.
-COARSE = 1e-11
 
 
 class CarriedConstraints(Part):
@@ -78,8 +75,6 @@ class CarriedConstraints(Part):
     """
 
     evaluates = lands_last = True
-    written = (*Part.written, "_early", "_begins_early")
-    _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
 
@@ -193,9 +188,8 @@ class CarriedConstraints(Part):
         require_context(context)
         system = context.getSystem()
         self._check_system(system, Precision.of(context))
-        refuse_agents(system, self.motion.constraint_set, context.getMolecules)
+        refuse_movers(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
-        self._tell_of_rounding(x)
         miss = self._worst(x, v if velocities else None, time)
         if miss is not None:
             raise InputError(
@@ -233,16 +227,16 @@ class CarriedConstraints(Part):
                     "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
                 )
 
-    def take_place(self, program: Program, context: openmm.Context) -> None:
+    def attach(self, program: Program, context: openmm.Context) -> None:
         """A State or checkpoint that was loaded is where its own steps ended, the engine is not."""
         self._engine.stand_at(self._state(context)[0])
 
-    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+    def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
         """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
         x, v, time = self._state(context)
         return self._worst(x, v if velocities else None, time)
 
-    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
+    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Violation | None:
         held = self.motion.sources[0]
         found = held.residuals(x, v, time)
         near, slow = self._engine.passage.limits
@@ -253,28 +247,13 @@ class CarriedConstraints(Part):
             self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
         if self._engine.rounded(x):
             allowed += 2.0**-22 * reach * self._slopes
-        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
         if miss is not None or found.rates is None or found.speeds is None:
             return miss
         size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
         # What is taken from v where it is carried together with x: all there is of a body at rest.
         lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
-        return Miss.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
-
-    def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Warn once of coordinates so large that their rounding adds noise to the velocities."""
-        held = self.motion.constraint_set
-        if self._told or not held.n_rows:
-            return
-        reach = float(np.abs(x[held.touched]).max())
-        grain = self._engine.passage.grain(reach)
-        self._told = grain > COARSE * held.scale.min()
-        if self._told:
-            warnings.warn(
-                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; "
-                "each step turns this into velocity, and the energy wanders. Move the origin nearer",
-                stacklevel=3,
-            )
+        return Violation.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
 
     def apply_positions(self, context: openmm.Context) -> None:
         """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
@@ -316,9 +295,8 @@ class CarriedConstraints(Part):
         state = context.getState(positions=True, velocities=True)
         if self._engine.cell is not None:
             self._engine.follow_cell(state)
-        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
-        return x, v, state.getTime().value_in_unit(unit.picosecond)
+        x, v = np.asarray(state.getPositions(asNumpy=True)._value), np.asarray(state.getVelocities(asNumpy=True)._value)
+        return x, v, float(state.getTime()._value)
 
     # -- results --------------------------------------------------------------------------------
 
@@ -329,10 +307,7 @@ class CarriedConstraints(Part):
         at the price of a force evaluation where forces are not known.
         """
         x, v, time = self._state(context)
-        groups = {g for g in range(32) if g not in self.groups}
-        kept = context.getIntegrator().getIntegrationForceGroups()
-        state = context.getState(forces=True, groups=kept & sum(1 << g for g in groups))
-        f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        f = forces_at(context, groups_in(context.getIntegrator()) - self.groups)
         return self.motion.multipliers(x, v, f, time)
 
     @property
@@ -366,11 +341,6 @@ class CarriedConstraints(Part):
         #: Where a step may end without a projection, the solve for positions must tell of failures itself.
         self._early = self.lean or getattr(program.integrator, "scheme", None) is None
         self._begins_early = getattr(getattr(program.integrator, "ensemble", None), "stays_tangent", False)
-
-    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
-        """Times, stages and lengths of drifts are those of the integrator that makes steps."""
-        super().serve(integrator, notes)
-        self._engine.follow(integrator, self.lean)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""
@@ -490,42 +460,9 @@ def refuse_single_precision(precision: Precision, force: openmm.PythonForce | No
         )
 
 
-def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
-    """Refuse barostats and other forces that move particles off the rows between steps."""
-    bound = next((item for item in held.constraints if not item.translation_invariant), None)
-    for force in system.getForces():
-        name = type(force).__name__
-        if isinstance(force, openmm.CMMotionRemover) and bound is not None:
-            raise UnsupportedError(
-                f"{name} shifts all velocities, but {bound!r} ties atoms to a place, and momentum is not conserved; "
-                "remove that force (createSystem(..., removeCMMotion=False))"
-            )
-        if "Barostat" not in name:
-            continue
-        if bound is not None:
-            raise UnsupportedError(
-                f"{name} moves molecules, but {bound!r} ties atoms to a place; run at constant volume, or hold "
-                "differences of positions only"
-            )
-        rigid = getattr(force, "getScaleMoleculesAsRigid", None)
-        if rigid is not None and not rigid():
-            raise UnsupportedError(f"{name} scales atoms one by one; call setScaleMoleculesAsRigid(True)")
-        row = _row_between(held, molecules())
-        if row is not None:
-            raise UnsupportedError(
-                f"{name} moves molecules apart, but row {held.row_name(row)} holds atoms of two of them; let them "
-                "count as one molecule by hold(system, ..., join=True), or run at constant volume"
-            )
-
-
-def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
-    """A row with atoms of several molecules."""
-    label = np.zeros(held.n_atoms, dtype=np.int64)
-    for k, atoms in enumerate(molecules):
-        label[list(atoms)] = k
-    for item, start in zip(held.constraints, held.starts, strict=False):
-        of = label[item.atoms]
-        apart = (of != of[:, :1]).any(axis=1)
-        if apart.any():
-            return int(start + np.argmax(apart))
-    return None
+def refuse_movers(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
+    """Refuse barostats and a CMMotionRemover that would move particles off the rows."""
+    bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
+    starts = zip(held.constraints, held.starts, strict=False)
+    rows = [(item.atoms, lambda k, start=start: held.row_name(start + k)) for item, start in starts]
+    refuse_agents(system, bound, rows, molecules)

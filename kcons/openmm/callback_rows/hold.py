@@ -22,7 +22,7 @@ from kcons.constraints import Angle, Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_agents
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_movers
 from kcons.openmm.quantities import masses_of
 
 #: Hydrogens, also heavy ones, are lighter than this (dalton).
@@ -137,7 +137,7 @@ def hold(
     part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
     links = [_neighbours(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
-    refuse_agents(system, part.motion.constraint_set, lambda: _molecules(system, joined))
+    refuse_movers(system, part.motion.constraint_set, lambda: _molecules(system, joined))
     # Nothing can fail from here on.
     _release(system, table, chosen)
     _tie(system, joined)

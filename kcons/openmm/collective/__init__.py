@@ -2,8 +2,7 @@
 
 - `coordinates`: Forces as coordinates
 - `row_program`: the part of the program that holds them
-- `rows_in_context`: the rows at the state of a Context, and what can be done to them
-- `collective_rows`: `CollectiveRows`, what users make
+- `collective_rows`: `CollectiveRows`, what users make, and the rows at the state of a Context
 """
 
 from kcons.openmm.collective.collective_rows import CollectiveRows

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +14,14 @@ from openmm import unit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints import Formula
+from kcons.constraints import Distance, Formula
 from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.internal import MOST_TURNED
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
+    ConstraintError,
     ConvergenceError,
     InputError,
     KconsError,
@@ -26,8 +29,10 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
+from kcons.motion.motion import Motion
 from kcons.openmm.collective.coordinates import (
     Row,
+    as_constraint,
     as_rows,
     chosen_groups,
     forces_in,
@@ -38,16 +43,34 @@ from kcons.openmm.collective.coordinates import (
     put_in_groups,
     unit_of,
 )
-from kcons.openmm.collective.row_program import GroupRows, require_holder
-from kcons.openmm.collective.rows_in_context import TOLERANCE, RowsInContext
-from kcons.openmm.integrator.part import Miss
+from kcons.openmm.collective.row_program import GroupRows, owner, require_holder, variables_of
+from kcons.openmm.integrator.part import BOND, NEAR, Violation
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import virtual_sites
-from kcons.steppers.compositions import Composition
-from kcons.steppers.rattle import Rattle
+from kcons.openmm.integrator.system_checks import (
+    SystemRows,
+    groups_in,
+    refuse_agents,
+    require_context,
+    virtual_sites,
+)
+from kcons.openmm.quantities import masses_of
+from kcons.openmm.states import energy_of, forces_at, motion_of, positions_of, velocities_of, width_of
+from kcons.openmm.topology import bonds_of
+from kcons.steppers.splitting import Composition, Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+#: Rows whose part beside the others is smaller than this (of their own norm) are dependent.
+DEPENDENT = 1e-5
+#: Relative tolerance of rows, and of the System's constraints where differences are taken, in double precision.
+TOLERANCE = 1e-13
+#: Off the rows by more than this (relative to the scale of a row, or to its rate): not on them.
+START_TOLERANCE = 1e-9
+#: Two values of one coordinate, by OpenMM and by kcons, differ by less.
+SAME = 1e-5
+_MAX_NEWTON = 60
 
 
 class CollectiveRows(GroupRows):
@@ -210,10 +233,10 @@ class CollectiveRows(GroupRows):
         """Whether a target is a context parameter, which others may set for the step to come."""
         return any(isinstance(target, str) for target in self._targets)
 
-    def take_place(self, program: Program, context: openmm.Context) -> None:
+    def attach(self, program: Program, context: openmm.Context) -> None:
         """A tolerance that was left open becomes what Forces can tell of coordinates of this size."""
         if self.asked_tolerance is None:
-            self.tolerance = self.at(context).finest
+            self.tolerance = self.finest(context)
             program.set(f"tolerance{self.code}", self.tolerance)
 
     def set_target(
@@ -272,7 +295,83 @@ class CollectiveRows(GroupRows):
         InfeasibleError
             Rows that are plain coordinates cannot be reached with bonds and angles as they are; likewise.
         """
-        return self.at(context).apply_positions(tolerance, bonds)
+        require_context(context)
+        scales, velocities = np.array(self.scales), velocities_of(context)
+        start, system = positions_of(context), context.getSystem()
+        if tolerance is None:
+            tolerance = self.finest(context) if self.asked_tolerance is None else self.asked_tolerance
+        system_tolerance = context.getIntegrator().getConstraintTolerance()
+
+        def size_at(x: FloatArray) -> tuple[float, FloatArray]:
+            context.setPositions(x)
+            if system.getNumConstraints():
+                context.applyConstraints(system_tolerance)
+            off = self.residuals(context)
+            return float(np.linalg.norm(off / scales)), off
+
+        done, reached = 0, False
+        try:
+            size, off = size_at(self._led(context, start, bonds))
+            for done in range(_MAX_NEWTON):
+                if reached := size <= tolerance:
+                    return done
+                here = positions_of(context)
+                _, directions, gram = self.gram(context)
+                push = np.einsum("k,kai->ai", np.linalg.solve(gram, -off), directions)
+                share = 1.0
+                while share > 1e-4:
+                    new, new_off = size_at(here + share * push)
+                    # Close to the solution rounding decides; a step that does not help ends the iteration.
+                    if new < (1.0 - 0.1 * share) * size:
+                        break
+                    share *= 0.5
+                else:
+                    break
+                size, off = new, new_off
+        finally:
+            if not reached:
+                context.setPositions(start)
+            context.setVelocities(velocities)
+        row = int(np.argmax(np.abs(off / scales)))
+        raise ConvergenceError(
+            f"row {row} ({self.names[row]}) stays off by {abs(off[row]):.3g} after {done} iterations (tolerance "
+            f"{tolerance:.3g}); the positions are unchanged. Start closer to the target, or move it there over time",
+            residual=size,
+            tolerance=tolerance,
+            iterations=done,
+            row=row,
+        )
+
+    def _led(self, context: openmm.Context, start: FloatArray, bonds: ArrayLike | None) -> FloatArray:
+        """Where Newton's method begins: for far targets of plain rows, groups are moved whole first.
+
+        Raises
+        ------
+        InfeasibleError
+            There is no way, or other bonds and angles would change.
+        """
+        system, found = context.getSystem(), self.worst_violation(context, velocities=False)
+        pairs = bonds_of(system, start) if bonds is None else np.asarray(bonds)
+        if found is None or found.near or not len(pairs):
+            return start
+        off, targets = self.residuals(context), self.targets(context)
+        forces = [forces_in(system, group) for group in self._groups]
+        plain = [as_constraint(f[0], t) if len(f) == 1 else None for f, t in zip(forces, targets.tolist(), strict=True)]
+        rows = [row for row in plain if row is not None]
+        if len(rows) < len(plain):
+            return start
+        held = SystemRows.of(system)
+        if held.n_rows:
+            rows.append(Distance(held.pairs, held.lengths))
+        try:
+            motion = Motion(ConstraintSet(rows, start, held.masses), start)
+        except KconsError:
+            # Rows that contradict each other or massless particles: what is wrong Newton's method is to say.
+            return start
+        ours = motion.sources[0].residuals(start, None, 0.0).sigma[: len(off)]
+        if not np.all(np.abs(ours - off) < SAME * np.maximum(1.0, np.abs(targets))):  # other images of particles
+            return start
+        return motion.restore_positions(start, bonds=pairs)
 
     def apply_velocities(self, context: openmm.Context) -> None:
         """Make the velocities of the context tangent to the rows and to the System's constraints.
@@ -282,7 +381,11 @@ class CollectiveRows(GroupRows):
         SingularGeometryError
             Rows that vanish or depend on others.
         """
-        self.at(context).apply_velocities()
+        if context.getSystem().getNumConstraints():
+            context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
+        _, directions, gram = self.gram(context)
+        change = np.einsum("k,kai->ai", np.linalg.solve(gram, self.rates(context)), directions)
+        context.setVelocities(velocities_of(context) - change)
 
     def restore(
         self, context: openmm.Context, tolerance: float | None = None, *, bonds: ArrayLike | None = None
@@ -298,10 +401,10 @@ class CollectiveRows(GroupRows):
         """
         self.apply_positions(context, tolerance, bonds=bonds)
         self.apply_velocities(context)
-        miss = self.worst_miss(context)
-        if miss is not None:
+        found = self.worst_violation(context)
+        if found is not None:
             raise CertificateError(
-                f"after restoring, the {miss}", row=miss.row, residual=abs(miss.off), atoms=miss.atoms
+                f"after restoring, the {found}", row=found.row, residual=abs(found.off), atoms=found.atoms
             )
 
     def check(self, context: openmm.Context, velocities: bool = True) -> None:
@@ -318,29 +421,99 @@ class CollectiveRows(GroupRows):
         ConstraintError
             Positions or velocities are not on the rows; `restore` brings them there.
         """
-        self.at(context).check(velocities)
+        require_context(context)
+        system = context.getSystem()
+        for k, group in enumerate(self._groups):
+            if not forces_in(system, group):
+                raise InputError(
+                    f"row {self._named(k)} is no part of this System; make the context from the System that the rows "
+                    "were added to",
+                    item="context",
+                )
+        gradients, _, _ = self.gram(context)
+        # A row that knows where the origin is gives momentum to the whole.
+        sizes, totals = np.linalg.norm(gradients, axis=(1, 2)), np.linalg.norm(gradients.sum(axis=1), axis=1)
+        in_space = np.flatnonzero(totals > max(1e-9, 10 * Precision.of(context).forces) * sizes)
+        bound = f"collective row {self._named(int(in_space[0]))}" if len(in_space) else None
+        held = [(np.array([atoms]), lambda _, k=k: self._named(k)) for k, atoms in enumerate(self.atoms)]
+        refuse_agents(system, bound, held, context.getMolecules)
+        found = self.worst_violation(context, velocities)
+        if found is not None:
+            remedy = "call restore(context)"
+            moves = isinstance(self._targets[found.row], float) and self._rates[found.row] != 0.0
+            holder = owner(self, context)
+            if moves and found.what == "positions" and (holder is None or self._clock(holder) == 0.0):
+                remedy += (
+                    ", or where the target has moved before, with another integrator, go on from there: "
+                    f"set_target(integrator, {found.row}, {self.values(context)[found.row]:.12g})"
+                )
+            raise ConstraintError(f"the {found}; {remedy}", rows=[found.row], atoms=found.atoms)
+
+    def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
+        """sigma and A v from the Forces themselves, at the state of the context."""
+        forces, off = Precision.of(context).forces, self.residuals(context)
+        allowed = np.array(self.scales) * max(START_TOLERANCE, 10 * self.tolerance, 2 * forces)
+        near: ArrayLike = 0.0
+        if np.any(np.abs(off) > allowed):
+            # Compared with the target, one radian, or what moves an atom by a short bond.
+            periods, targets = np.array(self.periods), self.targets(context)
+            own = np.where(periods > 0, periods / (2 * np.pi), np.abs(targets))
+            near = NEAR * np.maximum(own, BOND * np.linalg.norm(self.gradients(context), axis=(1, 2)))
+        found = Violation.worst("positions", off, allowed, self._named, self.atoms.__getitem__, near)
+        if found is not None or not velocities:
+            return found
+        gradients, v, demanded = self.gradients(context), velocities_of(context), self._targets_and_rates(context)[1]
+        size = np.linalg.norm(gradients, axis=(1, 2)) * float(np.linalg.norm(v, axis=1).max(initial=0.0))
+        rates = np.einsum("kai,ai->k", gradients, v) - demanded
+        allowed = max(START_TOLERANCE, 2 * forces) * (size + np.abs(demanded))
+        return Violation.worst("velocities", rates, allowed, self._named, self.atoms.__getitem__)
 
     # -- at the state of a context --------------------------------------------------------------
 
-    def at(self, context: openmm.Context) -> RowsInContext:
-        """The rows at the state of a context: gradients, Gram matrix, projections."""
-        return RowsInContext(self, context)
-
     def values(self, context: openmm.Context) -> FloatArray:
         """q of each row, shape (n_rows,)."""
-        return self.at(context).values()
+        require_context(context)
+        return np.array([energy_of(context, {group}) for group in self._groups])
+
+    def targets(self, context: openmm.Context) -> FloatArray:
+        """Where each target is now, shape (n_rows,).
+
+        Where the integrator of the context does not hold the rows, targets are those the rows were made with.
+        """
+        return self._targets_and_rates(context)[0]
 
     def residuals(self, context: openmm.Context) -> FloatArray:
         """sigma = q - target of each row, shape (n_rows,), to the nearest image."""
-        return self.at(context).sigma()
+        off, period = self.values(context) - self.targets(context), np.array(self.periods)
+        safe = np.where(period > 0, period, 1.0)
+        return np.where(period > 0, off - safe * np.floor(off / safe + 0.5), off)
+
+    def gradients(self, context: openmm.Context) -> FloatArray:
+        """grad q, shape (n_rows, n_particles, 3)."""
+        return np.array([-forces_at(context, {group}) for group in self._groups])
 
     def rates(self, context: openmm.Context) -> FloatArray:
         """A v less the rate of the targets, shape (n_rows,), per ps."""
-        return self.at(context).slopes()
+        across = np.einsum("kai,ai->k", self.gradients(context), velocities_of(context))
+        return across - self._targets_and_rates(context)[1]
+
+    def gram(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(A, M_par^+ A^T, A M_par^+ A^T), M_par^+ that of the System's constraints.
+
+        Raises
+        ------
+        SingularGeometryError
+            Rows that vanish, or depend on others or on the System's constraints.
+        """
+        gradients, directions, gram, adding = self._grams(context)
+        for k in range(self.n_rows):
+            if k not in adding:
+                raise SingularGeometryError(self._dependent(k), rows=[k])
+        return gradients, directions, gram
 
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
-        return self.at(context).rank()
+        return len(self._grams(context)[3])
 
     def multipliers_at(self, context: openmm.Context) -> FloatArray:
         """lambda at the positions and velocities of the context, as accurate as these; shape (n_rows,).
@@ -348,15 +521,90 @@ class CollectiveRows(GroupRows):
         (A M_par^+ A^T) lambda = target'' - d(A v)/dt - A M_par^+ f (notes, eq. 104), M_par^+ that of the System's
         constraints. d(A v)/dt along their free flight by central differences; needs nine evaluations of every row.
         """
-        return self.at(context).multipliers()
+        _, directions, gram = self.gram(context)
+        applied = forces_at(context, groups_in(context.getIntegrator()) - self.groups)
+        from_forces = np.einsum("kai,ai->k", directions, applied)
+        x, v = motion_of(context)
+        speed = float(np.linalg.norm(v, axis=1).max(initial=0.0))
+        from_motion = np.zeros(self.n_rows)
+        if speed > 0:
+            # Displacements of 1e-4 nm: the remainder of order four and rounding are both near 1e-11.
+            h = 1e-4 / speed
+            with _kept(context):
+                near, far = self._slope_change(context, x, v, h), self._slope_change(context, x, v, 2 * h)
+            from_motion = (4.0 * near - far) / 3.0
+        return np.linalg.solve(gram, -from_motion - from_forces)
 
-    def targets(self, context: openmm.Context) -> FloatArray:
-        """Where each target is now, shape (n_rows,)."""
-        return self.at(context).targets()
+    def finest(self, context: openmm.Context) -> float:
+        """The smallest relative residual that is held: what Forces tell, of coordinates as they see them.
 
-    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
-        """sigma and A v from the Forces themselves, at the state of the context."""
-        return self.at(context).worst_miss(velocities)
+        Where those are single numbers, a row is off by the gradient times what rounding took of them, at random: twice
+        its standard deviation is met by nearly each push.
+        """
+        precision = Precision.of(context)
+        if precision.name == "double":
+            return TOLERANCE
+        wide = width_of(context) if context.getSystem().usesPeriodicBoundaryConditions() else 0.0
+        moved = self.gradients(context) * np.maximum(np.abs(positions_of(context)), wide)
+        blur = np.linalg.norm(moved, axis=(1, 2)) / np.array(self.scales)
+        told = 0.8 * precision.seen * float(np.linalg.norm(blur))
+        # A power of two, or it would be another number whenever x is.
+        return max(precision.forces, 2.0 ** np.ceil(np.log2(told)) if 0 < told < np.inf else told)
+
+    def _targets_and_rates(self, context: openmm.Context) -> tuple[FloatArray, FloatArray]:
+        """What the integrator was made with or told; its variables are copies for the program."""
+        holder = owner(self, context)
+        program = getattr(holder, "program", None)
+        known = {} if holder is None else variables_of(holder) if program is None else program.settings
+
+        def now(name: str, given: Sequence[float | str | None]) -> FloatArray:
+            found = [
+                context.getParameter(value) if isinstance(value, str) else known.get(self._of(name, k, holder), value)
+                for k, value in enumerate(given)
+            ]
+            return np.array(found, dtype=np.float64)
+
+        targets, rates = now("target", self._targets), now("rate", self._rates)
+        clock = 0.0 if holder is None else self._clock(holder)
+        moves = [isinstance(target, float) for target in self._targets]
+        return targets + np.where(moves, rates * clock, 0.0), rates
+
+    def _grams(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray, list[int]]:
+        """A, M_par^+ A^T, A M_par^+ A^T, and the rows that add something to those before them."""
+        require_context(context)
+        masses, precision = masses_of(context.getSystem()), Precision.of(context)
+        weights = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
+        gradients = self.gradients(context)
+        directions = gradients * weights[:, None]
+        if self.meets_system:
+            with _kept(context, positions=False):
+                directions = np.array([_tangent(context, row) for row in directions])
+        gram = np.einsum("jai,kai->jk", gradients, directions)
+        gram = 0.5 * (gram + gram.T)
+        own = np.einsum("kai,a->k", gradients**2, weights)
+        good = np.isfinite(own) & (own > 0)
+        size = np.sqrt(np.where(good, own, 1.0))
+        scaled = gram / (size[:, None] * size)
+        # Squares of parts beside other rows that are rounding.
+        small = max(DEPENDENT**2, 10 * precision.forces)
+        adding: list[int] = []
+        for k in np.flatnonzero(good).tolist():
+            before = scaled[np.ix_(adding, adding)], scaled[adding, k]
+            left = scaled[k, k] - (before[1] @ np.linalg.lstsq(*before, rcond=None)[0] if adding else 0.0)
+            if left > small:
+                adding.append(k)
+        return gradients, directions, gram, adding
+
+    def _slope_change(self, context: openmm.Context, x: FloatArray, v: FloatArray, h: float) -> FloatArray:
+        """d(A v)/dt in free flight along the System's constraints, by the difference over +-h."""
+        change = np.zeros(self.n_rows)
+        for side in (1.0, -1.0):
+            context.setPositions(x + side * h * v)
+            if self.meets_system:
+                context.applyConstraints(_tight(context))
+            there = _tangent(context, v) if self.meets_system else v
+            change += side * np.einsum("kai,ai->k", self.gradients(context), there) / (2 * h)
+        return change
 
     # -- of an integrator, after its last step --------------------------------------------------
 
@@ -405,13 +653,7 @@ class CollectiveRows(GroupRows):
         c = self.code
         singular = int(integrator.getGlobalVariableByName(f"singular{c}"))
         if singular:
-            row = singular - 1
-            return SingularGeometryError(
-                f"step {step}: row {row} ({self.names[row]}) vanishes, or depends on the rows before it or on the "
-                "constraints of the System. Leave out a row that others imply; a dihedral over a straight angle or an "
-                "RMSD of 0 has no direction",
-                rows=[row],
-            )
+            return SingularGeometryError(f"step {step}: {self._dependent(singular - 1)}", rows=[singular - 1])
         off = np.abs(self._read(integrator, "sigma")) / np.array(self.scales)
         residual = integrator.getGlobalVariableByName(f"residual{c}")
         row = int(np.argmax(np.where(np.isfinite(off), off, math.inf)))
@@ -441,13 +683,47 @@ class CollectiveRows(GroupRows):
 
     def _digits(self, context: openmm.Context) -> str:
         """What to do where the tolerance asks for more digits than Forces have."""
-        here = self.at(context)
-        if not self.tolerance < here.finest:
+        finest = self.finest(context)
+        if not self.tolerance < finest:
             return ""
-        return f", but Forces tell no more than {here.finest:.0e} here in {here.precision}: leave the tolerance open"
+        return f", but Forces tell no more than {finest:.0e} here in {Precision.of(context)}: leave the tolerance open"
+
+    def _named(self, row: int) -> str:
+        return f"{row} ({self.names[row]})"
+
+    def _dependent(self, row: int) -> str:
+        return (
+            f"row {self._named(row)} vanishes, or depends on the rows before it or on the constraints of the System. "
+            "Leave out a row that others imply; a dihedral over a straight angle or an RMSD of 0 has no direction"
+        )
 
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"
+
+
+def _tight(context: openmm.Context) -> float:
+    """Tolerance of the System's constraints where differences are taken."""
+    precision = Precision.of(context)
+    return TOLERANCE if precision.name == "double" else max(TOLERANCE, precision.solvers)
+
+
+def _tangent(context: openmm.Context, v: FloatArray) -> FloatArray:
+    """v along the System's constraints at the context's positions; its velocities are overwritten."""
+    context.setVelocities(v)
+    context.applyVelocityConstraints(_tight(context))
+    return velocities_of(context)
+
+
+@contextmanager
+def _kept(context: openmm.Context, positions: bool = True) -> Iterator[None]:
+    """Put the state of the context back afterwards."""
+    x, v = motion_of(context)
+    try:
+        yield
+    finally:
+        if positions:
+            context.setPositions(x)
+        context.setVelocities(v)
 
 
 def _components(n: int, pairs: Sequence[tuple[int, int]]) -> np.ndarray:

@@ -20,6 +20,7 @@ from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.system_checks import ROW_NAME, groups_of
 from kcons.openmm.quantities import nanometers
+from kcons.openmm.states import energy_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -424,13 +425,8 @@ def found_values(
             alone.addForce(copy)
     context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
     context.setPositions(x)
-    values = np.array([energy(context, group) for group in range(len(rows))])
+    values = np.array([energy_of(context, {group}) for group in range(len(rows))])
     for k, value in enumerate(values):
         if not math.isfinite(value):
             raise InputError(f"row {k} is {value} at these positions", item="positions")
     return values
-
-
-def energy(context: openmm.Context, group: int) -> float:
-    """Energy of one force group in kJ/mol."""
-    return float(context.getState(getEnergy=True, groups=1 << group).getPotentialEnergy()._value)

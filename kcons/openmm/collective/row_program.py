@@ -22,6 +22,7 @@ from kcons.errors import InputError
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import require_context
 from kcons.steppers.operations import Exchange
 
 #: A pivot below this fraction of the row's own norm means that the row depends on others, in double precision.
@@ -45,8 +46,7 @@ class GroupRows(Part):
         One entry a row.
     """
 
-    evaluates = stays_finite = solves_alone = True
-    written = (*Part.written, "_leapfrog", "_single", "_base", "_start")
+    evaluates = stays_finite = True
     code = 1
     names: tuple[str, ...]
     atoms: tuple[tuple[int, ...], ...]
@@ -188,7 +188,7 @@ class GroupRows(Part):
     def remember(self, p: Program) -> None:
         c = self.code
         if self._drives:  # a step that failed is not counted in good_steps, and its time is not kept
-            first, kept = "delta(stage-first_stage)", f"1-delta(began{c}-good_steps)"
+            first, kept = "delta(stage)", f"1-delta(began{c}-good_steps)"
             p.let(f"clock{c}", f"clock{c}+{first}*({kept})*flown{c}", "the step before was kept")
             p.let(f"flown{c}", f"select({first}, 0, flown{c})", "a step begins")
             p.let(f"began{c}", "good_steps", "to see whether it is kept")
@@ -275,7 +275,7 @@ class GroupRows(Part):
     def land(self, p: Program, h: str) -> None:
         c = self.code
         if self._drives:
-            p.let(f"flown{c}", f"flown{c}+select(first_stage, 0, {h})", "targets at the end of the drift")
+            p.let(f"flown{c}", f"flown{c}+{h}", "targets at the end of the drift")
         if self._base != "xu":
             p.each(self._base, "x", "positions as other parts leave them")
         if self.lean:  # joined with the passes before it
@@ -374,7 +374,7 @@ class GroupRows(Part):
                     p.let(self._inverse(i, j), new, "Broyden's update")
 
     def _note_multipliers(self, p: Program, h: str) -> None:
-        c, begins = self.code, "delta(stage)"  # not so where constraints are applied alone
+        c, begins = self.code, "delta(stage)"
         for k in range(self.n_rows):
             push, impulse, multiplier, end = (self._of(name, k) for name in ("push", "impulse", "lambda", "end"))
             before = f"select({begins}, 0, {impulse})"
@@ -425,7 +425,7 @@ class GroupRows(Part):
         for k in rows:
             p.let(self._of("end", k), f"2*{self._of('more', k)}/(dt*{share!r})", "multiplier at the end of the step")
             p.let(self._of("impulse", k), f"{self._of('impulse', k)}+{self._of('more', k)}", "all of this step")
-        p.let(f"known{c}", "delta(first_stage)", "the next step begins here")
+        p.let(f"known{c}", "1", "the next step begins here")
         self._end_step(p)
 
     def passed(self, p: Program) -> None:
@@ -436,9 +436,9 @@ class GroupRows(Part):
     def _end_step(self, p: Program) -> None:
         for k in range(self.n_rows):
             mean, impulse, work = self._of("mean", k), self._of("impulse", k), self._of("work", k)
-            p.let(mean, f"select(first_stage, {mean}, {impulse}/dt)", "mean multiplier")
+            p.let(mean, f"{impulse}/dt", "mean multiplier")
             if self._rates[k] != 0.0:
-                done = f"{work}+select(first_stage+failed, 0, {self._rate(k)}*{impulse})"
+                done = f"{work}+select(failed, 0, {self._rate(k)}*{impulse})"
                 p.let(work, done, "force times speed of the target")
 
     # -- seen from Python -----------------------------------------------------------------------
@@ -470,6 +470,7 @@ def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
 
 def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
+    require_context(context)
     integrator = context.getIntegrator()
     members = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
@@ -477,7 +478,7 @@ def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator |
     known = [_HOLDING.get(int(one.this), one) for one in members if isinstance(one, openmm.CustomIntegrator)]
     holding = [one for one in known if rows._of("push", 0, one) in variables_of(one)]
     # Of members of a CompoundIntegrator the one that made steps last.
-    ours = (one for one in holding if getattr(one, "identity", holding) is rows.serves)
+    ours = (one for one in holding if getattr(one, "program", holding) is rows.program)
     return next(ours, next(iter(holding), None))
 
 

@@ -1,4 +1,4 @@
-"""Momenta that a System conserves, and that its thermostat must not count."""
+"""g, the momenta that a thermostat acts on: all that are independent, less those that the System conserves."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import Literal
 
 import numpy as np
 import openmm
-from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.guard import positions_of
-from kcons.openmm.integrator.steps import Integrator
+from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm.integrator.ensemble import Ensemble, Integrator
 from kcons.openmm.integrator.system_checks import (
     forces_of,
     groups_in,
@@ -23,7 +21,15 @@ from kcons.openmm.integrator.system_checks import (
     removes_centre_of_mass_motion,
 )
 from kcons.openmm.quantities import held_without_mass, masses_of
-from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, RigidMotions, open_directions
+from kcons.openmm.states import box_of, forces_at, positions_of, velocities_of
+from kcons.thermostats.freedom import (
+    BALANCED,
+    SHAKE,
+    SHIFT,
+    RigidMotions,
+    open_directions,
+    warn_of_conserved_momenta,
+)
 
 Momentum = Literal["auto", "conserved", "free"]
 
@@ -49,10 +55,92 @@ class Momenta:
 NONE = Momenta(np.zeros((0, 3)), False)
 
 
-def check_momentum(momentum: str) -> None:
-    """Raise `InputError` for a word that is none of `Momentum`."""
-    if momentum not in ("auto", "conserved", "free"):
-        raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
+class CountsMomenta(Ensemble):
+    """An ensemble that gives a temperature to g independent momenta, by scaling velocities.
+
+    g is three for each particle with a mass, less the rank of all constraints, less one for each direction in which
+    total momentum is conserved; it is found once for a Context. `ready` is called at the first step, and is what an
+    ensemble of this kind has to write besides its program.
+    """
+
+    momentum: Momentum
+    temperature: float | None
+
+    @staticmethod
+    def checked(momentum: Momentum) -> Momentum:
+        """Raise `InputError` for a word that is none of `Momentum`."""
+        if momentum not in ("auto", "conserved", "free"):
+            raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
+        return momentum
+
+    def masses(self, integrator: Integrator) -> FloatArray:
+        """Masses of the particles that it acts on; 0 for others."""
+        found: FloatArray = integrator._watch().rows.masses
+        return found
+
+    def independent(self, integrator: Integrator) -> int:
+        """Momenta of these particles that constraints leave."""
+        return integrator.independent_momenta()
+
+    def everyone(self, integrator: Integrator) -> bool:
+        """Whether it acts on all particles with a mass: total momentum may be conserved then."""
+        return np.array_equal(self.masses(integrator), integrator._watch().rows.masses)
+
+    def momenta(self, integrator: Integrator) -> Momenta:
+        """Which momenta are conserved."""
+        guard = integrator._watch()
+        if guard.momenta is None:
+            every = self.everyone(integrator)
+            guard.momenta = conserved_momenta(integrator, guard.context, self.momentum) if every else NONE
+        found: Momenta = guard.momenta
+        return found
+
+    def count(self, integrator: Integrator) -> int:
+        """g of an integrator: its momenta that are thermostatted and independent.
+
+        Raises
+        ------
+        OverdeterminedError
+            There is none.
+        """
+        guard = integrator._watch()
+        if guard.thermal is None:
+            count = self.independent(integrator) - len(self.momenta(integrator).directions)
+            if count < 1:
+                raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
+            guard.thermal = count
+        return int(guard.thermal)
+
+    def warmth(self, integrator: Integrator) -> float:
+        return integrator.degrees_of_freedom() / self.count(integrator)
+
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Find g, and tell of momenta that are conserved.
+
+        Raises
+        ------
+        OverdeterminedError
+            No degree of freedom is left.
+        UnsupportedError
+            Targets move.
+        """
+        moving = [part for part in integrator.parts if part.driven]
+        if moving:
+            raise UnsupportedError(
+                f"{type(self).__name__} needs constant targets, and those of {moving[0]!r} move: scaled velocities "
+                "would not follow; use Langevin, or a thermostat of kcons.ase"
+            )
+        masses, v = self.masses(integrator), velocities_of(context)
+        if self.everyone(integrator) and removes_centre_of_mass_motion(context.getSystem()):
+            v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
+        self.ready(integrator, context, masses, v)
+        momenta = self.momenta(integrator)
+        turns = momenta.turns and self.temperature is not None
+        warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=7)
+
+    def ready(self, integrator: Integrator, context: openmm.Context, masses: FloatArray, v: FloatArray) -> None:
+        """Before the first step: settings that depend on g, and on the velocities v of particles with these masses."""
+        raise NotImplementedError
 
 
 def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
@@ -121,7 +209,7 @@ def _totals(
     system, alone = given.getSystem(), openmm.System()
     for k in range(system.getNumParticles()):
         alone.addParticle(1.0 if system.isVirtualSite(k) else system.getParticleMass(k))
-    alone.setDefaultPeriodicBoxVectors(*given.getState().getPeriodicBoxVectors())
+    alone.setDefaultPeriodicBoxVectors(*box_of(given))
     alone.addForce(copy.deepcopy(force))
     clock = openmm.VerletIntegrator(1e-3)
     context = openmm.Context(alone, clock, openmm.Platform.getPlatformByName("Reference"))
@@ -134,8 +222,7 @@ def _totals(
         there = x + (SHIFT * size * rng.standard_normal(3) + SHAKE * size * rng.standard_normal(x.shape)) * bool(found)
         there[fixed] = x[fixed]
         context.setPositions(there)
-        state = context.getState(forces=True)
-        f = np.asarray(state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer))
+        f = forces_at(context, -1)
         total, whole = f.sum(axis=0), float(np.abs(f).sum())
         found.append(total / whole if whole > 0 and np.abs(total).max() > BALANCED * whole else np.zeros(3))
         turns.see(there, f)

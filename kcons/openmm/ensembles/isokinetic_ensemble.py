@@ -14,25 +14,17 @@ from openmm import unit
 from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm.ensembles.conserved_momenta import (
-    NONE,
-    Momenta,
-    Momentum,
-    check_momentum,
-    conserved_momenta,
-)
-from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
+from kcons.openmm.integrator.ensemble import Integrator
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
-from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion, warn_of_barostat
+from kcons.openmm.integrator.steps import Step
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.steppers.compositions import Composition
+from kcons.openmm.states import energy_of, forces_at, positions_of, velocities_of
 from kcons.steppers.operations import Kick, Operation, Project, Turn
-from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
-from kcons.steppers.splitting import Splitting
-from kcons.thermostats.freedom import atom_numbers, warn_of_conserved_momenta
+from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
+from kcons.thermostats.freedom import atom_numbers
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
 #: is continued stays as it is, bit for bit.
@@ -43,7 +35,7 @@ _CANCELS = 1e-4
 Atoms: TypeAlias = tuple[int, ...] | tuple[bool, ...] | None
 
 
-class Isokinetic(Ensemble):
+class Isokinetic(CountsMomenta):
     """Constant kinetic energy, for `ProjectedIntegrator(ensemble=...)`.
 
     Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
@@ -104,15 +96,15 @@ class Isokinetic(Ensemble):
     ) -> None:
         if convention not in ("exact", "notes"):
             raise InputError(f"convention is {convention!r}; choose 'exact' or 'notes'", item="convention")
-        check_momentum(momentum)
         if temperature is not None and kinetic_energy is not None:
             raise InputError("give temperature or kinetic_energy, not both", item="temperature")
+        plain = 0.0 if kinetic_energy is None else number(kinetic_energy, unit.kilojoule_per_mole, "kinetic_energy")
         self._keep(
             temperature=None if temperature is None else positive(kelvins(temperature), "temperature"),
-            kinetic_energy=None if kinetic_energy is None else _energy(kinetic_energy),
+            kinetic_energy=None if kinetic_energy is None else positive(plain, "kinetic_energy"),
             convention=convention,
             atoms=None if atoms is None else tuple(np.asarray(atoms).tolist()),
-            momentum=momentum,
+            momentum=self.checked(momentum),
         )
 
     def __repr__(self) -> str:
@@ -190,8 +182,7 @@ class Isokinetic(Ensemble):
             p.sum("wq", f"{of}m*w*v", "along the kick")
             p.sum("ww", f"{of}m*w*w", "2K before")
             p.sum("qq", f"{of}m*v*v", "size of the kick")
-        # h = 0 where constraints are applied alone: nothing changes then. 1e-300 keeps 0/0 away.
-        p.let("z", f"select({h}, max(sqrt(qq/two_k), 1e-300), 1e-300)", "strength of the kick")
+        p.let("z", "max(sqrt(qq/two_k), 1e-300)", "strength of the kick; 1e-300 keeps 0/0 away")
         p.let("aim", "min(max(wq/sqrt(max(ww*qq, 1e-300)), -1), 1)", "direction of the kick")
         p.let("decay", "exp(-z)", "all is divided by exp(z)")
         # sinh is exact near 0, where 1 - exp(-2z) is not.
@@ -201,15 +192,15 @@ class Isokinetic(Ensemble):
         p.let("lost", f"lost+step({_CANCELS!r}-scale)", "count what cannot be trusted")
         p.let("growth", "growth+z+log(scale)", "alpha over time")
         # Drifts change the length of velocities at their order; sqrt(two_k/ww) brings it back.
-        p.let("keep", f"select({h}, sqrt(two_k/ww), 1)*decay/scale", "share of the velocities")
+        p.let("keep", "sqrt(two_k/ww)*decay/scale", "share of the velocities")
         p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")
         turned, plain = (f"keep*v+(push-keep)*{q}", "v") if unseen else ("keep*w+push*v", "w+v")
         return turned if self.atoms is None else f"select(share, {turned}, {plain})"
 
     # -- a run ----------------------------------------------------------------------------------
 
-    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Find g and K; scale the velocities, unless they are right to rounding.
+    def ready(self, integrator: Integrator, context: openmm.Context, masses: FloatArray, v: FloatArray) -> None:
+        """Find K; scale the velocities, unless they are right to rounding.
 
         Raises
         ------
@@ -218,33 +209,28 @@ class Isokinetic(Ensemble):
         OverdeterminedError
             g is 1 where a temperature is asked for, or 0.
         UnsupportedError
-            A constraint couples thermostatted particles to others; targets move.
+            A constraint couples thermostatted particles to others.
         """
         if integrator.parts and integrator.scheme is None:
             raise UnsupportedError("the isokinetic leapfrog holds constraints of the System only; use scheme='rattle'")
-        moving = [part for part in integrator.parts if part.driven]
-        if moving:
-            raise UnsupportedError(
-                f"the isokinetic thermostat in OpenMM needs constant targets, but those of {moving[0]!r} move; use "
-                "Langevin, or kcons.ase.IsokineticDynamics"
+        found = float(masses @ np.einsum("ij,ij->i", v, v))
+        if not found > 0:
+            raise InputError(
+                "the isokinetic thermostat needs non-zero kinetic energy: call "
+                "integrator.setVelocitiesToTemperature(context, T) first",
+                item="velocities",
             )
-        masses, v, found = _in_motion(self.atoms, integrator, context)
-        momenta = self._momenta(integrator, context)
-        twice = self._twice_kinetic(_count(self.atoms, integrator, context, momenta), int(np.sum(masses > 0)), found)
-        turns = momenta.turns and self.temperature is not None
-        warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=7)
-        warn_of_barostat(context, self.temperature, stacklevel=6)
+        twice = self._twice_kinetic(integrator, masses, found)
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())
         precision = Precision.of(context).name
         integrator.program.set("two_k", twice)
         # Drifts keep the 2K of rigid bodies, and rounding is larger than what they change where it is not double.
-        rigid = SystemRows.of(context.getSystem()).rigid
+        rigid = integrator._watch().rows.rigid
         integrator.program.set("exact", float(precision == "double" and not rigid))
         if abs(found / twice - 1) > ROUNDING[precision]:
-            v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
-            context.setVelocities(v)
+            context.setVelocities(np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v))
 
     def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if kicks have lost digits."""
@@ -255,18 +241,14 @@ class Isokinetic(Ensemble):
                 "step, and lost digits; take a smaller time step"
             )
 
-    def _momenta(self, integrator: Integrator, context: openmm.Context) -> Momenta:
-        if not _everyone(self.atoms, integrator, context):
-            return NONE
-        return conserved_momenta(integrator, context, self.momentum)
-
-    def _twice_kinetic(self, count: int, n_moving: int, found: float) -> float:
+    def _twice_kinetic(self, integrator: Integrator, masses: FloatArray, found: float) -> float:
+        count = self.count(integrator)
         if self.kinetic_energy is not None:
             return 2 * self.kinetic_energy
         if self.temperature is None:
             return found
         if self.convention == "notes":
-            return 3 * n_moving * GAS_CONSTANT * self.temperature
+            return 3 * int(np.sum(masses > 0)) * GAS_CONSTANT * self.temperature
         if count < 2:
             raise OverdeterminedError(
                 "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; give kinetic_energy, or "
@@ -275,40 +257,61 @@ class Isokinetic(Ensemble):
             )
         return (count - 1) * GAS_CONSTANT * self.temperature
 
-    # -- what can be read -----------------------------------------------------------------------
+    def masses(self, integrator: Integrator) -> FloatArray:
+        """Masses of thermostatted particles; 0 for others."""
+        masses = super().masses(integrator)
+        if self.atoms is None:
+            return masses
+        inside = np.zeros(len(masses), dtype=bool)
+        inside[atom_numbers(np.asarray(self.atoms), len(masses))] = True
+        if integrator.parts:
+            raise UnsupportedError(
+                "a thermostat on some of the particles works with constraints of the System only; leave out parts=, "
+                "or thermostat all particles"
+            )
+        rows = integrator._watch().rows
+        first, second = inside[rows.pairs].T
+        if np.any(first != second):
+            row = int(np.argmax(first != second))
+            within, other = sorted(rows.pairs[row].tolist(), key=lambda atom: not inside[atom])
+            raise UnsupportedError(
+                f"constraint {rows.numbers[row]} of the System couples the thermostatted particle {within} to {other}, "
+                "which is not; choose particles such that every constraint is wholly inside or outside"
+            )
+        return np.where(inside, masses, 0.0)
 
-    def count(self, integrator: Integrator) -> int:
-        """g of an integrator: its momenta that are thermostatted and independent."""
-        guard = integrator._watch()
-        if guard.thermal is None:
-            return _count(self.atoms, integrator, guard.context, self._momenta(integrator, guard.context))
-        return guard.thermal
+    def independent(self, integrator: Integrator) -> int:
+        if self.atoms is None:
+            return super().independent(integrator)
+        masses, rows = self.masses(integrator), integrator._watch().rows
+        inside = masses[rows.pairs].any(axis=1)
+        some = replace(rows, pairs=rows.pairs[inside], lengths=rows.lengths[inside], settled=rows.settled[inside])
+        return 3 * int(np.sum(masses > 0)) - some.rank(positions_of(integrator.context))
+
+    # -- what can be read -----------------------------------------------------------------------
 
     def warmth(self, integrator: Integrator) -> float:
         """2 K/(g k) times this is the temperature of the configurations."""
         count = self.count(integrator)
-        if count < 2 or not _everyone(self.atoms, integrator, integrator.context):
+        if count < 2 or not self.everyone(integrator):
             return 1.0
         return integrator.degrees_of_freedom() / (count - 1)
 
     def at(self, temperature: float) -> Isokinetic:
-        atoms = None if self.atoms is None else np.asarray(self.atoms)
-        return Isokinetic(temperature, convention=self.convention, atoms=atoms, momentum=self.momentum)
+        return self.replaced(temperature=temperature, kinetic_energy=None)
 
     def follow(self, integrator: Integrator) -> None:
         """Kicks scale the velocities from the next step on."""
         guard = integrator._guard
         if guard is not None and guard.alive is not None and guard.started:
-            masses = _masses(self.atoms, integrator, integrator.context)
-            twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
+            twice = self._twice_kinetic(integrator, self.masses(integrator), 0.0)
             integrator.program.set("two_k", twice)
 
     def friction(self, integrator: Integrator) -> float:
         """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
         context = integrator.context
-        masses, v = _masses(self.atoms, integrator, context), velocities_of(context)
-        state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
-        f = np.asarray(state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer))
+        masses, v = self.masses(integrator), velocities_of(context)
+        f = forces_at(context, integrator.getIntegrationForceGroups())
         inside = masses > 0
         return float(np.sum(v[inside] * f[inside]) / (masses @ np.einsum("ij,ij->i", v, v)))
 
@@ -318,9 +321,8 @@ class Isokinetic(Ensemble):
 
     def conserved_energy(self, integrator: Integrator) -> float:
         """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""
-        state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
         heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")
-        return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)) + heat
+        return energy_of(integrator.context, integrator.getIntegrationForceGroups()) + heat
 
 
 def _add_up(step: Step, of: str, q: str, along: str) -> None:
@@ -340,76 +342,3 @@ def _add_up(step: Step, of: str, q: str, along: str) -> None:
     p.sum("qq", along, "q.M.(w+q)")
     p.let("wq", "wq-qq-ww", "along the kick")
     p.let("qq", "max(qq-wq, wq^2/ww)", "size of the kick")
-
-
-def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np.ndarray:
-    """Of thermostatted particles; 0 for others."""
-    system = context.getSystem()
-    n = system.getNumParticles()
-    masses: FloatArray = integrator._watch(context).rows.masses
-    if atoms is None:
-        return masses
-    inside = np.zeros(n, dtype=bool)
-    inside[atom_numbers(np.asarray(atoms), n)] = True
-    if integrator.parts:
-        raise UnsupportedError(
-            "a thermostat on some of the particles works with constraints of the System only; leave out parts=, or "
-            "thermostat all particles"
-        )
-    for k in range(system.getNumConstraints()):
-        i, j, _ = system.getConstraintParameters(k)
-        if inside[i] != inside[j]:
-            raise UnsupportedError(
-                f"constraint {k} of the System couples the thermostatted particle {i if inside[i] else j} to "
-                f"{j if inside[i] else i}, which is not; choose particles such that every constraint is wholly "
-                "inside or outside"
-            )
-    return np.where(inside, masses, 0.0)
-
-
-def _in_motion(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
-    """Masses that are thermostatted, velocities as a CMMotionRemover leaves them, and 2K.
-
-    Raises
-    ------
-    InputError
-        All velocities are zero.
-    """
-    masses, v = _masses(atoms, integrator, context), velocities_of(context)
-    if _everyone(atoms, integrator, context) and removes_centre_of_mass_motion(context.getSystem()):
-        v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)
-    found = float(masses @ np.einsum("ij,ij->i", v, v))
-    if not found > 0:
-        raise InputError(
-            "the isokinetic thermostat needs non-zero kinetic energy: call "
-            "integrator.setVelocitiesToTemperature(context, T) first",
-            item="velocities",
-        )
-    return masses, v, found
-
-
-def _everyone(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> bool:
-    """Whether all particles with a mass are thermostatted: total momentum may be conserved then."""
-    masses, everyones = (_masses(these, integrator, context) for these in (atoms, None))
-    return np.array_equal(masses, everyones)
-
-
-def _count(atoms: Atoms, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:
-    """g: momenta that are thermostatted and independent."""
-    if atoms is None:
-        count = integrator.independent_momenta(context)
-    else:
-        masses = _masses(atoms, integrator, context)
-        rows = SystemRows.of(context.getSystem())
-        inside = masses[rows.pairs].any(axis=1)
-        some = replace(rows, pairs=rows.pairs[inside], lengths=rows.lengths[inside], settled=rows.settled[inside])
-        count = 3 * int(np.sum(masses > 0)) - some.rank(positions_of(context))
-    count -= len(momenta.directions)
-    if count < 1:
-        raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
-    integrator._watch().thermal = count
-    return count
-
-
-def _energy(energy: unit.Quantity | float) -> float:
-    return positive(number(energy, unit.kilojoule_per_mole, "kinetic_energy"), "kinetic_energy")

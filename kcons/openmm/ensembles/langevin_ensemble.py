@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import openmm
 from openmm import unit
 
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
+from kcons.openmm.integrator.ensemble import BetweenHalves
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.steps import Ensemble, Integrator, Step
-from kcons.openmm.integrator.system_checks import warn_of_barostat
+from kcons.openmm.integrator.steps import Step
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
-from kcons.steppers.splitting import Splitting
 
 
-class Langevin(Ensemble):
+class Langevin(BetweenHalves):
     """Canonical ensemble, for `ProjectedIntegrator(ensemble=...)`: half a kick, half a drift along the constraints,
 
         v = P (exp(-gamma h) v + sqrt((1 - exp(-2 gamma h)) kT/m) noise),    P = M_par^+ M,
@@ -50,7 +47,6 @@ class Langevin(Ensemble):
     Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
 
-    adds_up = True
     noisy = True
     temperature: float
     friction: float
@@ -64,21 +60,6 @@ class Langevin(Ensemble):
     def __repr__(self) -> str:
         return f"Langevin({self.temperature:g} K, {self.friction:g}/ps)"
 
-    def check(self, scheme: Splitting | None) -> None:
-        """Raise `UnsupportedError` for all schemes but 'rattle'."""
-        if scheme is None:
-            raise UnsupportedError(
-                "Langevin needs velocities at the time of the positions, and those of the leapfrog are half a step "
-                "behind; use scheme='rattle'"
-            )
-        if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
-            raise UnsupportedError(f"Langevin splits the drift of scheme='rattle' in two; {scheme!r} has another form")
-
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
-        """Friction and noise act between two halves of the drift."""
-        first, second = drifts_of((0.5, 0.5))
-        return (Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project())
-
     def declare(self, program: Program) -> None:
         kT, friction = self.settings().values()
         program.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
@@ -87,25 +68,18 @@ class Langevin(Ensemble):
         program.number("spread", "size of the noise")
 
     def middle(self, step: Step, u: str) -> None:
-        p = step.program
-        p.let("kept_share", "exp(-friction*dt)", "friction")
-        # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
-        p.let("spread", "sqrt(2*kT*kept_share*sinh(friction*dt))", "noise")
-        p.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
+        friction_and_noise(step.program, u, "dt")
         if step.parts:
             # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
             step.project()
 
-    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Compare with a barostat."""
-        warn_of_barostat(context, self.temperature, stacklevel=6)
-
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}
 
-    def at(self, temperature: float) -> Langevin:
-        return Langevin(temperature, self.friction)
 
-    def with_friction(self, friction: unit.Quantity | float) -> Langevin:
-        """The same with another friction."""
-        return Langevin(self.temperature, friction)
+def friction_and_noise(program: Program, u: str, h: str) -> None:
+    """From velocities u to v, through a bath for a time h."""
+    program.let("kept_share", f"exp(-friction*{h})", "friction")
+    # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
+    program.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{h}))", "noise")
+    program.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")

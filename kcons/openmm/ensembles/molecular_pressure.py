@@ -164,7 +164,7 @@ def _cells_to_whole(system: openmm.System, x: FloatArray, box: FloatArray, label
 def _require_on_rows(context: openmm.Context) -> None:
     """Refuse rows that molecules leave where they move as wholes."""
     for part in getattr(context.getIntegrator(), "parts", ()):
-        miss = part.worst_miss(context, False)
+        miss = part.worst_violation(context, False)
         if miss is not None:
             raise UnsupportedError(
                 f"molecules that move as wholes leave row {miss.name}: it holds several together, or one in space. Let "

@@ -21,12 +21,13 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
-from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.steps import ConstantEnergy, Step
+from kcons.openmm.integrator.steps import Step
 from kcons.openmm.integrator.system_checks import forces_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
+from kcons.openmm.states import box_of, energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts, best_share
@@ -386,8 +387,7 @@ class HamiltonianMonteCarlo:
         return potential, change / self.thermal_energy
 
     def _potential(self) -> float:
-        state = self.context.getState(energy=True, groups=self.integrator.getIntegrationForceGroups())
-        return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole))
+        return energy_of(self.context, self.integrator.getIntegrationForceGroups())
 
     def _kinetic(self, v: FloatArray) -> float:
         return 0.5 * float((self._masses * v * v).sum())
@@ -412,7 +412,7 @@ class HamiltonianMonteCarlo:
         return known is None or not np.array_equal(x, known[0]) or self._surroundings() != known[1]
 
     def _surroundings(self) -> tuple[Any, dict[str, float]]:
-        return _box(self.context), dict(self.context.getParameters())
+        return box_of(self.context), dict(self.context.getParameters())
 
     def _next(self, reporter: Any) -> int:
         told = reporter.describeNextReport(self.simulation)
@@ -423,10 +423,6 @@ def _asked(told: Any) -> bool:
     """Whether a reporter wants molecules in the box."""
     periodic = told.get("periodic") if isinstance(told, dict) else (told[5] if len(told) > 5 else None)
     return bool(periodic)
-
-
-def _box(context: openmm.Context) -> Any:
-    return context.getState().getPeriodicBoxVectors()._value
 
 
 def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:

@@ -9,24 +9,24 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import positive, whole_number
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm.ensembles.conserved_momenta import Momenta, Momentum, check_momentum, conserved_momenta
-from kcons.openmm.integrator.guard import velocities_of
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
+from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, refuse_leapfrog
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.steps import Ensemble, Integrator, Step, use
-from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion, warn_of_barostat
+from kcons.openmm.integrator.steps import Step, use
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
+from kcons.openmm.states import energy_of
+from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.freedom import warn_of_conserved_momenta
 from kcons.thermostats.nose_hoover import HALF, chain_fractions
 
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
 
 
-class NoseHoover(Ensemble):
+class NoseHoover(CountsMomenta):
     """Canonical ensemble without noise, for `ProjectedIntegrator(ensemble=...)`: a chain that scales velocities.
 
     Half a step of the chain, a step on the constraints, half a step of the chain: the trajectory is that of
@@ -88,7 +88,6 @@ class NoseHoover(Ensemble):
         repeats: int = 1,
         momentum: Momentum = "auto",
     ) -> None:
-        check_momentum(momentum)
         chain_fractions(chain_order, repeats)
         self._keep(
             temperature=positive(kelvins(temperature), "temperature"),
@@ -96,7 +95,7 @@ class NoseHoover(Ensemble):
             length=whole_number(length, "length"),
             chain_order=int(chain_order),
             repeats=int(repeats),
-            momentum=momentum,
+            momentum=self.checked(momentum),
         )
 
     def __repr__(self) -> str:
@@ -105,11 +104,8 @@ class NoseHoover(Ensemble):
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for the leapfrog and for schemes of another order than 2."""
         if scheme is None:
-            raise UnsupportedError(
-                "NoseHoover needs velocities at the time of the positions, and those of the leapfrog are half a step "
-                "behind; use scheme='rattle'"
-            )
-        if scheme.order != 2:
+            refuse_leapfrog(self)
+        elif scheme.order != 2:
             raise UnsupportedError(f"{scheme!r} has order {scheme.order}, the chain 2; use scheme='rattle'")
 
     def check_timestep(self, dt: float) -> None:
@@ -174,8 +170,7 @@ class NoseHoover(Ensemble):
         """Move the chain on for half a step, or two halves one after the other; see `kcons.thermostats.nose_hoover`."""
         p, links = program, self._links()
         parts = len(p.tables["chain_share"]) // 2
-        # Where constraints are applied alone, no time passes.
-        time = f"{HALF.fraction!r}*dt" + ("*delta(first_stage)" if "first_stage" in p.numbers else "")
+        time = f"{HALF.fraction!r}*dt"
         p.sum("twice", "m*v*v", "2K, the only sum")
         p.let("chain_inertia", "kT/frequency^2", "mass of a link")
         p.let("scale", "1", "nothing done yet")
@@ -196,8 +191,7 @@ class NoseHoover(Ensemble):
         """The velocity of a link after half of the time, pushed by the one before and damped by the next."""
         link = f"link{k + 1}"
         if k == 0:
-            # g is not known before the first step, where constraints may be applied alone.
-            push = "select(chain_h, 0.5*chain_h*(twice*scale^2-momenta*kT)/(momenta*chain_inertia), 0)"
+            push = "0.5*chain_h*(twice*scale^2-momenta*kT)/(momenta*chain_inertia)"
         else:
             mass = "momenta*chain_inertia" if k == 1 else "chain_inertia"
             push = f"0.5*chain_h*({mass}*link{k}^2-kT)/chain_inertia"
@@ -214,64 +208,19 @@ class NoseHoover(Ensemble):
 
     # -- a run ----------------------------------------------------------------------------------
 
-    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Find g.
-
-        Raises
-        ------
-        InputError
-            A time step that the chain cannot follow.
-        OverdeterminedError
-            No degree of freedom is left.
-        UnsupportedError
-            Targets move.
-        """
-        moving = [part for part in integrator.parts if part.driven]
-        if moving:
-            raise UnsupportedError(
-                f"targets of {moving[0]!r} move, and scaled velocities would not follow them; use Langevin"
-            )
+    def ready(self, integrator: Integrator, context: openmm.Context, masses: FloatArray, v: FloatArray) -> None:
         self.check_timestep(float(integrator.getStepSize()._value))
-        system = context.getSystem()
-        momenta = conserved_momenta(integrator, context, self.momentum)
-        count = self._count(integrator, momenta)
-        masses, v = integrator._watch().rows.masses, velocities_of(context)
-        if removes_centre_of_mass_motion(system):
-            v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
-        warn_of_conserved_momenta(masses, v, momenta.directions, momenta.turns, stacklevel=7)
-        warn_of_barostat(context, self.temperature, stacklevel=6)
-        integrator.program.set("momenta", count)
-
-    def _count(self, integrator: Integrator, momenta: Momenta) -> int:
-        count = integrator.independent_momenta() - len(momenta.directions)
-        if count < 1:
-            raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
-        integrator._watch().thermal = count
-        return count
+        integrator.program.set("momenta", self.count(integrator))
 
     # -- what can be read -----------------------------------------------------------------------
-
-    def count(self, integrator: Integrator) -> int:
-        """g of an integrator: its momenta that are thermostatted and independent."""
-        guard = integrator._watch()
-        if guard.thermal is not None:
-            return int(guard.thermal)
-        return self._count(integrator, conserved_momenta(integrator, guard.context, self.momentum))
-
-    def warmth(self, integrator: Integrator) -> float:
-        return integrator.degrees_of_freedom() / self.count(integrator)
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "frequency": self.frequency}
 
-    def at(self, temperature: float) -> NoseHoover:
-        given: dict[str, Any] = dict(self.__dict__)
-        return type(self)(**{**given, "temperature": temperature})
-
     def conserved_energy(self, integrator: Integrator) -> float:
         """Energy of the System and of the chain in kJ/mol; its fluctuation is of order dt^2."""
-        state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
-        energy = (state.getPotentialEnergy() + integrator.kinetic_energy()).value_in_unit(unit.kilojoule_per_mole)
+        energy = energy_of(integrator.context, integrator.getIntegrationForceGroups())
+        energy += integrator.kinetic_energy().value_in_unit(unit.kilojoule_per_mole)
         kT, read = self.settings()["kT"], integrator.getGlobalVariableByName
         speeds = np.array([read(name) for name in self._links()])
         weights = np.ones(self.length)
@@ -280,7 +229,7 @@ class NoseHoover(Ensemble):
         return float(energy + 0.5 * inertia * (weights @ speeds**2) + kT * read("chain_place"))
 
 
-class NoseHooverMiddle(NoseHoover):
+class NoseHooverMiddle(BetweenHalves, NoseHoover):
     """The same chain in the middle of the drift, for `ProjectedIntegrator(ensemble=...)`: take it for large time steps.
 
     Half a kick, half a drift along the constraints, a step of the chain, half a drift, half a kick. At the ends of
@@ -302,20 +251,7 @@ class NoseHooverMiddle(NoseHoover):
     Zhang, Liu, Yan, Tuckerman and Liu, J. Phys. Chem. A 123, 6056 (2019).
     """
 
-    owes = False
-
-    def check(self, scheme: Splitting | None) -> None:
-        """Raise `UnsupportedError` for all schemes but 'rattle'."""
-        super().check(scheme)
-        if scheme is None or scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
-            raise UnsupportedError(
-                f"NoseHooverMiddle splits the drift of scheme='rattle' in two; {scheme!r} has another form"
-            )
-
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
-        """The chain moves between two halves of the drift."""
-        first, second = drifts_of((0.5, 0.5))
-        return (Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project())
+    adds_up = owes = False
 
     def open(self, program: Program) -> None:
         self._remember(program)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from typing import Any, Self
 
 import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.ensembles.langevin_ensemble import Langevin
-from kcons.openmm.integrator.steps import Integrator, Step
+from kcons.openmm.ensembles.langevin_ensemble import Langevin, friction_and_noise
+from kcons.openmm.integrator.ensemble import Integrator
+from kcons.openmm.integrator.steps import Step
 from kcons.openmm.integrator.system_checks import groups_in, groups_of
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
@@ -107,7 +109,6 @@ class LangevinRespa(Langevin):
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
-        super().begin(integrator, context)
         idle = set(self.groups) - groups_in(integrator)
         if idle:
             raise InputError(
@@ -158,12 +159,10 @@ class LangevinRespa(Langevin):
         step.note_end()
         return True
 
-    def at(self, temperature: float) -> LangevinRespa:
-        return type(self)(temperature, self.friction, dict(zip(self.groups, self.counts, strict=True)), self.slow_kicks)
-
-    def with_friction(self, friction: unit.Quantity | float) -> LangevinRespa:
+    def replaced(self, **changes: Any) -> Self:
         steps = dict(zip(self.groups, self.counts, strict=True))
-        return type(self)(self.temperature, friction, steps, self.slow_kicks)
+        kept = {"temperature": self.temperature, "friction": self.friction, "slow_kicks": self.slow_kicks}
+        return type(self)(**{**kept, "steps": steps, **changes})
 
 
 def _write_all(step: Step, operations: Sequence[Operation]) -> None:
@@ -178,8 +177,6 @@ def _write_all(step: Step, operations: Sequence[Operation]) -> None:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
         elif isinstance(operation, Exchange):
             # The drift that follows absorbs what noise has across constraints.
-            p.let("kept_share", f"exp(-friction*{operation.fraction!r}*dt)", "friction")
-            p.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{operation.fraction!r}*dt))", "noise")
-            p.each("v", "kept_share*v+spread*gaussian/sqrt(m)", "friction and noise act")
+            friction_and_noise(p, "v", f"{operation.fraction!r}*dt")
         elif isinstance(operation, Project):
             step.project()

@@ -17,10 +17,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.certificate import MOST, SHARE
-from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.ensemble import Integrator
+from kcons.openmm.integrator.part import NEAR, Part, Violation
 from kcons.openmm.integrator.precision import SINGLE, Precision
 from kcons.openmm.integrator.program import forces_at_old_positions
-from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
@@ -29,8 +29,10 @@ from kcons.openmm.integrator.system_checks import (
     parts_of_steps,
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
+    warn_of_barostat,
 )
 from kcons.openmm.quantities import held_without_mass
+from kcons.openmm.states import box_of, motion_of, positions_of, velocities_of, width_of
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -56,111 +58,6 @@ def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     return None
 
 
-# A State is in nm and ps whatever else is in use: _value spares the conversion, which takes longer than small Systems.
-
-
-def positions_of(context: openmm.Context) -> FloatArray:
-    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
-
-
-def velocities_of(context: openmm.Context) -> FloatArray:
-    return np.asarray(context.getState(velocities=True).getVelocities(asNumpy=True)._value)
-
-
-def width(context: openmm.Context) -> float:
-    """Largest coordinate in the periodic box."""
-    return float(np.abs(np.array(_box(context))).sum(axis=0).max())
-
-
-def _box(context: openmm.Context) -> Any:
-    return context.getState().getPeriodicBoxVectors()._value
-
-
-class SystemConstraints:
-    """The constraints of the System of one Context, and how closely its platform can hold them.
-
-    Parameters
-    ----------
-    context : openmm.Context
-    integrator : ProjectedIntegrator
-    """
-
-    def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
-        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
-        self.precision = Precision.of(context)
-        self.rows = SystemRows.of(context.getSystem(), rounded=self.precision.rounds_lengths)
-
-    @property
-    def context(self) -> openmm.Context:
-        context = self._context()
-        assert context is not None
-        return context
-
-    @property
-    def tolerance(self) -> float:
-        """That of OpenMM's solvers."""
-        integrator = self._integrator()
-        assert integrator is not None
-        return float(integrator.getConstraintTolerance())
-
-    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
-        """What each relative residual may be, given the tolerance and the size of the coordinates.
-
-        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
-        positions there to single numbers then, until the next step.
-        """
-        coarse = (
-            wrapped and self.precision.name == "mixed" and self.context.getSystem().usesPeriodicBoundaryConditions()
-        )
-        place = SINGLE if coarse else self.precision.place
-        inside = width(self.context) if coarse else 0.0
-        reach = np.maximum(np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0), inside) / self.rows.lengths
-        # The tolerance is that of the solver; OpenMM checks the squares of the distances. The coordinates of two
-        # particles are rounded.
-        rounding = self.precision.solvers + 2 * np.sqrt(3) * place * reach
-        return np.asarray(2 * self.tolerance + rounding + self.rows.slack)
-
-    def check(self, x: FloatArray, step: int | None) -> None:
-        """Raise if a constraint of the System is not fulfilled at positions x."""
-        if not self.rows.n_rows:
-            return
-        miss = np.abs(self.rows.stretches(x))
-        limit = self.limit(x)
-        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
-            limit = self.limit(x, wrapped=True)
-        excess = miss / limit
-        row = int(np.argmax(excess))
-        if not excess[row] <= 1:  # also NaN
-            tolerance = self.tolerance
-            raise ConvergenceError(
-                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g} "
-                f"({self.precision}, which holds {limit[row]:.2g}): the solvers of OpenMM did not converge and "
-                f"do not tell. Take a smaller time step, or {_REMEDY}",
-                residual=float(miss[row]),
-                tolerance=tolerance,
-                row=int(self.rows.numbers[row]),
-                atoms=self.rows.pairs[row],
-                step=step,
-            )
-
-    def hold_positions(self, tolerance: float) -> None:
-        """Bring the positions of the Context onto the constraints of the System."""
-        for _ in range(_CALLS):
-            self.context.applyConstraints(tolerance)
-            x = positions_of(self.context)
-            if not self.rows.n_rows or np.all(np.abs(self.rows.stretches(x)) <= self.limit(x)):
-                return
-
-    def speed_miss(self, x: FloatArray, v: FloatArray) -> Miss | None:
-        """A constraint of the System along which particles move."""
-        rows, tolerance = self.rows, self.tolerance
-        if not rows.n_rows:
-            return None
-        allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
-        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
-        return Miss.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
-
-
 class Guard:
     """Watches over one Context.
 
@@ -182,8 +79,9 @@ class Guard:
         check_system(self.system)
         self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
-        self.constraints = SystemConstraints(context, integrator)
-        self.rows, precision = self.constraints.rows, self.constraints.precision
+        self.precision = precision = Precision.of(context)
+        #: The constraints of the System.
+        self.rows = SystemRows.of(self.system, rounded=precision.rounds_lengths)
         integrator.take_precision(precision)
         self._refuse_old_positions()
         #: Whether something in the System moves x between steps.
@@ -203,8 +101,9 @@ class Guard:
         )
         #: Whether the start was looked at.
         self.started = False
-        #: g of the thermostat, once it is known.
+        #: g of the thermostat, and the momenta that are conserved, once they are known.
         self.thermal: int | None = None
+        self.momenta: Any = None
         self.since_check = 0
         self._explosive = len(self.rows.masses) * _LIGHT**2
         #: Whether the program sums squares of velocities where a call ends. Reference and CPU would make other noise,
@@ -223,7 +122,9 @@ class Guard:
 
     @property
     def context(self) -> openmm.Context:
-        return self.constraints.context
+        context = self._context()
+        assert context is not None
+        return context
 
     @property
     def integrator(self) -> Integrator:
@@ -238,7 +139,7 @@ class Guard:
 
     def _refuse_old_positions(self) -> None:
         """Raise where rows would be computed at old positions."""
-        integrator, precision = self.integrator, self.constraints.precision
+        integrator, precision = self.integrator, self.precision
         concerned = integrator.parts and precision.rounds_lengths and self.system.getNumConstraints()
         if concerned and forces_at_old_positions(integrator.program.lines):
             raise UnsupportedError(
@@ -248,6 +149,63 @@ class Guard:
                 "platform"
             )
 
+    # -- constraints of the System ---------------------------------------------------------------
+
+    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
+        """What each relative residual may be, given the tolerance and the size of the coordinates.
+
+        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
+        positions there to single numbers then, until the next step.
+        """
+        coarse = wrapped and self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
+        place = SINGLE if coarse else self.precision.place
+        inside = width_of(self.context) if coarse else 0.0
+        reach = np.maximum(np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0), inside) / self.rows.lengths
+        # The tolerance is that of the solver; OpenMM checks the squares of the distances. The coordinates of two
+        # particles are rounded.
+        rounding = self.precision.solvers + 2 * np.sqrt(3) * place * reach
+        return np.asarray(2 * self.integrator.getConstraintTolerance() + rounding + self.rows.slack)
+
+    def check_lengths(self, x: FloatArray, step: int | None) -> None:
+        """Raise if a constraint of the System is not fulfilled at positions x."""
+        if not self.rows.n_rows:
+            return
+        miss = np.abs(self.rows.stretches(x))
+        limit = self.limit(x)
+        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
+            limit = self.limit(x, wrapped=True)
+        excess = miss / limit
+        row = int(np.argmax(excess))
+        if not excess[row] <= 1:  # also NaN
+            tolerance = self.integrator.getConstraintTolerance()
+            raise ConvergenceError(
+                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g} "
+                f"({self.precision}, which holds {limit[row]:.2g}): the solvers of OpenMM did not converge and "
+                f"do not tell. Take a smaller time step, or {_REMEDY}",
+                residual=float(miss[row]),
+                tolerance=tolerance,
+                row=int(self.rows.numbers[row]),
+                atoms=self.rows.pairs[row],
+                step=step,
+            )
+
+    def hold_positions(self, tolerance: float) -> None:
+        """Bring the positions of the Context onto the constraints of the System."""
+        for _ in range(_CALLS):
+            self.context.applyConstraints(tolerance)
+            x = positions_of(self.context)
+            if not self.rows.n_rows or np.all(np.abs(self.rows.stretches(x)) <= self.limit(x)):
+                return
+
+    def speed_violation(self, x: FloatArray, v: FloatArray) -> Violation | None:
+        """A constraint of the System along which particles move."""
+        rows, tolerance = self.rows, self.integrator.getConstraintTolerance()
+        if not rows.n_rows:
+            return None
+        allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
+        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
+        return Violation.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
+
     # -- calls ----------------------------------------------------------------------------------
 
     @property
@@ -256,7 +214,7 @@ class Guard:
         context = self._context()
         if context is None or self._size != _size(self.system):
             return False
-        return self._left is None or self._left == (context.getStepCount(), _box(context))
+        return self._left is None or self._left == (context.getStepCount(), box_of(context))
 
     def enter(self) -> None:
         """A call of `step` begins."""
@@ -268,7 +226,7 @@ class Guard:
     def leave(self) -> None:
         """A call of `step` ends."""
         context = self.context
-        self._left = context.getStepCount(), _box(context)
+        self._left = context.getStepCount(), box_of(context)
         if self.integrator.parts:
             self._parameters = dict(context.getParameters())
 
@@ -285,9 +243,8 @@ class Guard:
             What a part finds wrong.
         """
         context, integrator = self.context, self.integrator
-        now = context.getState(positions=True, velocities=True)
-        x, v = (np.asarray(each._value) for each in (now.getPositions(asNumpy=True), now.getVelocities(asNumpy=True)))
-        _check_finite(x, v, context.getStepCount(), False)
+        x, v = motion_of(context)
+        check_finite(x, v, context.getStepCount(), False)
         if self.started:
             integrator.refresh()
         else:
@@ -295,15 +252,16 @@ class Guard:
             context.setVelocities(v)
         try:
             for part in integrator.parts:
-                part.take_place(integrator.program, context)
+                part.attach(integrator.program, context)
             self._put_right(x)
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
                 if not self.started:
                     part.check(context, velocities=not self.late)
                 elif not part.steered:  # a context parameter moves rows, and the next drift follows
-                    self._refuse(part.worst_miss(context, velocities=not self.late))
+                    self._refuse(part.worst_violation(context, velocities=not self.late))
             if not self.started:
+                warn_of_barostat(context, getattr(integrator.ensemble, "temperature", None), stacklevel=5)
                 integrator.ensemble.begin(integrator, context)
         except Exception:
             context.setPositions(x)
@@ -327,22 +285,22 @@ class Guard:
         asked = [part for part in integrator.parts if not (self.started and part.steered)]
         misses = _misses(asked, context)
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
-        if not near and not np.any(miss > self.constraints.limit(x)):
+        if not near and not np.any(miss > self.limit(x)):
             return
         if not near:
-            self.constraints.hold_positions(integrator.getConstraintTolerance())
+            self.hold_positions(integrator.getConstraintTolerance())
             near = not misses and bool(_misses(asked, context))  # pulled off by the constraints of the System
         if near:
             integrator.applyConstraints(context)
         now = positions_of(context)
-        self.constraints.check(now, None)
+        self.check_lengths(now, None)
         if near or miss[row] > TIDY:
             moved = float(np.sqrt(np.max(np.sum((now - x) ** 2, axis=1))))
             worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
             worst = f"the {misses[0]}" if misses else worst
             logger.warning("the start was put right: %s; particles were moved by up to %.3g nm", worst, moved)
 
-    def _refuse(self, miss: Miss | None) -> None:
+    def _refuse(self, miss: Violation | None) -> None:
         if miss is not None:
             raise InputError(
                 f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimiser is one: take "
@@ -360,8 +318,8 @@ class Guard:
             # impulse, which enters the kinetic energy, is that of a smooth motion.
             off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
         else:
-            off = self.constraints.speed_miss(positions_of(context), v) is not None
-            off = off or any(part.worst_miss(context) is not None for part in integrator.parts)
+            off = self.speed_violation(positions_of(context), v) is not None
+            off = off or any(part.worst_violation(context) is not None for part in integrator.parts)
         if off:
             integrator.applyVelocityConstraints(context)
 
@@ -385,7 +343,7 @@ class Guard:
         step, v = context.getStepCount(), velocities_of(context)
         try:
             self.integrator.ensemble.verify(self.integrator)
-            _check_finite(positions_of(context), v, step, held)
+            check_finite(positions_of(context), v, step, held)
             speeds = np.sqrt(np.einsum("ij,ij->i", v, v))
             atom = int(np.argmax(speeds))
             raise NonFiniteError(
@@ -452,10 +410,10 @@ class Guard:
             now = context.getState(positions=True, velocities=True)
             x = np.asarray(now.getPositions(asNumpy=True)._value)
             v = np.asarray(now.getVelocities(asNumpy=True)._value)
-            _check_finite(x, v, step, self.rows.n_rows > 0)
-            self.constraints.check(x, step)
-            misses = [] if self.late else [self.constraints.speed_miss(x, v)]
-            misses += [part.worst_miss(context, velocities=not self.late) for part in integrator.parts]
+            check_finite(x, v, step, self.rows.n_rows > 0)
+            self.check_lengths(x, step)
+            misses = [] if self.late else [self.speed_violation(x, v)]
+            misses += [part.worst_violation(context, velocities=not self.late) for part in integrator.parts]
             for miss in misses:
                 self.certify(miss, f"at step {step} ")
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
@@ -470,7 +428,7 @@ class Guard:
             good = self.context.getStepCount()
             error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
 
-    def certify(self, miss: Miss | None, where: str = "") -> None:
+    def certify(self, miss: Violation | None, where: str = "") -> None:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
         if miss is not None:
             raise CertificateError(
@@ -530,9 +488,9 @@ def _size(system: openmm.System) -> tuple[int, int, int]:
     return system.getNumParticles(), system.getNumConstraints(), system.getNumForces()
 
 
-def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Miss]:
+def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Violation]:
     """Rows whose positions are off, the worst of each part."""
-    return [found for part in parts if (found := part.worst_miss(context, velocities=False)) is not None]
+    return [found for part in parts if (found := part.worst_violation(context, velocities=False)) is not None]
 
 
 def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:
@@ -561,7 +519,8 @@ def _smaller_step(held: bool) -> str:
     return f"take a smaller time step, or minimize the energy first{solver}"
 
 
-def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
+def check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
+    """Raise `NonFiniteError` for a NaN or infinity; `held` where the System has constraints."""
     for array, item in ((x, "position"), (v, "velocity")):
         finite = np.isfinite(array)
         if not finite.all():

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import openmm
-from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
-from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.quantities import masses_of
+from kcons.openmm.states import forces_at, positions_of, velocities_of
 
 #: Longest way of a particle in one step, nm.
 _STRIDE = 0.01
@@ -47,9 +46,7 @@ def descend(integrator: openmm.Integrator, context: openmm.Context, tolerance: f
     try:
         integrator.applyConstraints(context)
         for _ in range(iterations or 50_000):
-            state = context.getState(forces=True, groups=groups)
-            f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
-            pull = _tangent(integrator, context, np.asarray(f) * inverse)
+            pull = _tangent(integrator, context, forces_at(context, groups) * inverse)
             if np.sqrt(np.mean((masses * pull) ** 2)) <= tolerance:
                 return
             v = _tangent(integrator, context, v + dt * pull)

@@ -24,7 +24,7 @@ BOND = 0.1
 
 
 @dataclass(frozen=True)
-class Miss:
+class Violation:
     """A row that is off by more than it may be.
 
     Attributes
@@ -57,7 +57,7 @@ class Miss:
         name: Callable[[int], str],
         atoms: Callable[[int], Iterable[int]],
         near: ArrayLike = 0.0,
-    ) -> Miss | None:
+    ) -> Violation | None:
         """The worst of some rows, or None if each is off by no more than allowed; NaN is the worst."""
         size = np.abs(off)
         limit = np.broadcast_to(np.asarray(allowed, dtype=float), size.shape)
@@ -83,14 +83,11 @@ class Part(ABC):
     puts positions and velocities back to what they were before it and asks the part that has this code for the
     error to raise.
 
-    The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
-    is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
-
     Steps after which the state is not read may end without `project` (see `kcons.openmm.integrator.steps`): the next
     drift absorbs what v has across the rows. `lean` is set to True before `declare` where a program has such steps.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
-    `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.integrator.system_checks`.
+    `kcons.openmm.integrator.system_checks.refuse_agents`.
 
     Attributes
     ----------
@@ -104,9 +101,6 @@ class Part(ABC):
         within its own `land`; at most one part of an integrator may.
     lands_last : bool
         Whether it adds to x of its own particles only, so that it comes after the constraints of the System.
-    solves_alone : bool
-        Whether the program also brings a state onto the rows outside of steps. Where a part does not, all parts are
-        asked to do so by `apply_positions` and `apply_velocities`.
     groups : frozenset of int
         Force groups that carry rows, not forces.
     lean : bool
@@ -124,34 +118,24 @@ class Part(ABC):
     evaluates: bool = False
     meets_system: bool = False
     lands_last: bool = False
-    solves_alone: bool = False
     groups: frozenset[int] = frozenset()
     lean: bool = False
     alone: bool = False
     stays_finite: bool = False
     sited: bool = False
-    #: Attributes that a program sets in a part while it is written: each integrator that has the part has its own.
-    written: tuple[str, ...] = ("code", "lean")
-    #: The integrator that the part serves, as `object` that no other has.
-    serves: object = None
+    #: The program that the part serves: that of the integrator which made steps last.
+    program: Program | None = None
+
+    def begin_program(self, code: int) -> None:
+        """A program is written anew, in which the part has this number."""
+        self.code, self.lean = code, False
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "program"}
 
     def code_in(self, integrator: object) -> int:
         """Its number in an integrator, which need not be the one that it serves now."""
         return next((k for k, part in enumerate(getattr(integrator, "parts", ()), 1) if part is self), self.code)
-
-    def notes(self) -> dict[str, Any]:
-        """What the program that was written last has set."""
-        return {name: vars(self)[name] for name in self.written if name in vars(self)}
-
-    def forget(self) -> None:
-        """Be as before any program was written."""
-        for name in self.written:
-            vars(self).pop(name, None)
-
-    def serve(self, integrator: openmm.CustomIntegrator, notes: dict[str, Any]) -> None:
-        """Serve another integrator than before; `notes` are those of its program."""
-        self.forget()
-        vars(self).update(notes)
 
     @property
     def driven(self) -> bool:
@@ -188,7 +172,7 @@ class Part(ABC):
     def take_precision(self, program: Program, precision: Precision) -> None:
         """The Context is known, and with it what can be held."""
 
-    def take_place(self, program: Program, context: openmm.Context) -> None:
+    def attach(self, program: Program, context: openmm.Context) -> None:
         """Positions are known, where others may have set them: before a step, and before anything is checked."""
 
     def begin_run(self) -> None:
@@ -216,16 +200,16 @@ class Part(ABC):
         """
 
     @abstractmethod
-    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+    def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
         """What the rows themselves say of the state of the context, whatever solvers believe; None if all hold."""
 
+    @abstractmethod
     def apply_positions(self, context: openmm.Context) -> Any:
         """Bring the positions of the context onto the rows; velocities stay as they are."""
-        raise NotImplementedError
 
+    @abstractmethod
     def apply_velocities(self, context: openmm.Context) -> Any:
         """Make the velocities of the context tangent to the rows."""
-        raise NotImplementedError
 
     @abstractmethod
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:

@@ -16,15 +16,17 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
-from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Integrator
+from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import TOLERANCES, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
-from kcons.openmm.integrator.steps import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step, write_step
+from kcons.openmm.integrator.steps import VARIABLES, Step, write_step
 from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
 from kcons.openmm.quantities import kelvins, number, relative_tolerance
+from kcons.openmm.states import motion_of, positions_of, velocities_of
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
@@ -148,21 +150,22 @@ class ProjectedIntegrator(Integrator):
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         _refuse_shared(self.parts)
-        for k, part in enumerate(self.parts, start=1):
-            part.forget()
-            part.code = k
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
         if self.row_groups:
             openmm.Integrator.setIntegrationForceGroups(self, set(range(32)) - self.row_groups)
         self.program = Program(self)
-        self._step = Step(self.program, self.scheme, self.parts, self._ensemble)
-        write_step(self._step, self._own_step)
+        self._step = self._write(self.program)
         self.program.hand_over()
-        #: What parts know as this integrator, and what its program has set in each.
-        self.identity = object()
-        self._notes = [part.notes() for part in self.parts]
+
+    def _write(self, program: Program) -> Step:
+        """Write the program; parts keep what they need to know of it, and that it is the one they serve."""
+        for k, part in enumerate(self.parts, start=1):
+            part.begin_program(k)
+        step = Step(program, self.scheme, self.parts, self._ensemble)
+        write_step(step, self._own_step)
         for part in self.parts:
-            part.serves = self.identity
+            part.program = self.program
+        return step
 
     #: A kind of step of its own, see `write_step`.
     _own_step: Callable[[Step], bool] | None = None
@@ -179,7 +182,7 @@ class ProjectedIntegrator(Integrator):
         """What is held and how closely, the variables, and the steps of the integrator, in words."""
         held = f"constraints of the System to {self.getConstraintTolerance():g} (relative)"
         if self._guard is not None:
-            held += f", {self._guard.constraints.precision}"
+            held += f", {self._guard.precision}"
         elif self.asked_tolerance is None:
             held += ", or what the precision of the Context allows"
         step = "\n".join(f"  {operation}" for operation in self.operations())
@@ -243,13 +246,11 @@ class ProjectedIntegrator(Integrator):
 
     def _take_parts(self) -> None:
         """Parts that have served another integrator since serve this one again."""
-        if all(part.serves is self.identity for part in self.parts):
+        if all(part.program is self.program for part in self.parts):
             return
-        for part, notes in zip(self.parts, self._notes, strict=True):
-            part.serve(self, notes)
-            part.serves = self.identity
+        self._write(Program(self))  # the same as that which the integrator has
         if self._guard is not None:
-            self.take_precision(self._guard.constraints.precision)
+            self.take_precision(self._guard.precision)
             self._guard.started = False
 
     def take_precision(self, precision: Precision) -> None:
@@ -414,19 +415,16 @@ class ProjectedIntegrator(Integrator):
         """
         guard = self._watch(context)
         context = guard.context
-        start, velocities = positions_of(context), velocities_of(context)
+        start, velocities = motion_of(context)
         tolerance = self._tolerance(tolerance)
+        check_finite(start, start, context.getStepCount(), guard.rows.n_rows > 0)
         try:
-            guard.constraints.hold_positions(tolerance)
-            if not all(part.solves_alone for part in self.parts):
-                for part in self.parts:
-                    part.apply_positions(context)
-            elif self.parts:
-                context.setVelocities(np.zeros_like(velocities))
-                self._run_alone(guard, self._step.alone, self._step.alone + 1)
-            guard.constraints.check(positions_of(context), None)
+            guard.hold_positions(tolerance)
             for part in self.parts:
-                guard.certify(part.worst_miss(context, velocities=False))
+                part.apply_positions(context)
+            guard.check_lengths(positions_of(context), None)
+            for part in self.parts:
+                guard.certify(part.worst_violation(context, velocities=False))
         except KconsError:
             context.setPositions(start)
             raise
@@ -445,9 +443,6 @@ class ProjectedIntegrator(Integrator):
         context = guard.context
         velocities, tolerance = velocities_of(context), self._tolerance(tolerance)
         try:
-            if self.parts and all(part.solves_alone for part in self.parts):
-                self._run_alone(guard, self._step.alone, self._step.alone)
-                return
             context.applyVelocityConstraints(tolerance)
             for part in self.parts:
                 part.apply_velocities(context)
@@ -457,32 +452,6 @@ class ProjectedIntegrator(Integrator):
 
     def _tolerance(self, given: float | None) -> float:
         return relative_tolerance(self.getConstraintTolerance() if given is None else given)
-
-    def _run_alone(self, guard: Guard, first: int, end: int) -> None:
-        """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
-        context = guard.context
-        if not guard.started:  # what Forces tell here is not known yet
-            for part in self.parts:
-                part.take_place(self.program, context)
-        time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
-        # Within a call, too: only its own steps begin it.
-        call = self.getGlobalVariableByName("call") if "call" in self.program.numbers else 0.0
-        self.program.push()
-        self.refresh()
-        try:
-            with self._control("first_stage", first), self._control("end_stage", end):
-                openmm.CustomIntegrator.step(self, 1)
-        finally:
-            self.program.write("good_steps", good)
-            self.refresh()
-            if call:
-                self.program.write("call", 1.0)
-            context.setTime(time)
-            context.setStepCount(count)
-        code = int(self.getGlobalVariableByName("failed"))
-        if code:
-            self.program.write("failed", 0.0)
-            raise self._failure(code, count)
 
     def setVelocitiesToTemperature(
         self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None

@@ -1,4 +1,4 @@
-"""One step of an integrator: a function for each kind of step, and what an ensemble puts into it.
+"""One step of an integrator: a function for each kind of step.
 
 What begins and ends a step, and what may be left out of it, goes by a few variables:
 
@@ -12,25 +12,21 @@ What begins and ends a step, and what may be left out of it, goes by a few varia
 - `ending` is 1 in the last step of a call, which sums `motion` for `Guard.look`.
 - `phase` is other than 0 where virtual sites are placed at the end of an execution of the program only: each execution
   is then the part of a step from one force evaluation to the next, and counts on by itself.
-- `first_stage` and `end_stage` are other than 0 and the number of drifts only while constraints are applied outside of
-  steps: then the program starts at a drift without kicks, or behind it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import openmm
 
-from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of, stages_of
-from kcons.steppers.operations import Exchange, Operation
-from kcons.steppers.rattle import Rattle
-from kcons.steppers.splitting import Splitting
+from kcons.openmm.integrator.schemes import stages_of
+from kcons.steppers.operations import Exchange
+from kcons.steppers.splitting import Rattle, Splitting
 
 #: Schemes whose shortest drifts are less than this part of a step: what rounding does to x, divided by the length of
 #: the drift, must be kept out of v there.
@@ -54,8 +50,6 @@ VARIABLES = {
     "kick": Variable("number", "length of a kick as a fraction of the step, with what the last step left out"),
     "ending": Variable("control", "1 in the last step of a call"),
     "motion": Variable("number", "sum of squares of velocities where a call ended"),
-    "first_stage": Variable("control", "0; more to apply the constraints alone, outside of steps"),
-    "end_stage": Variable("control", "where the stages end"),
     "good_steps": Variable("number", "steps done since the integrator was made"),
     "call": Variable("control", "1 where a call of step begins, 2 within it, 0 without Python"),
     "failed": Variable("control", "number of the part whose solve failed, 0 for none"),
@@ -81,192 +75,12 @@ VARIABLES = {
 }
 
 
-def use(program: Program, *names: str, value: float | None = None) -> str:
-    """Declare variables of the list, with another value at the beginning where one is given; returns the last name."""
+def use(program: Program, *names: str) -> str:
+    """Declare variables of the list; returns the last name."""
     for name in names:
         kind, words, first = VARIABLES[name]
-        given = () if kind == "vector" else (first if value is None else value,)
-        getattr(program, kind)(name, words, *given)
+        getattr(program, kind)(name, words, *(() if kind == "vector" else (first,)))
     return names[-1]
-
-
-class Integrator(openmm.CustomIntegrator):
-    """What ensembles and checks may ask of an integrator; `ProjectedIntegrator` answers, and says what each is."""
-
-    scheme: Splitting | None
-    parts: tuple[Part, ...]
-    program: Program
-    row_groups: frozenset[int]
-    spare: bool
-    _guard: Any
-    _watch: Callable[..., Any]
-    take_precision: Callable[..., None]
-    refresh: Callable[[], None]
-    applyConstraints: Callable[..., None]
-    applyVelocityConstraints: Callable[..., None]
-    independent_momenta: Callable[..., int]
-    degrees_of_freedom: Callable[..., int]
-    kinetic_energy: Callable[..., Any]
-
-    @property
-    def ensemble(self) -> Ensemble:
-        raise NotImplementedError
-
-    @property
-    def context(self) -> openmm.Context:
-        raise NotImplementedError
-
-    @property
-    def check_every(self) -> int:
-        raise NotImplementedError
-
-
-class Ensemble:
-    """The kicks of an integrator, and what happens in the middle of its step; this one is Newton's: v += h f/m.
-
-    A value: its attributes never change, two are equal if theirs are, and it may be given to any number of
-    integrators. What changes belongs to the integrator.
-
-    Attributes
-    ----------
-    stays_tangent : bool
-        Whether kicks leave v tangent to all constraints at x: a step that ends with a kick ends without a projection
-        of its own then.
-    adds_up : bool
-        Whether two kicks at the same place, which are one of the sum of their times, are made as one.
-    owes : bool
-        Whether what `close` does may be left to the next step if the state is not read between.
-    noisy : bool
-        Whether it has noise, of size `spread` in the program: the kinetic energy that is reported is then that of
-        `v_middle`, since velocities have the temperature of the bath in the middle of a step only.
-    """
-
-    stays_tangent = adds_up = owes = noisy = False
-
-    # -- what it goes with ----------------------------------------------------------------------
-
-    def check(self, scheme: Splitting | None) -> None:
-        """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
-
-    def check_timestep(self, dt: float) -> None:
-        """Raise `InputError` for a time step (ps) that the ensemble cannot follow."""
-
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
-        """What a step consists of. Where there is an `Exchange`, `middle` writes it."""
-        return operations_of(scheme)
-
-    # -- the program ----------------------------------------------------------------------------
-
-    def declare(self, program: Program) -> None:
-        """Variables and tables."""
-
-    def write(self, step: Step) -> bool:
-        """Write a step of its own kind; False to leave it to `write_step`."""
-        return False
-
-    def open(self, program: Program) -> None:
-        """What comes before the first kick of a step, v tangent to all constraints; also what the last step owes.
-
-        Where constraints are applied alone (`first_stage` is not 0) it must do nothing.
-        """
-
-    def close(self, program: Program) -> None:
-        """What comes at the end of a step, v tangent to all constraints; `behind` says that the next step is to do it.
-
-        Only with `owes`, and where the program has `between`.
-        """
-
-    def take_back(self, program: Program) -> None:
-        """A step failed: variables of the ensemble are again what they were before `open`."""
-
-    def kick(self, step: Step, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
-        """Let the applied forces act for a time.
-
-        For h = 0 nothing but the impulse may be added: so the constraints are applied alone.
-
-        Parameters
-        ----------
-        step : Step
-        h : str
-            Expression of the time.
-        impulse : str
-            Expression that is to be added to v before (that of the drift that came before), or ''.
-        tangent : bool
-            Whether v is tangent before, without the impulse.
-        unseen : bool
-            Whether another kick follows before v is read.
-
-        Returns
-        -------
-        str
-            Expression of the velocities afterwards, which are not yet in v.
-        """
-        return "+".join(filter(None, ["v", impulse, f"{h}*{step.force}/m"]))
-
-    def middle(self, step: Step, u: str) -> None:
-        """Between two halves of the drift: from velocities u, an expression, to v."""
-        raise NotImplementedError
-
-    def drift(self, step: Step, h: str, u: str) -> str:
-        """A drift of length h with velocities u; returns what `Step.drift` does."""
-        return step.flight(h, u)
-
-    # -- a run ----------------------------------------------------------------------------------
-
-    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """At the first step of a run, x and v on the constraints.
-
-        Raises
-        ------
-        KconsError
-            The ensemble does not exist for this System or this start.
-        """
-
-    def verify(self, integrator: Integrator) -> None:
-        """Raise `ConvergenceError` if something went wrong since the last check."""
-
-    def warmth(self, integrator: Integrator) -> float:
-        """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
-        return 1.0
-
-    def settings(self) -> dict[str, float]:
-        """The global variables of the program that are settings of the ensemble, by name."""
-        return {}
-
-    def at(self, temperature: float) -> Ensemble:
-        """The same at another temperature (K)."""
-        raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
-
-    def with_friction(self, friction: Any) -> Ensemble:
-        """The same with another friction (1/ps)."""
-        raise UnsupportedError("there is no friction; give ensemble=Langevin(temperature, friction)")
-
-    def follow(self, integrator: Integrator) -> None:
-        """The integrator takes this ensemble, perhaps in the middle of a run; raise `KconsError` if it cannot."""
-
-    # -- a value --------------------------------------------------------------------------------
-
-    def _keep(self, **attributes: Any) -> None:
-        self.__dict__.update(attributes)
-
-    def __setattr__(self, name: str, value: object) -> None:
-        raise UnsupportedError(
-            f"{self!r} is a value and does not change: call setTemperature or setFriction of the integrator, or make "
-            f"another {type(self).__name__}"
-        )
-
-    def __delattr__(self, name: str) -> None:
-        self.__setattr__(name, None)
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and other.__dict__ == self.__dict__
-
-    def __hash__(self) -> int:
-        return hash((type(self), *self.__dict__.items()))
-
-
-class ConstantEnergy(Ensemble):
-    """Newton's equations."""
 
 
 class Step:
@@ -280,8 +94,6 @@ class Step:
         Its stages as fractions of the step; see `stages_of`.
     halves : bool
         Whether a bath acts between two halves of the only drift.
-    alone : int
-        With parts: number of the stage that is a drift without kicks, for applying constraints outside of steps.
     phases : int
         Executions of the program that a step takes where virtual sites are placed at the end of each only.
     kept : bool
@@ -306,7 +118,6 @@ class Step:
         self.operations = ensemble.operations(scheme)
         self.drifts, self.kicks = stages_of(self.operations)
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
-        self.alone = len(self.drifts) + 1
         self.one_drift = len(self.drifts) == 1 or self.halves
         self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
         self.sited = scheme is not None and any(part.sited for part in self.parts)
@@ -403,7 +214,6 @@ class Step:
     @property
     def ends_tangent(self) -> bool:
         """Whether the last kick leaves v tangent, so that no projection is needed."""
-        # In a loop, the last kick may be left out, where constraints are applied alone.
         return self.ensemble.stays_tangent and self.kicks[-1] != 0 and (not self.parts or self.one_drift)
 
     # -- the kinetic energy that is reported ----------------------------------------------------
@@ -411,16 +221,12 @@ class Step:
     def note_middle(self, velocities: str) -> None:
         """The velocities between the last drift of a step and the kick that ends it."""
         if self.ensemble.noisy:
-            self.program.each("v_middle", self._of_step(velocities, "v_middle"), "its kinetic energy is reported")
+            self.program.each("v_middle", velocities, "its kinetic energy is reported")
 
     def note_end(self) -> None:
         """The step that has this `v_middle` ends."""
         if self.ensemble.noisy:
-            self.program.each("v_end", self._of_step("v", "v_end"), "to see whether others change v")
-
-    def _of_step(self, value: str, kept: str) -> str:
-        """Constraints that are applied alone, outside of steps, leave a variable as it is."""
-        return f"select(first_stage, {kept}, {value})" if self.parts else value
+            self.program.each("v_end", "v", "to see whether others change v")
 
 
 # -- kinds of step --------------------------------------------------------------------------------
@@ -575,15 +381,12 @@ def _joined_step(step: Step) -> None:
 # -- steps that are taken back when a part fails --------------------------------------------------
 
 
-def declare_guards(step: Step, *, shares: bool = True) -> None:
-    """Variables of steps with parts, and their stages; `shares` where drifts have lengths of their own."""
-    p, n = step.program, len(step.drifts)
-    use(p, "failed", "good_steps", "first_stage")
-    use(p, "end_stage", value=n)
-    use(p, "stage", "stale")
-    if shares:
-        p.table("drift_share", [*step.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
-    p.table("kick_share", [*step.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
+def _declare_guards(step: Step) -> None:
+    """Variables of steps with parts, and their stages."""
+    p = step.program
+    use(p, "failed", "good_steps", "stage", "stale")
+    p.table("drift_share", step.drifts, "length of drift k as a fraction of the step")
+    p.table("kick_share", step.kicks, "length of the kick before drift k as a fraction of the step")
     if step.kept or step.lean:
         use(p, "call", "moved")
 
@@ -597,13 +400,10 @@ def see_who_moved(step: Step) -> None:
 
 
 def _guarded_step(step: Step) -> None:
-    """Any scheme with parts. The same program brings positions, or velocities alone, onto the constraints.
-
-    It starts at the last stage of the tables then, a drift without kicks, or behind it.
-    """
+    """Any scheme with parts."""
     p = step.program
     divided = step.sited and step.one_drift
-    declare_guards(step)
+    _declare_guards(step)
     use(p, "h", *["per_h"] * step.one_drift, *["phase"] * divided, "x_last", "v_last")
     if step.kept:
         step.force = use(p, "force")
@@ -622,7 +422,7 @@ def _guarded_step(step: Step) -> None:
 
 def _up_to_forces(step: Step, then: Callable[[Step], None]) -> None:
     p, ensemble = step.program, step.ensemble
-    with p.when("first_stage+abs(failed) = 0", "a step, and nothing failed before"):
+    with p.when("failed = 0", "a step, and nothing failed before"):
         p.let_others_act()
     if step.kept:
         see_who_moved(step)
@@ -647,13 +447,12 @@ def _up_to_forces(step: Step, then: Callable[[Step], None]) -> None:
         p.each("v_last", "v", "to come back to")
         ensemble.open(p)
         if step.kicks[0]:
-            step.kick("dt*kick_share(first_stage)", tangent=True)
-        p.let("stage", "first_stage", "first drift")
+            step.kick("dt*kick_share(0)", tangent=True)
+        p.let("stage", "0", "first drift")
         if step.halves:
-            with p.when("first_stage = 0", "a step"):
-                p.let("h", "dt*drift_share(0)", "length of the first drift")
-                ensemble.middle(step, f"v+{step.drift('h')}")
-                p.let("stage", "1", "what follows")
+            p.let("h", "dt*drift_share(0)", "length of the first drift")
+            ensemble.middle(step, f"v+{step.drift('h')}")
+            p.let("stage", "1", "what follows")
         if step.one_drift:
             _only_drift(step)
         else:
@@ -665,7 +464,7 @@ def _only_drift(step: Step) -> None:
     """One drift needs no loop; set-up takes 15 times as long for each block within a loop."""
     p = step.program
     p.let("per_h", "0", "no drift yet")
-    with p.when("stage < end_stage*step(0.5-failed)", "unless velocities are projected alone"):
+    with p.when("failed = 0", "rows are independent"):
         p.let("h", "dt*drift_share(stage)", "length of the drift")
         impulse = step.drift("h")
         if step.scheme is None:
@@ -676,7 +475,7 @@ def _only_drift(step: Step) -> None:
 
 def _all_drifts(step: Step) -> None:
     p = step.program
-    with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
+    with p.loop(f"stage < {len(step.drifts)}*step(0.5-failed)", "all drifts and kicks of the scheme"):
         p.let("h", "dt*drift_share(stage)", "length of this drift")
         if step.single:
             # From (x-xu)/h, the shortest of many drifts would have most of the digits of v.
@@ -703,9 +502,6 @@ def _kick_after(step: Step, impulse: str = "") -> None:
 def _with_forces(step: Step) -> None:
     p = step.program
     if step.scheme is None:
-        # The leapfrog has velocities of half a step ago, which belong to no x.
-        with p.when("first_stage*step(0.5-failed) != 0", "constraints alone"):
-            step.project()
         with p.when("failed = 0", "the step is good"):
             p.let("good_steps", "good_steps+1", "count it")
     else:
@@ -735,15 +531,14 @@ def _lean_step(step: Step) -> None:
     gradients, and absorbs what they have across. The motion is the same; see notes on RATTLE and leapfrog.
     """
     p = step.program
-    declare_guards(step)
+    _declare_guards(step)
     use(p, "h", "per_h", "x_last", "v_last", "u", "force", "moving", "looked", "behind", "led", "loose")
     for part in step.parts:
         part.lean = True
         part.declare(p)
     with p.when("select(failed, 0, looked) != 0", "x and v may have been changed"):
         p.each("v_last", "v", "to come back to")
-        with p.when("first_stage = 0", "a step"):
-            p.let_others_act()
+        p.let_others_act()
         see_who_moved(step)
     with p.when("failed = 0", "after a failure nothing moves"):
         with p.when("looked != 0", "x and v may have been changed"):
@@ -759,7 +554,7 @@ def _lean_step(step: Step) -> None:
                     part.begin(p)
                 if across:
                     p.each("v", "u", "v again")
-            p.each("u", "v+kick_share(first_stage)*dt*force/m", "the applied forces act (kick)")
+            p.each("u", "v+kick_share(0)*dt*force/m", "the applied forces act (kick)")
         with p.when("looked = 0", "in the middle of many steps"):
             p.let_others_act()
             p.each("x_last", "x", "to come back to")
@@ -768,9 +563,9 @@ def _lean_step(step: Step) -> None:
                 part.renew(p)
         p.let("stale", "0", "what is kept belongs to x")
         p.let("led", "behind", "for multipliers")
-        p.let("stage", "first_stage", "the drift")
+        p.let("stage", "0", "the drift")
         p.let("per_h", "0", "no drift yet")
-        with p.when("stage < end_stage*step(0.5-failed)", "unless velocities are projected alone"):
+        with p.when("failed = 0", "rows are independent"):
             p.let("h", "dt*drift_share(stage)", "length of the drift")
             for part in step.parts:
                 part.remember(p)

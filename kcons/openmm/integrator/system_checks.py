@@ -7,7 +7,7 @@ velocities, independently of it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +19,8 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.integrator.ensemble import Integrator
 from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.steps import Integrator
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 
@@ -287,21 +287,6 @@ def refuse_forgotten_parts(system: openmm.System, row_groups: Iterable[int]) -> 
             )
 
 
-def refuse_motion_remover(system: openmm.System, kind: str) -> None:
-    """Refuse a CMMotionRemover beside rows that hold particles in space.
-
-    Raises
-    ------
-    UnsupportedError
-        There is one: it takes away a momentum that such rows give.
-    """
-    if removes_centre_of_mass_motion(system):
-        raise UnsupportedError(
-            f"{kind} holds particles in space, and the CMMotionRemover of the System moves them; remove it, or create "
-            "the System with removeCMMotion=False"
-        )
-
-
 def check_system(system: openmm.System) -> None:
     """Refuse Systems that a CustomIntegrator of kicks and drifts cannot propagate.
 
@@ -396,40 +381,52 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     return late
 
 
-def refuse_barostat(context: openmm.Context, rows: Iterable[Sequence[int]], kind: str) -> None:
-    """Refuse a barostat that would break rows: it moves molecules as wholes, each by a vector of its own.
+def refuse_agents(
+    system: openmm.System,
+    bound: str | None,
+    rows: Iterable[tuple[IntArray, Callable[[int], str]]] = (),
+    molecules: Callable[[], Iterable[Sequence[int]]] = tuple,
+) -> None:
+    """Refuse what moves particles off rows between steps: barostats, and a CMMotionRemover.
 
     Parameters
     ----------
-    context : openmm.Context
-    rows : iterable of sequences of int
-        The particles of each row. A row on one particle only is taken to hold it in space.
-    kind : str
-        What the rows are called.
+    system : openmm.System
+    bound : str, optional
+        A row that holds particles in space.
+    rows : iterable of (ndarray of int of shape (n, width), function)
+        The particles of rows of one kind, and their names by number.
+    molecules : callable
+        The molecules, which barostats move as wholes, each by a vector of its own.
 
     Raises
     ------
     UnsupportedError
-        There is a barostat, and a row holds particles of several molecules together or one in space.
     """
-    names = {type(force).__name__ for force in forces_of(context.getSystem())} & BAROSTATS
-    if not names:
-        return
-    rows = list(rows)
-    if rows and any(_scales_atoms(force) for force in forces_of(context.getSystem())):
-        raise UnsupportedError(f"{kind} is held, and {_ATOM_BY_ATOM}")
-    molecule = np.empty(context.getSystem().getNumParticles(), dtype=np.int64)
-    for number, members in enumerate(context.getMolecules()):
-        molecule[list(members)] = number
-    for row in rows:
-        atoms = [int(a) for a in row]
-        if len(atoms) < 2 or len(set(molecule[atoms].tolist())) > 1:
-            what = "holds a particle in space" if len(atoms) < 2 else "holds particles of several molecules together"
+    for force in forces_of(system):
+        name = type(force).__name__
+        moves = isinstance(force, openmm.CMMotionRemover)
+        if bound is not None and (moves or name in BAROSTATS):
+            what = "shifts all velocities" if moves else "moves molecules"
             raise UnsupportedError(
-                f"{kind} on particles {', '.join(map(str, atoms[:6]))}{', ...' if len(atoms) > 6 else ''} {what}; "
-                f"{names.pop()} moves whole molecules and would break it. Run at constant volume, or join the "
-                "molecules by bonds of no strength"
+                f"{name} {what}, and {bound} holds particles in space, so that momentum is not conserved: take it out "
+                "of the System (createSystem(..., removeCMMotion=False)), or hold differences of positions only"
             )
+        if name not in BAROSTATS:
+            continue
+        if _scales_atoms(force):
+            raise UnsupportedError(f"rows are held, and {_ATOM_BY_ATOM}")
+        label = np.empty(system.getNumParticles(), dtype=np.int64)
+        for number, members in enumerate(molecules()):
+            label[list(members)] = number
+        for atoms, name_of in rows:
+            apart = (label[atoms] != label[atoms[:, :1]]).any(axis=1)
+            if apart.any():
+                raise UnsupportedError(
+                    f"{name} moves molecules apart, but row {name_of(int(np.argmax(apart)))} holds atoms of several; "
+                    "let them count as one molecule by hold(system, ..., join=True) or by bonds of no strength, or run "
+                    "at constant volume"
+                )
 
 
 #: Relative difference of two temperatures that is taken for rounding.

@@ -65,7 +65,6 @@ class QuadricRows(SurfaceRows):
     """
 
     circles = False
-    written = (*SurfaceRows.written, "circles", "_a")
     #: Name of A in the program, the curvature along the kept gradient; where velocities are tangent, the level.
     _a = "s_a"
 
@@ -117,6 +116,10 @@ class QuadricRows(SurfaceRows):
         return f"(-s_s/(s_b{self._safe}+sqrt(max(0, s_b*s_b-{self._a}*s_s))))"
 
     # -- the program ----------------------------------------------------------------------------
+
+    def begin_program(self, code: int) -> None:
+        super().begin_program(code)
+        self.circles, self._a = False, "s_a"
 
     def declare(self, program: Program) -> None:
         p = program

@@ -13,14 +13,16 @@ from openmm import unit
 from kcons.constraints import MovingTarget, Torus
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
+from kcons.openmm.integrator.system_checks import require_context
 from kcons.openmm.quantities import accepted, nanometers
+from kcons.openmm.states import forces_at, motion_of
 from kcons.openmm.surfaces.closed_forms import QUADRICS, CompiledQuadricRows, QuadricRows, TorusRows
 from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
-from kcons.openmm.surfaces.surface_rows import CARRIER, SurfaceRows, engine, positions_and_velocities, refuse_system
+from kcons.openmm.surfaces.surface_rows import CARRIER, SurfaceRows, engine, refuse_system
 from kcons.openmm.surfaces.surface_steps import surface_step
 from kcons.steppers import Splitting
 
@@ -160,28 +162,8 @@ class SurfaceIntegrator(ProjectedIntegrator):
             super()._run(guard, steps, ends)
         except NonFiniteError:
             # A force that is not finite is seen in the step after the one whose velocities it has spoilt.
-            if not all(np.isfinite(array).all() for array in positions_and_velocities(guard.context)):
+            if not all(np.isfinite(array).all() for array in motion_of(guard.context)):
                 guard.put_back()
-            raise
-
-    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
-        """Bring positions onto all constraints: those of the System by OpenMM, surfaces by `apply_positions`.
-
-        Raises
-        ------
-        KconsError
-            They cannot be reached from here; positions are unchanged.
-        """
-        if len(self.surfaces) < len(self.parts):
-            super().applyConstraints(context, tolerance)
-            return
-        context = self._watch(context).context
-        start, _ = positions_and_velocities(context)
-        context.applyConstraints(self._tolerance(tolerance))
-        try:
-            self.apply_positions(context)
-        except KconsError:
-            context.setPositions(start)
             raise
 
     # -- the state of a context -----------------------------------------------------------------
@@ -190,31 +172,6 @@ class SurfaceIntegrator(ProjectedIntegrator):
     def surface_atoms(self) -> IntArray:
         """Particles on surfaces, in the order of `multipliers`, shape (n_rows,)."""
         return np.concatenate([part.atoms for part in self.surfaces])
-
-    def rank(self, context: openmm.Context) -> int:
-        """Degrees of freedom taken by surfaces and other parts, beyond the constraints of the System."""
-        return sum(part.rank(context) for part in self.parts)
-
-    def apply_positions(self, context: openmm.Context) -> None:
-        """Move each particle to the nearest point of its surface.
-
-        Raises
-        ------
-        ConvergenceError
-            A particle finds no surface; nothing was moved.
-        """
-        x, _ = positions_and_velocities(context)
-        try:
-            for part in self.surfaces:
-                part.apply_positions(context)
-        except KconsError:
-            context.setPositions(x)
-            raise
-
-    def apply_velocities(self, context: openmm.Context) -> None:
-        """Take away what velocities have across the surfaces."""
-        for part in self.surfaces:
-            part.apply_velocities(context)
 
     def multipliers(self, context: openmm.Context) -> FloatArray:
         """lambda of each row, exact at the present state; kJ/mol/nm where the coordinate is a length in nm.
@@ -233,10 +190,10 @@ class SurfaceIntegrator(ProjectedIntegrator):
 
     def _dynamics(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Positions of all particles; velocities and applied forces of those on surfaces."""
-        x, v = positions_and_velocities(context)
-        f = context.getState(forces=True, groups=self.getIntegrationForceGroups()).getForces(asNumpy=True)
+        require_context(context)
+        x, v = motion_of(context)
         atoms = self.surface_atoms
-        return x, v[atoms], np.array(f.value_in_unit(unit.kilojoule_per_mole / unit.nanometer))[atoms]
+        return x, v[atoms], forces_at(context, self.getIntegrationForceGroups())[atoms]
 
 
 def _all_atoms(given: Sequence[AnySurface], n: int) -> IntArray:

@@ -15,10 +15,11 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.integrator.part import BOND, NEAR, Miss, Part
+from kcons.openmm.integrator.part import BOND, NEAR, Part, Violation
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import require_context
+from kcons.openmm.integrator.system_checks import refuse_agents, require_context
 from kcons.openmm.quantities import masses_of
+from kcons.openmm.states import motion_of, positions_of
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
 START_TOLERANCE = 1e-6
@@ -41,7 +42,6 @@ class SurfaceRows(Part):
         Whether the System may have constraints of its own, on other particles.
     """
 
-    solves_alone = True
     bonded = True
     #: Whether `fly_alone` moves x before it needs the velocity of the drift for the last time.
     moves = False
@@ -109,7 +109,7 @@ class SurfaceRows(Part):
         slopes = np.concatenate([item.gradient(x[item.atoms], 0.0)[:, 0] for item in self.rows])
         return np.asarray(slopes / np.sqrt(np.einsum("ij,ij->i", slopes, slopes))[:, None])
 
-    def take_place(self, program: Program, context: openmm.Context) -> None:
+    def attach(self, program: Program, context: openmm.Context) -> None:
         """Refuse another number of particles than the variables of the program have."""
         found = context.getSystem().getNumParticles()
         if found != self.n_particles:
@@ -125,7 +125,8 @@ class SurfaceRows(Part):
         And `UnsupportedError` for a System that surfaces do not go with.
         """
         refuse_system(context.getSystem(), self.atoms)
-        x, v = positions_and_velocities(context)
+        require_context(context)
+        x, v = motion_of(context)
         first = 0
         for item in self.rows:
             item.check(x[item.atoms], 0.0, first)
@@ -133,29 +134,32 @@ class SurfaceRows(Part):
         miss = self._worst(x, v if velocities else None)
         if miss is None:
             return
-        off = f"is {abs(miss.off):.3g} nm from its surface, {miss.name}; move it there with integrator.apply_positions("
+        off = (
+            f"is {abs(miss.off):.3g} nm from its surface, {miss.name}; move it there with integrator.applyConstraints("
+        )
         off += "context). (Surfaces are not repeated in periodic boxes: positions must not be wrapped)"
         if miss.what == "velocities":
             off = f"has the velocity {abs(miss.off):.3g} nm/ps across its surface, {miss.name}; call "
-            off += "integrator.apply_velocities(context) after velocities are set"
+            off += "integrator.applyVelocityConstraints(context) after velocities are set"
         raise InputError(f"particle {miss.atoms[0]} {off}", item=miss.what, atoms=miss.atoms)
 
-    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+    def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
         """Distances from the surfaces and velocities across them, by the objects that were given."""
-        x, v = positions_and_velocities(context)
+        require_context(context)
+        x, v = motion_of(context)
         return self._worst(x, v if velocities else None)
 
-    def _worst(self, x: FloatArray, v: FloatArray | None) -> Miss | None:
+    def _worst(self, x: FloatArray, v: FloatArray | None) -> Violation | None:
         allowed = START_TOLERANCE * np.maximum(1.0, np.abs(x[self.atoms]).max(axis=1))
         near = NEAR * np.concatenate([_length(item) for item in self.rows])
-        miss = Miss.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of, near)
+        miss = Violation.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of, near)
         if miss is not None or v is None:
             return miss
         held = v[self.atoms]
         across = np.einsum("ij,ij->i", self.normals(x), held)
         speed = np.sqrt(np.einsum("ij,ij->i", held, held))
         allowed = START_TOLERANCE * np.maximum(speed, np.abs(v).max())
-        return Miss.worst("velocities", across, allowed, self.row_name, self._atoms_of)
+        return Violation.worst("velocities", across, allowed, self.row_name, self._atoms_of)
 
     def _atoms_of(self, row: int) -> list[int]:
         return [int(self.atoms[row])]
@@ -168,7 +172,8 @@ class SurfaceRows(Part):
         ConvergenceError
             An atom finds no surface; nothing was moved.
         """
-        x, _ = positions_and_velocities(context)
+        require_context(context)
+        x = positions_of(context)
         x[self.atoms] = engine(context, [self], x).restore_positions(x[self.atoms])
         miss = self._worst(x, None)
         if miss is not None:
@@ -182,13 +187,15 @@ class SurfaceRows(Part):
 
     def apply_velocities(self, context: openmm.Context) -> None:
         """Take away what velocities have across the surfaces."""
-        x, v = positions_and_velocities(context)
+        require_context(context)
+        x, v = motion_of(context)
         v[self.atoms] = engine(context, [self], x).project_velocities(x[self.atoms], v[self.atoms])
         context.setVelocities(v)
 
     def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
         """The engine for these atoms, and their positions."""
-        x, _ = positions_and_velocities(context)
+        require_context(context)
+        x = positions_of(context)
         return engine(context, [self], x), x[self.atoms]
 
     def rank(self, context: openmm.Context) -> int:
@@ -230,15 +237,6 @@ def _length(item: Constraint) -> FloatArray:
     return np.where(radius > 0, radius, BOND)
 
 
-def positions_and_velocities(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
-    """In nm and nm/ps, as they are (not wrapped), shape (n_particles, 3) each."""
-    require_context(context)
-    state = context.getState(positions=True, velocities=True)
-    x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-    v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
-    return np.array(x, dtype=np.float64), np.array(v, dtype=np.float64)
-
-
 def engine(context: openmm.Context, parts: Sequence[SurfaceRows], x: FloatArray) -> Motion:
     """The solver of kcons for the atoms of these parts alone, in their order, at positions x of all particles."""
     system, atoms = context.getSystem(), np.concatenate([part.atoms for part in parts])
@@ -263,13 +261,4 @@ def refuse_system(system: openmm.System, atoms: IntArray) -> None:
             raise UnsupportedError(
                 f"particle {atom} has no mass and is not moved by integrators: it cannot be held on a surface"
             )
-    for force in system.getForces():
-        if "Barostat" in type(force).__name__:
-            raise UnsupportedError(
-                f"{type(force).__name__} scales positions, but surfaces stay where they are: remove the barostat"
-            )
-        if isinstance(force, openmm.CMMotionRemover):
-            raise UnsupportedError(
-                "CMMotionRemover shifts all velocities, but momentum is not conserved on surfaces; remove that force "
-                "(createSystem(..., removeCMMotion=False))"
-            )
+    refuse_agents(system, "a surface")

@@ -7,10 +7,11 @@ rounding grows as 1/h.
 
 from __future__ import annotations
 
-from kcons.openmm.integrator.steps import ConstantEnergy, Step, declare_guards, see_who_moved, use
+from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.steps import Step, see_who_moved, use
 from kcons.openmm.surfaces.closed_forms import QuadricRows
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
-from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Rattle
 
 
 def surface_step(step: Step) -> bool:
@@ -30,19 +31,22 @@ def surface_step(step: Step) -> bool:
     if circles is not None and step.scheme is not None:
         circles.circles = True
         step.drifts, step.kicks = _without_flight(step.drifts, step.kicks, len(step.scheme.flight))
-        step.alone = len(step.drifts) + 1
     # x and v stay as they are until the only landing of the step is known: nothing to come back to.
     untouched = isinstance(step.scheme, Rattle) and not step.kept and circles is None
     use(p, "between")
-    declare_guards(step, shares=not untouched)
-    use(p, *["behind", "kick"] if untouched else ["h", "x_last", "v_last"], *["xu"] * bonded)
+    use(p, "failed", "good_steps", "stale", *["call", "moved"] * step.kept, *["xu"] * bonded)
+    if untouched:
+        use(p, "behind", "kick")
+    else:
+        use(p, "stage", "h", "x_last", "v_last")
+        p.table("drift_share", step.drifts, "length of drift k as a fraction of the step")
+        p.table("kick_share", step.kicks, "length of the kick before drift k as a fraction of the step")
     if step.kept:
         step.force = use(p, "force")
     for part in surfaces:
         part.declare(p)
-    # As for other parts, `first_stage` makes the program bring positions, or velocities alone, onto surfaces. Blocks
-    # are few: OpenMM follows every way through them when a Context is made.
-    with p.when("first_stage+abs(failed) = 0", "a step, and nothing failed before"):
+    # Blocks are few: OpenMM follows every way through them when a Context is made.
+    with p.when("failed = 0", "nothing failed before"):
         p.let_others_act()
     if step.kept:
         see_who_moved(step)
@@ -66,7 +70,7 @@ def surface_step(step: Step) -> bool:
         with p.when("select(failed, 0, between) = 0", "somebody looks at the velocities"):
             # Otherwise the next drift absorbs what they have across the surfaces.
             if untouched:
-                p.let("kick", "select(failed, 0.5*behind, kick_share(stage))", "what they lack")
+                p.let("kick", "select(failed, 0.5*behind, 0.5)", "what they lack")
                 p.each("v", "select(kick, v+kick*dt*f/m, v)", "the rest of the kick")
             step.project()
         if untouched:
@@ -87,23 +91,20 @@ def _circles(step: Step, bonded: bool) -> QuadricRows | None:
 
 def _one_drift(step: Step, surfaces: list[SurfaceRows], bonded: bool) -> None:
     p = step.program
-    p.let("stage", "first_stage", "the drift, or constraints alone")
-    with p.when("stage < end_stage", "a drift"):
-        p.let("kick", "select(behind, 1, kick_share(first_stage))", "with the half kick that is missing")
-        u = "v+kick*dt*f/m"  # x and v stay until the landing is known
-        if any(part.moves for part in surfaces):
-            p.each(use(p, "u"), u, "kick")
-            u = "u"
-        _fly(step, surfaces, bonded, u if u == "u" else f"({u})", "dt")
-        p.let("stage", "stage+1", "what follows")
+    p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
+    u = "v+kick*dt*f/m"  # x and v stay until the landing is known
+    if any(part.moves for part in surfaces):
+        p.each(use(p, "u"), u, "kick")
+        u = "u"
+    _fly(step, surfaces, bonded, u if u == "u" else f"({u})", "dt")
 
 
 def _drifts(step: Step, surfaces: list[SurfaceRows], bonded: bool, circles: QuadricRows | None) -> None:
     p = step.program
     if step.kicks[0]:
-        p.each("v", f"v+dt*kick_share(first_stage)*{step.force}/m", "kick")
-    p.let("stage", "first_stage", "first drift")
-    with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
+        p.each("v", f"v+dt*kick_share(0)*{step.force}/m", "kick")
+    p.let("stage", "0", "first drift")
+    with p.loop(f"stage < {len(step.drifts)}*step(0.5-failed)", "all drifts and kicks of the scheme"):
         p.let("h", "dt*drift_share(stage)", "length of this drift")
         if circles is not None:
             circles.circle(p, "h")

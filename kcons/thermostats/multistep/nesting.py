@@ -16,8 +16,8 @@ from typing import Literal
 
 from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError
-from kcons.steppers.compositions import SUZUKI_4
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
+from kcons.steppers.splitting import SUZUKI_4
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.

@@ -365,10 +365,8 @@ class Barostat:
                 f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
                 "atoms overlap, or the force field returns what is no energy"
             )
-        numbers, attempt = (
-            noise_generator((self.seed, 1), state.step),
-            Attempt(system, pieces, state, thermal_energy, dt),
-        )
+        numbers = noise_generator((self.seed, 1), state.step)
+        attempt = Attempt(system, pieces, state, thermal_energy, dt)
         trial, drawn = self._trial(attempt, before, numbers), numbers.random()
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)

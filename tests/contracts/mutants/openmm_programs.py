@@ -57,8 +57,8 @@ MUTANTS = [
     ),
     (
         "constraints/constraint.py",
-        "if self.squared and not (target > 0).all():",
-        "if not self.squared and not (target > 0).all():",
+        "if self.positive and not (target > 0).all():",
+        "if not self.positive and not (target > 0).all():",
         "tests/constraints/test_target.py::test_a_distance_that_moves_below_zero_is_refused_there",
     ),
     (
@@ -171,20 +171,20 @@ MUTANTS = [
     ),
     (
         "openmm/ensembles/langevin_ensemble.py",
-        "sqrt(2*kT*kept_share*sinh(friction*dt))",
-        "sqrt(kT*kept_share*sinh(friction*dt))",
+        "sqrt(2*kT*kept_share*sinh(friction*{h}))",
+        "sqrt(kT*kept_share*sinh(friction*{h}))",
         "tests/openmm/ensembles/test_langevin_ensemble.py",
     ),
     (
         "openmm/surfaces/surface_steps.py",
-        '"select(behind, 1, kick_share(first_stage))"',
-        '"kick_share(first_stage)"',
+        '"0.5+0.5*behind"',
+        '"0.5"',
         "tests/openmm/surfaces/test_surface_steps.py",
     ),
     (
         "openmm/surfaces/surface_steps.py",
-        '"select(failed, 0.5*behind, kick_share(stage))"',
-        '"kick_share(stage)"',
+        '"select(failed, 0.5*behind, 0.5)"',
+        '"0.5"',
         "tests/openmm/surfaces/test_surface_integrator.py::test_a_first_step_without_solution_leaves_velocities_without_a_kick",
     ),
     (
@@ -195,15 +195,15 @@ MUTANTS = [
     ),
     (
         "openmm/integrator/projected.py",
-        "            part.serve(self, notes)\n",
-        "",
+        "        self._write(Program(self))",
+        "        # self._write(Program(self))",
         "tests/openmm/integrator/test_part.py::test_integrators_in_turn_hold_the_same_part",
     ),
     (
         "openmm/integrator/system_checks.py",
-        "if rows and any(_scales_atoms",
-        "if not rows and any(_scales_atoms",
-        "tests/openmm/integrator/test_projected.py::test_barostat_and_rows_between_molecules",
+        "        if _scales_atoms(force):",
+        "        if not rows and _scales_atoms(force):",
+        "tests/openmm/integrator/test_projected.py::test_what_moves_particles_off_rows_is_refused",
     ),
     (
         "openmm/ensembles/conserved_momenta.py",
@@ -243,8 +243,8 @@ MUTANTS = [
     ),
     (
         "openmm/integrator/projected.py",
-        "            part.forget()\n",
-        "",
+        "            part.begin_program(k)\n",
+        "            part.code = k\n",
         "tests/openmm/surfaces/test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
     ),
     (
@@ -267,7 +267,7 @@ MUTANTS = [
     ),
     (
         "openmm/integrator/guard.py",
-        "self._left == (context.getStepCount(), _box(context))",
+        "self._left == (context.getStepCount(), box_of(context))",
         "True",
         "tests/openmm/integrator/test_rattle_integrator.py::test_change_of_the_box",
     ),

@@ -353,12 +353,3 @@ def test_the_program_says_what_it_does():
     listing = peptide()[1].listing()
     for words in ("solve for positions", "solve for velocities", "positions whose gradients are taken"):
         assert f"carried rows: {words}" in listing
-
-
-def test_coordinates_far_from_the_origin_are_warned_of():
-    x = 1e6 + np.eye(2, 3)
-    part = hold(system := free([12.0] * 2), Distance([[0, 1]]), x)
-    context = started(context_of(system, ProjectedIntegrator(0.01, parts=[part])), x)
-    with pytest.warns(UserWarning, match="nm from the origin"):
-        part.check(context)
-    part.check(context)  # once

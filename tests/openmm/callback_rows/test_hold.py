@@ -195,9 +195,13 @@ def barostat():
     ("rows", "force", "words"),
     [
         (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #6 Distance\(0, 3\).*join=True"),
-        (Plane([6], [0, 0, 1]), barostat(), "ties atoms to a place"),
+        (Plane([6], [0, 0, 1]), barostat(), "holds particles in space"),
         (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
-        (Distance([[6, 7]]), openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False), "setScaleMoleculesAsRigid"),
+        (
+            Distance([[6, 7]]),
+            openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False),
+            "let it scale molecules as rigid",
+        ),
     ],
     ids=["between molecules", "place", "momentum", "scaled atoms"],
 )

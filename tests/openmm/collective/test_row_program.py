@@ -103,29 +103,6 @@ def test_order_with_bonds_and_dihedrals(scheme, order, constraints):
     assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
 
 
-# A step of blanes-moan6 consists of 99 drifts, some of which last 1e-5 ps only.
-@pytest.mark.parametrize(
-    ("scheme", "steps", "platform"),
-    [
-        ("rattle", 50, "CPU"),
-        ("rattle", 50, "Reference"),
-        ("suzuki4", 20, "Reference"),
-        ("blanes-moan6", 5, "Reference"),
-    ],
-)
-def test_reversible(platform, scheme, steps):
-    context, integrator, _ = dipeptide(platform=platform, scheme=scheme)
-    x, v = state_of(context)
-    energy = energy_of(context, integrator)
-    integrator.step(steps)
-    assert abs(energy_of(context, integrator) - energy) < 0.5  # kJ/mol; the kinetic energy is about 60
-    context.setVelocities(-state_of(context)[1])
-    integrator.step(steps)
-    back, turned = state_of(context)
-    assert np.abs(back - x).max() <= 1e-12
-    assert np.abs(turned + v).max() <= 1e-9
-
-
 # -- moving targets -------------------------------------------------------------------------------------
 
 

@@ -7,10 +7,7 @@ import openmm
 import pytest
 from ensemble_runs import (
     in_calls_of_any_length,
-    on_their_rows,
     run,
-    three_on_a_sphere,
-    three_parts,
     twice_kinetic,
     warm,
 )
@@ -31,8 +28,8 @@ from openmm_systems import (
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
 from kcons.constraints import Distance
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, SurfaceIntegrator, hold
+from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import Isokinetic as CoreIsokinetic
 
@@ -68,30 +65,6 @@ def test_one_bond_as_the_core_stepper(scheme):
         r, u = state_of(context)
         assert np.abs(r - state.positions).max() <= limit
         assert np.abs(u - state.velocities).max() <= 100 * limit
-
-
-#: System, time, reference steps, and the numbers of steps of each scheme. In many small steps velocities, which are
-#: differences of positions, are rounding: order 6 shows on the dumbbell only.
-RUNS = {
-    "dumbbell": (0.4, 64, {"rattle": (64, 128, 256), "isokinetic4": (16, 24, 32), "isokinetic6": (16, 20, 24)}),
-    "alanine": (0.016, 24, {"rattle": (16, 32, 64), "isokinetic4": (8, 12, 16)}),
-}
-
-
-@pytest.mark.parametrize(("name", "scheme"), [(name, scheme) for name, run in RUNS.items() for scheme in run[2]])
-def test_order(name, scheme):
-    """Slope of the error at fixed time: a bond in a field, and alanine dipeptide with all bonds held."""
-    system, x, v = dumbbell() if name == "dumbbell" else alanine()
-    span, many, runs = RUNS[name]
-
-    def end(scheme, n):
-        integrator = ProjectedIntegrator(span / n * unit.picosecond, scheme, tolerance=1e-14, ensemble=Isokinetic())
-        return state_of(run(system, integrator, x, v, n))[0]
-
-    exact = end("isokinetic6", many)
-    errors = [np.abs(end(scheme, n) - exact).max() for n in runs[scheme]]
-    slope = -np.polyfit(np.log(runs[scheme]), np.log(errors), 1)[0]
-    assert slope == pytest.approx(ORDERS[scheme], abs=0.15)
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
@@ -347,56 +320,6 @@ def test_gpus_wait_for_two_sums_a_step(platform):
 
 
 # -- isokinetic: with what is held -------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
-def test_parts_keep_their_rows_and_the_kinetic_energy(scheme):
-    system, x, parts = three_parts()
-    ensemble = Isokinetic(300.0)
-    integrator = ProjectedIntegrator(1e-3, scheme, parts=parts, ensemble=ensemble)
-    context = warm(system, integrator, x, 4)
-    for block in range(4):
-        integrator.step(20)
-        integrator.check()
-        r, u = on_their_rows(*state_of(context))
-        # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
-        assert abs(twice_kinetic(system, u) / ((18 - 3 - 1) * GAS_CONSTANT * 300) - 1) <= 1e-13
-        if block == 1:  # somebody moves x between steps
-            context.setPositions(r + 0.0)
-            integrator.applyConstraints(context)
-    with pytest.raises(UnsupportedError, match="multipliers_at"):
-        parts[1].multipliers(integrator)
-    with pytest.raises(InputError, match="constant energy"):
-        parts[0].step_multipliers()
-
-
-def test_rows_that_are_carried_move_as_those_of_the_system():
-    """The same bonds held by OpenMM and by kcons: one trajectory, although others move x in between."""
-    system, x, v = loose_alanine()
-    other = copy.deepcopy(system)
-    carried = hold(other, [], positions=x, take="all")
-    ends = []
-    for this, parts in ((system, ()), (other, (carried,))):
-        ensemble = Isokinetic(300.0, momentum="free")
-        integrator = ProjectedIntegrator(1e-3, parts=parts, tolerance=1e-13, ensemble=ensemble)
-        context = run(this, integrator, x, v, 10)
-        r, u = state_of(context)
-        context.setPositions(r + 0.7)
-        context.setVelocities(u)
-        integrator.step(10)
-        ends.append(state_of(context))
-    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
-    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
-
-
-def test_surfaces_alone():
-    system, x, spheres = three_on_a_sphere()
-    integrator = SurfaceIntegrator(1e-3, surfaces=spheres, system=system, ensemble=Isokinetic(300.0))
-    context = warm(system, integrator, x, 1)
-    integrator.step(100)
-    r, u = state_of(context)
-    np.testing.assert_allclose(np.linalg.norm(r, axis=1), 0.5, atol=1e-14)
-    assert abs(twice_kinetic(system, u) / (5 * GAS_CONSTANT * 300) - 1) <= 1e-13
 
 
 def test_leapfrog_keeps_the_kinetic_energy_of_half_steps():

@@ -202,11 +202,11 @@ def test_rows_that_are_near_are_put_right_in_the_first_step(make, off, near, cap
     integrator = ProjectedIntegrator(1e-3, parts=[part])
     context = started(system, integrator, x, v)
     if near:
-        assert part.worst_miss(context, velocities=False).near
+        assert part.worst_violation(context, velocities=False).near
         with caplog.at_level("WARNING", logger="kcons.openmm"):
             integrator.step(1)
         assert "the start was put right: the positions are off row" in caplog.text
-        assert part.worst_miss(context) is None
+        assert part.worst_violation(context) is None
         assert np.abs(state_of(context)[0] - x).max() < 3 * off
         return
     with pytest.raises(KconsError, match=r"call restore|apply_positions"):
@@ -371,13 +371,13 @@ def test_positions_rounded_to_single_numbers_are_excused_where_few_molecules_cro
     given = x.copy()
     given[: 2 * crossed] = inside[: 2 * crossed].astype(np.float32) - seen
     assert integrator.context is context
-    watch = integrator._guard.constraints
+    watch = integrator._guard
     assert (np.abs(watch.rows.stretches(given)) > watch.limit(given))[:crossed].all()
     if refused:
         with pytest.raises(ConvergenceError):
-            watch.check(given, 1)
+            watch.check_lengths(given, 1)
     else:
-        watch.check(given, 1)
+        watch.check_lengths(given, 1)
 
 
 def external(n):

@@ -10,12 +10,12 @@ from openmm_systems import started, state_of
 
 from kcons.constraints import Distance
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
-from kcons.openmm.integrator.part import Miss, Part
+from kcons.openmm.integrator.part import Part, Violation
 from kcons.openmm.integrator.program import Program
 
 
 def worst(off, allowed, near=0.0):
-    return Miss.worst("positions", np.array(off), allowed, lambda k: f"row {k}", lambda k: [k, k + 1], near)
+    return Violation.worst("positions", np.array(off), allowed, lambda k: f"row {k}", lambda k: [k, k + 1], near)
 
 
 def test_the_worst_is_relative_to_what_is_allowed():

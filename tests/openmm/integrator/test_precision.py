@@ -332,7 +332,7 @@ def check_parts(held, scheme, platform):
         limit = exact if precision.name == "double" else 2e-6
         off = part.residuals(context) if held is rows_of_two_kinds else part.distances(y)
         assert np.abs(off).max() < limit
-        assert part.worst_miss(context, velocities=scheme != "leapfrog") is None
+        assert part.worst_violation(context, velocities=scheme != "leapfrog") is None
 
 
 @pytest.mark.parametrize("held, scheme, platform", cases_of(True))
@@ -529,7 +529,7 @@ def check_beside_water(kind, options, platform):
     integrator.applyVelocityConstraints(context)
     integrator.step(20)
     integrator.check()
-    assert part.worst_miss(context, velocities=False) is None
+    assert part.worst_violation(context, velocities=False) is None
 
 
 @pytest.mark.parametrize("kind, options, platform", beside_water_on_gpus(True))

@@ -96,9 +96,8 @@ def test_listings_are_complete(kind):
 def test_variables_are_declared_as_the_list_says():
     program = Program(openmm.CustomIntegrator(1e-3))
     assert use(program, "failed", "stale", "coarse", "xu") == "xu"
-    use(program, "end_stage", value=3)
-    assert program.numbers == {"failed": 0.0, "stale": 1.0, "coarse": 0.0, "end_stage": 3.0}
-    assert program.idle == {"failed": 0.0, "end_stage": 3.0}
+    assert program.numbers == {"failed": 0.0, "stale": 1.0, "coarse": 0.0}
+    assert program.idle == {"failed": 0.0}
     assert program.settings == {"coarse": 0.0}
     assert set(program.vectors) == {"xu"}
     with pytest.raises(KeyError):

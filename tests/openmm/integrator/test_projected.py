@@ -26,7 +26,7 @@ from openmm_systems import (
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Isokinetic, ProjectedIntegrator
-from kcons.openmm.integrator.system_checks import refuse_barostat
+from kcons.openmm.integrator.system_checks import refuse_agents
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 PS = unit.picosecond
@@ -111,28 +111,42 @@ def test_barostat_with_a_part_that_keeps_forces():
     assert integrator.getGlobalVariableByName("worst_gap") == 0
 
 
-def test_barostat_and_rows_between_molecules():
+def test_what_moves_particles_off_rows_is_refused():
     system, x = water_box(64)
-    integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x)
-    refuse_barostat(context, [[0, 3], [5]], "a distance")  # no barostat
+    molecules = started(system, integrator := ProjectedIntegrator(1e-3), x).getMolecules
+
+    def refuse(*atoms, bound=None):
+        refuse_agents(system, bound, [(np.array([each]), "number {}".format) for each in atoms], molecules)
+
+    refuse([0, 3], [5], bound="a plane")  # no barostat
     system.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
-    context = started(system, again := ProjectedIntegrator(1e-3), x)
-    refuse_barostat(context, [[0, 1], [3, 4, 5]], "a distance")
-    with pytest.raises(UnsupportedError, match=r"a distance on particles 0, 3 .*several molecules.*MonteCarloBarostat"):
-        refuse_barostat(context, [[0, 1], [0, 3]], "a distance")
-    with pytest.raises(UnsupportedError, match="in space"):
-        refuse_barostat(context, [[2]], "a plane")
-    del again
-    flexible = openmm.MonteCarloFlexibleBarostat(1.0, 300.0)
+    refuse([0, 1], [3, 4, 5])
+    with pytest.raises(
+        UnsupportedError, match=r"MonteCarloBarostat .*row number 0 holds atoms of several; .*join=True"
+    ):
+        refuse([0, 1], [0, 3])
+    for mover in (None, openmm.CMMotionRemover()):
+        if mover is not None:
+            system.removeForce(system.getNumForces() - 1)
+            system.addForce(mover)
+        with pytest.raises(UnsupportedError, match=r"a plane holds particles in space.*removeCMMotion=False"):
+            refuse([2], bound="a plane")
+    system.removeForce(system.getNumForces() - 1)
+    system.addForce(flexible := openmm.MonteCarloFlexibleBarostat(1.0, 300.0))
     flexible.setScaleMoleculesAsRigid(False)
+    with pytest.raises(UnsupportedError, match=r"rows are held, and MonteCarloFlexibleBarostat .*let it scale"):
+        refuse([0, 1])
+    del integrator
+
+
+def test_a_barostat_that_scales_atoms_is_refused_beside_constraints():
     system, x = water_box(64)
-    system.addForce(flexible)
+    system.addForce(flexible := openmm.MonteCarloFlexibleBarostat(1.0, 300.0))
+    flexible.setScaleMoleculesAsRigid(False)
     context = started(system, loose := ProjectedIntegrator(1e-3), x)
     with pytest.raises(UnsupportedError, match=r"has constraints, and MonteCarloFlexibleBarostat"):
         loose.step(1)
-    with pytest.raises(UnsupportedError, match=r"a distance is held, and MonteCarloFlexibleBarostat .*let it scale"):
-        refuse_barostat(context, [[0, 1]], "a distance")
+    del context
 
 
 def test_centre_of_mass_motion():

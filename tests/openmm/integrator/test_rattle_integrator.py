@@ -86,35 +86,6 @@ def test_checks_wait_for_the_end_of_a_call_that_is_near(monkeypatch):
     assert checked == [15, 27, 37, 47, 57, 67, 77]
 
 
-def test_order_two():
-    system, x, v = dumbbell()
-    context = started(system, fine := ProjectedIntegrator(1e-4, "blanes-moan6", tolerance=1e-14), x, v)
-    fine.step(640)
-    true, errors = state_of(context), []
-    for dt in (4e-3, 2e-3, 1e-3):
-        context = started(system, integrator := RattleIntegrator(dt, tolerance=1e-14), x, v)
-        integrator.step(round(0.064 / dt))
-        found = state_of(context)
-        errors.append([np.abs(found[k] - true[k]).max() for k in (0, 1)])
-    slopes = np.diff(np.log2(errors), axis=0)
-    np.testing.assert_allclose(slopes, -2, atol=0.1)
-
-
-def test_reversible():
-    system, x, v = alanine()
-    context = started(system, integrator := RattleIntegrator(1e-3, tolerance=1e-14), x, v)
-    integrator.applyVelocityConstraints(context, 1e-14)
-    before = state_of(context)
-    integrator.step(20)
-    there = state_of(context)
-    context.setVelocities(-there[1])
-    integrator.step(20)
-    back = state_of(context)
-    assert np.abs(there[0] - before[0]).max() > 1e-3
-    np.testing.assert_allclose(back[0], before[0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(-back[1], before[1], rtol=0, atol=1e-10)
-
-
 def test_kinetic_energy_is_that_of_the_velocities():
     system, x, v = alanine()
     context = started(system, integrator := RattleIntegrator(1e-3), x, v)

@@ -37,7 +37,7 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.steps import Ensemble
+from kcons.openmm.integrator.ensemble import Ensemble
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 #: The trap of `tied_cluster` is round.

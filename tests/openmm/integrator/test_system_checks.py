@@ -20,7 +20,7 @@ from openmm_systems import (
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
-from kcons.openmm.integrator.system_checks import SystemRows, refuse_motion_remover
+from kcons.openmm.integrator.system_checks import SystemRows
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 
@@ -118,14 +118,6 @@ def test_residuals_by_hand():
     rows = SystemRows.of(system)
     np.testing.assert_allclose(rows.stretches(x + np.array([[0, 0, 0], [0.001, 0, 0]])), [0.01])
     np.testing.assert_allclose(rows.speeds(x, np.array([[1.0, 0, 0], [0, 1, 0]])), [-1.0])
-
-
-def test_motion_remover_beside_what_is_held_in_space():
-    system, _, _ = dumbbell()
-    refuse_motion_remover(system, "a plane")
-    system.addForce(openmm.CMMotionRemover())
-    with pytest.raises(UnsupportedError, match=r"a plane holds particles in space.*removeCMMotion=False"):
-        refuse_motion_remover(system, "a plane")
 
 
 @pytest.mark.parametrize("kind", [ProjectedIntegrator, openmm.VerletIntegrator])

@@ -163,7 +163,7 @@ def test_copies_of_a_system_make_steps_in_threads():
         x, v = np.random.default_rng(seed).normal(size=(2, n, 3))
         context.setPositions(x / np.linalg.norm(x, axis=1)[:, None])
         context.setVelocities(v)
-        integrator.apply_velocities(context)
+        integrator.applyVelocityConstraints(context)
         integrator.step(1000)
         ends[name] = np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
 
@@ -269,12 +269,12 @@ def test_positions_and_velocities_are_checked_and_can_be_put_right(kind):
     with pytest.raises(InputError, match=r"particle 1 is .* nm from its surface") as caught:
         integrator.check(context)
     assert caught.value.atoms == (1,)
-    integrator.apply_positions(context)
+    integrator.applyConstraints(context)
     context.setVelocities(VELOCITIES)
     assert worst(integrator, context)[0] <= 1e-13
     with pytest.raises(InputError, match="across its surface"):
         integrator.check(context)
-    integrator.apply_velocities(context)
+    integrator.applyVelocityConstraints(context)
     integrator.check(context)
     assert worst(integrator, context)[1] <= 1e-14
     integrator.step(3)

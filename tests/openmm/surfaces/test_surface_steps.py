@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import openmm
 import pytest
@@ -12,7 +10,6 @@ from openmm_systems import PLATFORMS
 from reference import cases
 from surface_cases import (
     KINDS,
-    POSITIONS,
     core_run,
     energy_of,
     on_surface,
@@ -26,20 +23,6 @@ from kcons.constraints import Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.surfaces.formulas import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
-
-#: Order, and numbers of steps in TIME where the leading error rules and rounding does not.
-ORDERS = {
-    "rattle": (2, (24, 48)),
-    "geodesic": (2, (24, 48)),
-    "suzuki4": (4, (24, 48)),
-    "yoshida4": (4, (32, 64)),
-    "kahan-li6": (6, (24, 48)),
-    "blanes-moan4": (4, (24, 48)),
-    "blanes-moan6": (6, (12, 24)),
-    "blanes-moan6a": (6, (12, 20)),
-}
-TIME = 2.0
-assert set(ORDERS) == {name for name in SCHEMES if not name.startswith("isokinetic")}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -57,20 +40,9 @@ def test_on_the_surface_and_along_it(kind, scheme, platform):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scheme", ["geodesic", "blanes-moan6a"])
-def test_reversible(kind, scheme):
-    integrator, context = on_surface(kind, scheme, 0.02, atoms=(0, 2))
-    x0, v0 = state_of(context)
-    integrator.step(60)
-    context.setVelocities(-state_of(context)[1])
-    integrator.step(60)
-    x, v = state_of(context)
-    assert np.abs(x - x0).max() <= 1e-12
-    assert np.abs(v + v0).max() <= 1e-12
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("scheme", "steps"), [("rattle", 20), ("geodesic", 20), ("blanes-moan6a", 4)])
+@pytest.mark.parametrize(
+    ("scheme", "steps"), [("rattle", 20), ("geodesic", 20), ("suzuki4", 8), ("kahan-li6", 4), ("blanes-moan6a", 4)]
+)
 def test_the_steps_are_those_of_the_core(kind, scheme, steps):
     integrator, context = on_surface(kind, scheme, 0.04, atoms=(0, 2))
     integrator.step(steps)
@@ -78,34 +50,6 @@ def test_the_steps_are_those_of_the_core(kind, scheme, steps):
     x_core, v_core = core_run(kind, SCHEMES[scheme](), 0.04, steps, atoms=(0, 2))
     assert np.abs(x - x_core).max() <= 1e-12
     assert np.abs(v - v_core).max() <= 1e-12
-
-
-@cache
-def solution(kind):
-    # Far finer than what it is compared with; that the steps are right is tested above.
-    integrator, context = on_surface(kind, "blanes-moan6", TIME / 96)
-    integrator.step(96)
-    return state_of(context)
-
-
-@pytest.mark.parametrize(
-    "kind, scheme",
-    [
-        *((kind, scheme) for kind in ("sphere", "rotated ellipsoid", "cylinder") for scheme in ("rattle", "geodesic")),
-        *((kind, scheme) for kind in ("torus", "formula") for scheme in ORDERS),
-    ],
-)
-def test_observed_order(kind, scheme):
-    order, numbers = ORDERS[scheme]
-    x, v = solution(kind)
-    errors = []
-    for steps in numbers:
-        integrator, context = on_surface(kind, scheme, TIME / steps)
-        integrator.step(steps)
-        there, velocity = state_of(context)
-        errors.append(max(np.abs(there - x).max(), np.abs(velocity - v).max()))
-    slope = -np.polyfit(np.log(numbers), np.log(errors), 1)[0]
-    assert slope == pytest.approx(order, abs=0.15)
 
 
 def test_several_steps_at_once_are_the_same_as_one_by_one():
@@ -216,16 +160,6 @@ def test_great_circles_leave_resting_and_free_particles_alone():
     assert there[1] == pytest.approx([0, np.cos(0.5), np.sin(0.5)], abs=1e-14)
     assert there[2] == pytest.approx([5.1, 0.2, 0.3], abs=1e-14)
     assert v[2] == pytest.approx([0.1, 0.2, 0.3], abs=1e-15)
-
-
-def test_plane_and_cylinder_need_no_constraint_in_free_flight():
-    integrator, context = on_surface("cylinder", "rattle", 0.01)
-    free = system_of(potential="0", springs=0)
-    held = KINDS["cylinder"](np.arange(3), POSITIONS)
-    integrator = SurfaceIntegrator(0.01, "suzuki4", surfaces=held, system=free, positions=POSITIONS)
-    context = started(free, integrator, POSITIONS, [[0, 0, 0.7]] * 3)
-    integrator.step(100)
-    assert state_of(context)[0] == pytest.approx(POSITIONS + np.array([0, 0, 0.7]), abs=1e-13)
 
 
 @pytest.mark.parametrize("radius", [1e-4, 1e4])
