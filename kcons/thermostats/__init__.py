@@ -14,7 +14,7 @@
 """
 
 from kcons.thermostats.configurational_temperature import configurational_sample, configurational_temperature
-from kcons.thermostats.correlated_series import Estimate, mean
+from kcons.thermostats.correlated_series import Estimate, autocorrelation_time, evaluations_per_sample, mean
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
@@ -25,8 +25,6 @@ from kcons.thermostats.multistep import (
     ForceGroups,
     IsokineticSpheres,
     LangevinRespa,
-    autocorrelation_time,
-    evaluations_per_sample,
 )
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.pressure import (
