@@ -11,15 +11,15 @@ from kcons.thermostats.pressure.barostat import Barostat, CellRescaling, MonteCa
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.constant_pressure import ConstantPressure
 from kcons.thermostats.pressure.measured import PressureObserver, constraint_virial, instantaneous_pressure
-from kcons.thermostats.pressure.pieces import Pieces, find_pieces
+from kcons.thermostats.pressure.pieces import BarostatBodies, find_pieces
 
 __all__ = [
     "Barostat",
+    "BarostatBodies",
     "CellRescaling",
     "CellSystem",
     "ConstantPressure",
     "MonteCarloBarostat",
-    "Pieces",
     "PressureObserver",
     "constraint_virial",
     "find_pieces",

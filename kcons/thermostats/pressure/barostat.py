@@ -31,8 +31,8 @@ from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import (
+    BarostatBodies,
     Held,
-    Pieces,
     find_pieces,
     lattice_of,
     require_periodic,
@@ -193,7 +193,7 @@ class Attempt(NamedTuple):
     """What a trial is made from."""
 
     system: CellSystem
-    pieces: Pieces
+    pieces: BarostatBodies
     state: State
     thermal_energy: float
     dt: float
@@ -267,7 +267,7 @@ class Barostat:
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
-        self._pieces: WeakKeyDictionary[CellSystem, Pieces] = WeakKeyDictionary()
+        self._pieces: WeakKeyDictionary[CellSystem, BarostatBodies] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_pieces"}
@@ -282,7 +282,7 @@ class Barostat:
     def operation(self) -> Press:
         return Press(self.every, f"{self.what} ({self.strains.kind})")
 
-    def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> Pieces:
+    def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
         """What moves as one.
 
         Raises
@@ -421,7 +421,9 @@ class Barostat:
             forces = system.with_forces(state).forces
         return Place(cell, positions, system.energy(positions, state.time, state.step), forces, stress)
 
-    def _log_chance(self, pieces: Pieces, before: Place, after: Place, trial: Trial, thermal_energy: float) -> float:
+    def _log_chance(
+        self, pieces: BarostatBodies, before: Place, after: Place, trial: Trial, thermal_energy: float
+    ) -> float:
         """ln of the ratio of the distribution at the two places."""
         rise = after.energy - before.energy + self.pressure * (after.volume - before.volume)
         if self.tension:
@@ -567,7 +569,7 @@ class CellRescaling(Barostat):
         return np.full(len(self.strains), super().acceptance(state)[0])
 
 
-def energy_by_strain(system: CellSystem, pieces: Pieces, place: Place) -> FloatArray:
+def energy_by_strain(system: CellSystem, pieces: BarostatBodies, place: Place) -> FloatArray:
     """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centres.
 
     The stress is that of all atoms moving along; what they would move relative to the centre of their piece does work

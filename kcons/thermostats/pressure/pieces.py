@@ -27,8 +27,8 @@ FLAT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
-    """Pieces of a system.
+class BarostatBodies:
+    """What moves as one when the cell changes.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ def find_pieces(
     molecules: ArrayLike | None = None,
     held: Held = "refuse",
     time: float = 0.0,
-) -> Pieces:
+) -> BarostatBodies:
     """Pieces of a system by its constraints, and by bonds if they are given.
 
     Parameters
@@ -168,7 +168,7 @@ def find_pieces(
     total = np.bincount(label, masses).astype(float)
     order = np.argsort(~placed, kind="stable")
     near = _joined(nearest)
-    pieces = Pieces(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order), axes)
+    pieces = BarostatBodies(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order), axes)
     lattice = lattice_of(system)
     y = pieces.whole(positions, lattice)
     closing = np.flatnonzero(np.round((y[near[:, 1]] - y[near[:, 0]]) @ lattice[1]).any(axis=1))
@@ -230,7 +230,7 @@ def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):
     ----------
     x : ndarray, shape (n_atoms, 3)
     label, weight, opened, atoms, parents
-        Of `Pieces`; the last two are its tree.
+        Of `BarostatBodies`; the last two are its tree.
     lattice : ndarray, shape (2, 3, 3)
     change : ndarray, shape (3, 3)
     d : ndarray, shape (n_atoms, 3)
