@@ -15,7 +15,7 @@ from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.thermostats.pressure import CellSystem, Pieces, find_pieces, instantaneous_pressure
+from kcons.thermostats.pressure import BarostatBodies, CellSystem, find_pieces, instantaneous_pressure
 from kcons.thermostats.pressure.measured import Virial, mean_pressure, refuse_virial
 from kcons.thermostats.pressure.pieces import Held
 
@@ -113,7 +113,7 @@ class PressureReporter:
         self._file = Path(file).open("w") if isinstance(file, str | Path) else file  # noqa: SIM115
         if self._file is not None:
             print("# time/fs  volume/A^3  pressure/bar", file=self._file)
-        self._known: tuple[Any, AtomsSystem, Pieces | None] | None = None
+        self._known: tuple[Any, AtomsSystem, BarostatBodies | None] | None = None
         self.values: list[FloatArray] = []
         self.volumes: list[float] = []
 
@@ -144,7 +144,7 @@ class PressureReporter:
         barostat = getattr(self.dynamics, "barostat", None)
         return np.ones(3, dtype=bool) if barostat is None else barostat.strains.axes
 
-    def _system(self) -> tuple[AtomsSystem, Pieces | None]:
+    def _system(self) -> tuple[AtomsSystem, BarostatBodies | None]:
         dynamics, motion = self.dynamics, self.dynamics.motion
         if self._known is None or self._known[0] is not motion:
             system = AtomsSystem(dynamics, motion)

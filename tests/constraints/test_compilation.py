@@ -39,7 +39,7 @@ print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 #: A kernel that calls another one, of another module: what it moves, and whether it was compiled.
 MOVES = """
 import numpy as np
-from kcons.thermostats.pressure.centre_moves import displacements
+from kcons.thermostats.pressure.pieces import displacements
 d = np.zeros((2, 3))
 displacements(
     np.array([[0.1, 0, 0], [2.9, 0, 0]]), np.array([0, 0]), np.array([0.5, 0.5]), np.ones((1, 3), dtype=bool),

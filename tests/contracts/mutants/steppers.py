@@ -203,7 +203,7 @@ MUTANTS = {
     "thermostats/freedom.py": [
         ("for k in range(1, «NEARER + 1→2»)", "test_freedom.py::test_bodies_that_feel_another_are_not[gas]"),
     ],
-    "thermostats/pressure/cell_rescaling.py": [
+    "thermostats/pressure/barostat.py": [
         (
             "«spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)→pass»",
             "test_cell_rescaling.py::test_noise_of_few_pieces_stays_within_what_a_trial_may_change[anisotropic]",
@@ -214,7 +214,7 @@ MUTANTS = {
     ],
     "thermostats/slow_share.py": [
         (
-            "«paced(system, there, f, 0.0)→f * system.weights»",
+            "«constrained_acceleration(system, there, f, 0.0)→f * system.weights»",
             "test_slow_share.py::test_a_rigid_pair_turns_freely_in_a_trap",
         ),
         ("np.array([name == group, «True→name != group»])", "test_slow_share.py::test_springs_of_free_atoms"),

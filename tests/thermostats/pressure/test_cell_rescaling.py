@@ -13,10 +13,8 @@ from kcons.errors import InputError
 from kcons.thermostats import mean
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
-from kcons.thermostats.pressure.barostat import Place
-from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
+from kcons.thermostats.pressure.barostat import Place, Strains, energy_by_strain
 from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
-from kcons.thermostats.pressure.strains import Strains
 
 
 @pytest.mark.parametrize("tau", [2.0, 30.0])
@@ -62,7 +60,7 @@ def test_energy_by_strain_is_the_derivative(turned):
     system.set_cell(cell, x)
     place = Place(cell, x, 0.0, system.forces(x, x, 0.0, 0), system.stress(x, 0.0))
     found = energy_by_strain(system, pieces, place)
-    strains = Strains.of("flexible")
+    strains = Strains("flexible")
     frame = strains.frame(cell)
     for k, generator in enumerate(strains.generators_in(frame)):
         energies = []
