@@ -30,7 +30,6 @@ HERE = Path(__file__).parent
 LOCALE = locale.setlocale(locale.LC_ALL)
 #: How long comparisons run what is to be timed, less than usual: no test looks at a time. What else they do stays.
 LITTLE = {
-    "kcons.comparison.methods.openmm": {"BLOCKS": 1, "BLOCK_STEPS": (10, 20)},
     "bare_solvers": {"SAMPLING": 0.01},
 }
 #: The same of the package, of modules that were imported.

@@ -75,7 +75,7 @@ def in_water(full: bool) -> Iterator[dict[str, Any]]:
             part.restore(context)
         integrator.step(2)
         contexts[name] = context
-    steps, rounds = (50, 9) if full else (5, 3)
+    steps, rounds = (50, 9) if full else (5, 2)
     calls = {name: partial(integrator.step, steps) for name, (integrator, _, _) in runs.items()}
     found = harness.speeds(harness.in_turn(calls, rounds), steps)
     for name, (_, _, part) in runs.items():

@@ -317,7 +317,7 @@ def pieces(part: str, quick: bool, systems: list[str]) -> dict[str, Callable[[],
     if part == "reversal":
         steps = {m: (200 if quick else 2000) // (10 if m == "ASE" else 1) for m in METHODS}
         return {f"reversal, {s}, {m}": partial(row, reversal, m, s, steps[m], system=s, method=m) for s, m in both}
-    trials = 300 if quick else 10_000
+    trials = 100 if quick else 10_000
     return {f"molecules, {k}": partial(counted, k, min(k + BATCH, trials)) for k in range(0, trials, BATCH)}
 
 

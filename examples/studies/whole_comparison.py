@@ -219,7 +219,8 @@ def winners(table: pd.DataFrame) -> pd.DataFrame:
                 same = SAME_EVALUATIONS if cost == "evaluations" else max(SAME_TIME, known.margin or 0.0)
                 told = {"part": key, "test system": heading, "engine": engine, "decided by": COSTS[cost]}
                 found.append({**told, "repeat to": same, **_judged(mine, others, cost, least, same, known.error_unit)})
-    return pd.DataFrame(found)
+    columns = ["part", "test system", "engine", "decided by", "repeat to", "gain", "at an error of", "ahead of kcons"]
+    return pd.DataFrame(found, columns=columns)
 
 
 def _takes_no_time(part: pd.DataFrame, engine: str) -> bool:

@@ -4,9 +4,9 @@ ASE applies constraint objects one after another, and each undoes the work of th
 whole set and solves it as one. Units are ASE's; targets are in angstrom and radian. Importing this package registers
 the object with ASE, which makes files that contain it readable.
 
-- `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
+- `topology`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
-- `pressure`, `pressure_reporter`: the stress of the constraint forces, cells that change
+- `pressure`: cells that change, the pressure along a run
 - `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
 - `logger`: ASE's log, with multipliers and the right temperature
 - `dynamics`, `thermostat_dynamics`: dynamics with any stepper, thermostat and barostat
@@ -25,8 +25,7 @@ try:
     )
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.logger import ConstraintLogger
-    from kcons.ase.pressure_reporter import PressureReporter
-    from kcons.ase.rigid_water import rigid_water
+    from kcons.ase.pressure import PressureReporter
     from kcons.ase.thermostat_dynamics import (
         ConstrainedLangevin,
         ConstrainedMonteCarlo,
@@ -35,7 +34,7 @@ try:
         MultipleTimeSteps,
         draw_velocities,
     )
-    from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass
+    from kcons.ase.topology import constraints_of, repair_elements, repartition_hydrogen_mass, rigid_water
     from kcons.ase.translation import from_ase_constraints
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.ase") from error
@@ -57,7 +56,7 @@ __all__ = [
     "constraints_of",
     "draw_velocities",
     "from_ase_constraints",
-    "mend_elements",
+    "repair_elements",
     "repartition_hydrogen_mass",
     "rigid_water",
     "to_ase_constraints",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
 from threading import local
@@ -47,8 +48,6 @@ class Binding:
     motion: Motion
     given: tuple[Constraint, ...]
     touched: IntArray
-    #: The atoms whose masses matter.
-    weighed: IntArray | slice
     n_atoms: int
     mass_array: str
     masses: bytes
@@ -71,7 +70,7 @@ class Binding:
             len(arrays["positions"]) == self.n_atoms
             and atoms.pbc.tobytes() == self.pbc
             and name == self.mass_array
-            and arrays[name][self.weighed].tobytes() == self.masses
+            and arrays[name].tobytes() == self.masses
         )
 
     def serves(self, holder: object, cell: FloatArray) -> bool:
@@ -123,10 +122,8 @@ def bind(
     atoms: Atoms,
     degenerate: Literal["convert", "raise"],
     time: float = 0.0,
-    *,
-    all_masses: bool = False,
 ) -> Binding:
-    """A new engine for `given` on `atoms`; with `all_masses` it fits as long as masses of free atoms stay, too."""
+    """A new engine for `given` on `atoms`."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]
     held = ConstraintSet(
@@ -134,21 +131,18 @@ def bind(
     )
     motion = Motion(held, x, degenerate=degenerate, time=time)
     touched = touched_atoms(held.constraints)
-    all_touched = len(touched) == len(atoms)
     name = "masses" if "masses" in atoms.arrays else "numbers"
-    weighed = slice(None) if all_masses or all_touched else touched
     return Binding(
         motion=motion,
         given=held.constraints,
         touched=touched,
-        weighed=weighed,
         n_atoms=len(atoms),
         mass_array=name,
-        masses=atoms.arrays[name][weighed].tobytes(),
+        masses=atoms.arrays[name].tobytes(),
         periodic=periodic,
         pbc=atoms.pbc.tobytes(),
         cell=atoms.cell.array.tobytes(),
-        weights=_weights(motion) if all_touched else None,
+        weights=_weights(motion) if len(touched) == len(atoms) else None,
     )
 
 
@@ -222,8 +216,9 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
         if len(both):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {both[0]}, which kcons holds too; ASE would apply the two "
-                f"one after the other, and neither would hold. Put all of it into one Constraints object"
-                f"{_REPLACEMENTS.get(type(other).__name__, '')}"
+                "one after the other, and neither would hold. Put all of it into one Constraints object: attach(atoms) "
+                "does so for what is on the atoms; for new rows, held = from_ase_constraints(atoms), "
+                "atoms.set_constraint(), constrain(atoms, [*held, *new])"
             )
     bound.others = company(present)
 
@@ -238,23 +233,19 @@ def _acted_on(other: Any, n_atoms: int) -> IntArray:
     return np.arange(n_atoms)[indices]
 
 
-_REPLACEMENTS = {
-    name: f", with {ours} for what {name} held"
-    for name, ours in {
-        "FixAtoms": "FixedAtoms",
-        "FixBondLengths": "Distance",
-        "FixInternals": "Distance, Angle, Dihedral and DistanceDifference",
-        "FixLinearTriatomic": "Distance and LinearRelation",
-        "FixCom": "CenterOfMass",
-        "FixSubsetCom": "CenterOfMass",
-        "FixedPlane": "Plane",
-        "FixedLine": "Line",
-        "FixCartesian": "LinearCombination",
-    }.items()
-} | dict.fromkeys(
-    ("Constraints", "ConstraintsWithFixedAtoms"),
-    ": atoms.set_constraint(), then constrain(atoms, [*old.constraints, *new])",
-)
+@contextmanager
+def unchanged_on_failure(atoms: Atoms) -> Iterator[None]:
+    """Put positions, momenta, cell and constraints of the atoms back where something is refused."""
+    arrays = {name: atoms.arrays[name].copy() for name in ("positions", "momenta") if name in atoms.arrays}
+    cell, constraints = atoms.cell.array.copy(), list(atoms.constraints)
+    try:
+        yield
+    except BaseException:
+        for name, values in arrays.items():
+            atoms.arrays[name][...] = values
+        atoms.cell[...] = cell
+        atoms.set_constraint(constraints)
+        raise
 
 
 def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:

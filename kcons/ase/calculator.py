@@ -12,11 +12,9 @@ from ase.calculators.calculator import Calculator, PropertyNotImplementedError, 
 from numpy.typing import NDArray
 
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure import VOIGT
-from kcons.ase.respect import refuse_taken_along
+from kcons.ase.respect import VOIGT, refuse_taken_along
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
-from kcons.errors import InputError
 from kcons.thermostats.pressure import constraint_virial
 
 #: Residual, in units of what double precision can reach, up to which positions are taken as they are.
@@ -123,8 +121,9 @@ class ConstrainedCalculator(Calculator):
             if name not in results and name in known and not self.inner.calculation_required(work, [name]):
                 results[name] = known[name]
         if "forces" in results:
-            forces = _checked(results["forces"], len(work))
-            results["forces"] = motion.project_forces(x, forces)
+            forces = np.array(numbers(results["forces"], "forces of the calculator"))
+            results["forces"] = forces.copy()
+            self.constraints.adjust_forces(work, results["forces"])
             if "stress" in results:
                 stress = np.array(numbers(results["stress"], "stress of the calculator"))
                 if stress.shape == (3, 3):
@@ -142,14 +141,3 @@ class ConstrainedCalculator(Calculator):
         x = atoms.get_positions()
         motion = self.constraints.engine(atoms)
         atoms.set_positions(motion.project_positions(x, x.copy()), apply_constraint=False)
-
-
-def _checked(values: Any, n_atoms: int) -> NDArray[np.float64]:
-    forces = np.array(numbers(values, "forces of the calculator"))
-    if forces.shape != (n_atoms, 3):
-        raise InputError(f"the calculator returned forces of shape {forces.shape}, not ({n_atoms}, 3)", item="forces")
-    finite = np.isfinite(forces)
-    if not finite.all():
-        atom = int(np.argmin(finite.all(axis=1)))
-        raise InputError(f"the calculator's force on atom {atom} is not finite: {forces[atom]}", item="forces")
-    return forces

@@ -22,10 +22,10 @@ from kcons.ase.binding import (
     refuse_not_finite,
     shared,
     touched_atoms,
+    unchanged_on_failure,
 )
-from kcons.ase.pressure import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, Watch, fulfilled
+from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions, fulfilled, virial_of
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
@@ -95,7 +95,7 @@ class Constraints(FixConstraint):
         self._binding: Binding | None = None
         #: The atoms that the positions known of belong to; one object may be on several.
         self._last: ref[Atoms] | None = None
-        self._watch = UNKNOWN
+        self._accepted = UNKNOWN
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
@@ -155,7 +155,7 @@ class Constraints(FixConstraint):
 
     def _forget(self, atoms: Atoms) -> None:
         """What is known of the positions is void."""
-        self._watch = Watch(len(atoms))
+        self._accepted = AcceptedPositions(len(atoms))
         #: Calls of each hook until its result is certified.
         self._positions_due = self._momenta_due = 0
 
@@ -174,16 +174,16 @@ class Constraints(FixConstraint):
         UnsupportedError
             They were moved along with the cell, where a row holds them in space.
         """
-        bound, watch = self._bound(atoms), self._watch
+        bound, accepted = self._bound(atoms), self._accepted
         x = bound.taken(new, "position")
         motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
-        if watch.in_another(cell):
-            watch.refuse_taken_along(motion, old, cell)
-        found = watch.ask(motion.constraint_set, old, x)
+        if accepted.in_another(cell):
+            accepted.refuse_taken_along(motion, old, cell)
+        found = accepted.ask(motion.constraint_set, old, x)
         frame = found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)
         if not frame:
             try:
-                watch.look(motion, old, cell, elsewhere=bool(found & ELSEWHERE))
+                accepted.look(motion, old, cell, elsewhere=bool(found & ELSEWHERE))
                 motion.project_positions(x, old, out=x)
             except (ConvergenceError, InputError, UnsupportedError) as error:
                 refuse_not_finite(x, "position")
@@ -193,16 +193,16 @@ class Constraints(FixConstraint):
                         error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
                     raise
         if frame:
-            motion.project_positions(x, watch.asked, out=x)
+            motion.project_positions(x, accepted.asked, out=x)
         if self._positions_due <= 0:
             try:
                 motion.certify(x)
             except CertificateError:
-                x[...] = watch.asked
+                x[...] = accepted.asked
                 raise
             self._positions_due = CHECK_EVERY
         self._positions_due -= 1
-        watch.accept(x, cell)
+        accepted.accept(x, cell)
         if x is not new:
             new[...] = x
 
@@ -217,11 +217,11 @@ class Constraints(FixConstraint):
         InputError
             The atoms were moved past the constraints in another way; see `restore`.
         """
-        if rand or not self._watch.in_another(atoms.cell.array):
+        if rand or not self._accepted.in_another(atoms.cell.array):
             return  # other edits are seen where positions are set
-        bound, watch = self._bound(atoms), self._watch
+        bound, accepted = self._bound(atoms), self._accepted
         x = atoms.arrays["positions"]
-        if not watch.look(bound.motion, x, atoms.cell.array):
+        if not accepted.look(bound.motion, x, atoms.cell.array):
             try:
                 self._move(atoms, bound.motion, bound.motion.project_positions(x, x))
             except ConvergenceError as error:
@@ -238,10 +238,10 @@ class Constraints(FixConstraint):
         UnsupportedError
             They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
         """
-        bound, watch = self._bound(atoms), self._watch
+        bound, accepted = self._bound(atoms), self._accepted
         p = bound.taken(momenta, "momentum")
-        watch.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
-        watch.note_momenta()
+        accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
+        accepted.note_momenta()
         due = self._momenta_due <= 0
         _project(bound, atoms.arrays["positions"], p, "momentum", certified=due)
         self._momenta_due = CHECK_EVERY - 1 if due else self._momenta_due - 1
@@ -269,12 +269,12 @@ class Constraints(FixConstraint):
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
-        bound, watch = self._bound(atoms), self._watch
+        bound, accepted = self._bound(atoms), self._accepted
         f = bound.taken(forces, "force")
         _project(bound, atoms.arrays["positions"], f, "force")
         if f is not forces:
             np.copyto(forces, f, casting="unsafe")
-        watch.between_steps = True
+        accepted.between_steps = True
 
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""
@@ -331,14 +331,14 @@ class Constraints(FixConstraint):
         # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
         twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__, _last=None, _watch=UNKNOWN)
+        twin.__dict__.update(self.__dict__, _last=None, _accepted=UNKNOWN)
         return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None, "_last": None, "_watch": UNKNOWN}
+        return {**self.__dict__, "_binding": None, "_last": None, "_accepted": UNKNOWN}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
@@ -377,10 +377,10 @@ class Constraints(FixConstraint):
             If there is no way to fulfil the constraints from here with other bonds and angles as they are; nothing is
             changed.
         """
-        bound, watch = self._bound(atoms), self._watch
+        bound, accepted = self._bound(atoms), self._accepted
         x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
         self._move(atoms, bound.motion, x)
-        watch.between_steps = True
+        accepted.between_steps = True
 
     def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
         """Put atoms where they are on the constraints, and project momenta that they have."""
@@ -388,7 +388,7 @@ class Constraints(FixConstraint):
         atoms.set_positions(x, apply_constraint=False)
         if momenta is not None:
             atoms.set_momenta(momenta, apply_constraint=False)
-        self._watch.know(x, atoms.cell.array)
+        self._accepted.know(x, atoms.cell.array)
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
@@ -542,22 +542,15 @@ def constrain(
     if isinstance(constraints, str):
         constraints = named = named_rows(atoms, constraints)
     held = Constraints(constraints, degenerate=degenerate)
-    before = list(atoms.constraints)
-    arrays = {name: atoms.arrays[name].copy() for name in ("positions", "momenta") if name in atoms.arrays}
-    atoms.set_constraint([*before, held])
-    try:
+    with unchanged_on_failure(atoms):
+        atoms.set_constraint([*atoms.constraints, held])
         if project:
             held.restore(atoms)
-        bound, watch = held._bound(atoms), held._watch
-        watch.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
-        watch.between_steps = True
+        bound, accepted = held._bound(atoms), held._accepted
+        accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
+        accepted.between_steps = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
-    except BaseException:
-        atoms.set_constraint(before)
-        for name, values in arrays.items():
-            atoms.arrays[name][...] = values
-        raise
     if named is not None and named.bonds_guessed:
         keep_guessed(atoms, named.topology.bonds)
         warnings.warn(

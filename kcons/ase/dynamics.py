@@ -15,7 +15,16 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
-from kcons.ase.binding import FORCES_ONLY, Binding, Company, applied_forces, bind, company, same_company
+from kcons.ase.binding import (
+    FORCES_ONLY,
+    Binding,
+    Company,
+    applied_forces,
+    bind,
+    company,
+    same_company,
+    unchanged_on_failure,
+)
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
@@ -133,7 +142,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self._size = len(atoms)
         self._momenta = self._masses = np.zeros((0, 3))  # momenta as written last; masses, 0 for fixed atoms
         self._forces = None if forces is None else finite_array(forces, len(atoms), "forces")
-        with changed_only_if_all_is_well(atoms):
+        with unchanged_on_failure(atoms):
             self._prepare(atoms, timestep, state)
             # Files last: to open one for writing ends what an older run left there.
             steps, logfile = self.nsteps, kwargs.pop("logfile", None)
@@ -194,7 +203,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
         Its arrays cannot be changed; the atoms' own can.
         """
-        return self._start(self._systems()).shown()
+        return self._start(self._systems()).read_only()
 
     @property
     def motion(self) -> Motion:
@@ -373,7 +382,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if bound is None or not bound.fits(atoms):
             self._refuse_fewer(len(atoms))
             rows = [*_rows(atoms, present), *self._more]
-            bound = bind(rows, atoms, self._degenerate, self.time, all_masses=True)
+            bound = bind(rows, atoms, self._degenerate, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, company(present), None
@@ -445,19 +454,6 @@ def write_back(positions, velocities, masses, x, p, momenta, v):  # type: ignore
         e[i] = momentum
         f[i] = momentum
         g[i] = momentum / m[i] if m[i] != 0.0 else b[i]
-
-
-@contextmanager
-def changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
-    """Put the atoms back where something is refused."""
-    before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
-    try:
-        yield
-    except BaseException:
-        atoms.set_positions(before[0], apply_constraint=False)
-        atoms.set_momenta(before[1], apply_constraint=False)
-        atoms.cell[...] = before[2]
-        raise
 
 
 def applied_energy(atoms: Atoms, only_forces: bool) -> float:

@@ -1,59 +1,29 @@
-"""Pressure of atoms with constraints: the stress of the constraint forces, and cells that change."""
+"""Pressure of atoms in runs of our dynamics: cells that change, and the pressure along a run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
-from ase import Atoms
+from ase import units
 from ase.calculators.calculator import PropertyNotImplementedError
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from kcons.ase.respect import require_on_surface
-from kcons.ase.topology import velocities_of
+from kcons.ase.dynamics import FAR, ConstrainedDynamics
+from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.thermostats.pressure import CellSystem, constraint_virial
+from kcons.thermostats.pressure import BarostatBodies, CellSystem, find_pieces, instantaneous_pressure
+from kcons.thermostats.pressure.measured import Virial, mean_pressure, refuse_virial
+from kcons.thermostats.pressure.pieces import Held
 
-#: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
-VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
 _BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, which take energies alone"
 
 
-def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
-    """`constraint_virial` at the present positions and momenta, which are zero where there are none.
-
-    Raises
-    ------
-    UnsupportedError
-        The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
-        StrainFilter, does not respect them.
-    """
-    x = atoms.arrays["positions"]
-    try:
-        require_on_surface(motion.constraint_set, x, time)
-    except InputError as error:
-        raise UnsupportedError(
-            f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
-            "them. Relax cells with FrechetCellFilter, or restore the atoms first"
-        ) from error
-    return constraint_virial(motion, x, velocities_of(atoms), forces, time)
-
-
 class AtomsSystem(CellSystem):
-    """Constraints and forces of `Atoms`, whose own cell is the one that changes.
-
-    Parameters
-    ----------
-    motion : Motion
-    force, potential : callable
-        Of positions and time, in the cell that the atoms have.
-    atoms : ase.Atoms
-        With a periodic cell.
-    stressless : bool
-        Whether constraints of ASE add forces, which no stress knows of.
-    far : float
+    """Constraints, forces and energy of a dynamics object, whose atoms have the cell that changes.
 
     Raises
     ------
@@ -61,25 +31,21 @@ class AtomsSystem(CellSystem):
         The cell is not periodic.
     """
 
-    def __init__(
-        self,
-        motion: Motion,
-        force: Callable[[FloatArray, float], ArrayLike],
-        potential: Callable[[FloatArray, float], float],
-        atoms: Atoms,
-        *,
-        stressless: bool = False,
-        far: float,
-    ) -> None:
-        self.atoms = atoms
+    def __init__(self, dynamics: ConstrainedDynamics, motion: Motion) -> None:
+        self.atoms = dynamics.atoms
         if motion.lattice is None:
             raise InputError(
                 "the atoms have no periodic cell, and a barostat nothing to change: set atoms.cell and atoms.pbc",
                 item="cell",
             )
-        self._stressless = stressless
+        #: Constraints of ASE add forces, which no stress knows of.
+        self._stressless = dynamics._only_forces
         super().__init__(
-            motion, lambda x, t, cell: force(x, t), lambda x, t, cell: potential(x, t), self._stress, far=far
+            motion,
+            lambda x, t, cell: dynamics._force(x, t),
+            lambda x, t, cell: dynamics._energy(x, t),
+            self._stress,
+            far=FAR,
         )
 
     @property
@@ -100,3 +66,95 @@ class AtomsSystem(CellSystem):
         except PropertyNotImplementedError as error:
             raise UnsupportedError(f"the calculator has no stress; {_BY_ENERGIES}") from error
         return np.asarray(found, dtype=float)
+
+
+class PressureReporter:
+    """Pressure and volume of a run; attach it: ``dynamics.attach(reporter, interval=10)``.
+
+    Parameters
+    ----------
+    dynamics : ConstrainedDynamics
+        Or any of the thermostats. It needs no barostat.
+    file : path or text file, optional
+        Where to write time (fs), volume (A^3) and pressure (bar, as in `mean`), a line for each call.
+    virial : {'molecular', 'atomic', 'difference'}
+        See `kcons.thermostats.instantaneous_pressure`; 'difference' is for calculators without stress.
+    molecules : array_like of int, shape (n, 2), optional
+        Bonds, for pieces; by default those of the barostat.
+    temperature_K : float, optional
+        For N kT/V instead of the present kinetic energy of pieces.
+
+    Attributes
+    ----------
+    values : list of ndarray, shape (3, 3)
+        Pressure tensors in eV/A^3.
+    volumes : list of float
+
+    Raises
+    ------
+    InputError
+        An unknown virial; `temperature_K` with 'atomic'; dynamics of ASE, which do not know all rows.
+    """
+
+    def __init__(
+        self,
+        dynamics: ConstrainedDynamics,
+        file: str | Path | IO[str] | None = None,
+        *,
+        virial: Virial = "molecular",
+        molecules: ArrayLike | None = None,
+        temperature_K: float | None = None,
+    ) -> None:
+        refuse_virial(virial, temperature_K)
+        refuse_other(dynamics, ConstrainedDynamics, "dynamics", "a dynamics object of kcons.ase")
+        self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
+        self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
+        self._own = isinstance(file, str | Path)
+        self._file = Path(file).open("w") if isinstance(file, str | Path) else file  # noqa: SIM115
+        if self._file is not None:
+            print("# time/fs  volume/A^3  pressure/bar", file=self._file)
+        self._known: tuple[Any, AtomsSystem, BarostatBodies | None] | None = None
+        self.values: list[FloatArray] = []
+        self.volumes: list[float] = []
+
+    def __del__(self) -> None:
+        if getattr(self, "_own", False) and self._file is not None:
+            self._file.close()
+
+    def __call__(self) -> None:
+        dynamics, atoms = self.dynamics, self.dynamics.atoms
+        system, pieces = self._system()
+        state = dynamics.state.copied()
+        self.values.append(
+            instantaneous_pressure(system, state, self.virial, pieces=pieces, thermal_energy=self.thermal)
+        )
+        self.volumes.append(float(atoms.get_volume()))
+        if self._file is not None:
+            bar = mean_pressure(self.values[-1:], self._axes) / units.bar
+            line = f"{dynamics.get_time() / units.fs:.3f} {self.volumes[-1]:.6f} {bar:.6g}"
+            print(line, file=self._file, flush=True)
+
+    @property
+    def mean(self) -> float:
+        """Of the pressure, in eV/A^3, along the axes that a barostat changes."""
+        return mean_pressure(self.values, self._axes)
+
+    @property
+    def _axes(self) -> NDArray[np.bool_]:
+        barostat = getattr(self.dynamics, "barostat", None)
+        return np.ones(3, dtype=bool) if barostat is None else barostat.strains.axes
+
+    def _system(self) -> tuple[AtomsSystem, BarostatBodies | None]:
+        dynamics, motion = self.dynamics, self.dynamics.motion
+        if self._known is None or self._known[0] is not motion:
+            system = AtomsSystem(dynamics, motion)
+            barostat, pieces = getattr(dynamics, "barostat", None), None
+            if self.virial != "atomic":
+                x = dynamics.atoms.arrays["positions"]
+                if barostat is not None and self.molecules is None:
+                    pieces = barostat.pieces(dynamics._systems(), x, dynamics.time)
+                else:
+                    held: Held = "refuse" if barostat is None else barostat.held
+                    pieces = find_pieces(system, x, self._axes, self.molecules, held, dynamics.time)
+            self._known = motion, system, pieces
+        return self._known[1:]

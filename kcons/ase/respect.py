@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from ase import Atoms
 from ase.cell import Cell
 
+from kcons.ase.topology import velocities_of
 from kcons.constraints.arguments import finite_array
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
@@ -12,6 +14,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.thermostats.pressure.measured import constraint_virial
 from kcons.thermostats.pressure.pieces import rows_open
 
 #: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
@@ -53,7 +56,7 @@ _MOVED_WITHIN_A_STEP = (
 )
 
 
-class Watch:
+class AcceptedPositions:
     """The positions that the constraints last accepted: what differs from them was moved past the constraints.
 
     Also what was last asked for, before it was corrected: an MD engine that goes on from its own copy of the positions
@@ -72,7 +75,7 @@ class Watch:
         self.between_steps = True
         self._cell: bytes | None = None  # of the accepted positions
         #: Positions as they were accepted, as they were accepted before, and as they were asked for.
-        self._accepted, self._before, self.asked = np.full((3, n_atoms, 3), np.nan)
+        self._positions, self._before, self.asked = np.full((3, n_atoms, 3), np.nan)
         self._momenta_since = self._again = False
         self._repeats = self._absurd = 0
 
@@ -82,7 +85,7 @@ class Watch:
 
     def know(self, x: FloatArray, cell: FloatArray) -> None:
         """Accept positions that are on the constraints."""
-        self._accepted[...], self._cell = x, cell.tobytes()
+        self._positions[...], self._cell = x, cell.tobytes()
 
     def look(self, motion: Motion, x: FloatArray, cell: FloatArray, *, elsewhere: bool | None = None) -> bool:
         """Whether positions before a step, or where momenta are set, may stay: near enough to the constraints.
@@ -99,7 +102,7 @@ class Watch:
             They are, and were moved within a step; or they were scaled, and a row holds them in space.
         """
         changed = self.in_another(cell)
-        good = not (changed or (differ(self._accepted, x) if elsewhere is None else elsewhere))
+        good = not (changed or (differ(self._positions, x) if elsewhere is None else elsewhere))
         if not good:
             scaled = changed and self._scaled(motion, x, cell)
             worst = _worst_row(motion.constraint_set, x)
@@ -118,12 +121,12 @@ class Watch:
     def _scaled(self, motion: Motion, x: FloatArray, cell: FloatArray) -> bool:
         """Whether positions are those accepted last but for a change of the cell that took them along."""
         self.refuse_taken_along(motion, x, cell)
-        moved = self._accepted @ deformation(np.frombuffer(self._cell or b"").reshape(3, 3), cell)
+        moved = self._positions @ deformation(np.frombuffer(self._cell or b"").reshape(3, 3), cell)
         return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
 
     def refuse_taken_along(self, motion: Motion, x: FloatArray, cell: FloatArray) -> None:
         """As the function of this name, from the positions and the cell that were accepted last."""
-        refuse_taken_along(motion, self._accepted, np.frombuffer(self._cell or b"").reshape(3, 3), x, cell)
+        refuse_taken_along(motion, self._positions, np.frombuffer(self._cell or b"").reshape(3, 3), x, cell)
 
     def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
         """Remember positions before they are corrected; what `compared` finds of them.
@@ -133,7 +136,7 @@ class Watch:
         UnsupportedError
             The last correction, and those before it, were larger than any usable time step makes them.
         """
-        found = compared(old, self._accepted, new, self.asked)
+        found = compared(old, self._positions, new, self.asked)
         if self._momenta_since:
             if found & LARGE and np.isfinite(self.asked).all():
                 self._refuse_absurd(held)
@@ -141,7 +144,7 @@ class Watch:
                 self._absurd = 0
         if found & NEW:
             self._repeats, self._again = self._repeats + 1 if self._again else 0, False
-            np.copyto(self._before, self._accepted)
+            np.copyto(self._before, self._positions)
             np.copyto(self.asked, new)
         elif self._momenta_since:
             self._again = True
@@ -185,7 +188,7 @@ class Watch:
 
 
 #: Of atoms that are not known yet.
-UNKNOWN = Watch(0)
+UNKNOWN = AcceptedPositions(0)
 
 
 def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[int, float] | None:
@@ -215,6 +218,30 @@ def require_on_surface(
         finite_array(x, held.n_atoms, "position")
         said = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}): {why}"
         raise UnsupportedError(said) if by_class else InputError(said, item="positions", atoms=held.row_atoms(row))
+
+
+#: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
+VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
+
+
+def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
+    """`constraint_virial` at the present positions and momenta, which are zero where there are none.
+
+    Raises
+    ------
+    UnsupportedError
+        The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
+        StrainFilter, does not respect them.
+    """
+    x = atoms.arrays["positions"]
+    try:
+        require_on_surface(motion.constraint_set, x, time)
+    except InputError as error:
+        raise UnsupportedError(
+            f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
+            "them. Relax cells with FrechetCellFilter, or restore the atoms first"
+        ) from error
+    return constraint_virial(motion, x, velocities_of(atoms), forces, time)
 
 
 def deformation(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -15,8 +15,8 @@ from ase import Atoms, units
 from ase.calculators.mixing import SumCalculator
 from numpy.typing import ArrayLike
 
-from kcons.ase.binding import FORCES_ONLY
-from kcons.ase.dynamics import FAR, ConstrainedDynamics, changed_only_if_all_is_well, in_step
+from kcons.ase.binding import FORCES_ONLY, unchanged_on_failure
+from kcons.ase.dynamics import ConstrainedDynamics, in_step
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
@@ -118,7 +118,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
             return super()._made(motion)
         if np.any(self._friction):
             raise UnsupportedError("friction takes out heat beside the thermostat; leave it out")
-        system = AtomsSystem(motion, self._force, self._energy, self.atoms, stressless=self._only_forces, far=FAR)
+        system = AtomsSystem(self, motion)
         self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
         return system
 
@@ -386,7 +386,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         system = self._systems()
         state = self._start(system)
         sampler = cast(HamiltonianMonteCarlo, self.stepper)
-        with changed_only_if_all_is_well(self.atoms):
+        with unchanged_on_failure(self.atoms):
             found = tune(system, state, self.dt, sampler, wanted=wanted, proposals=proposals)
         self.dt = found.dt
         self._resume(found.state)

@@ -13,12 +13,15 @@ from ase import Atoms, units
 from ase.data import atomic_masses, atomic_numbers, chemical_symbols
 from numpy.typing import NDArray
 
+from kcons.constraints import Distance
 from kcons.constraints.arguments import check_pairs, positive
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.guessed_bonds import guess_bonds, reaches
+from kcons.topology.guessed_bonds import close_pairs, guess_bonds, reaches
 from kcons.topology.holding import Holding, Options, with_options
+from kcons.topology.rigid_groups import water_rows
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import (
     MASSES,
@@ -37,10 +40,11 @@ __all__ = [
     "bonds_of",
     "constraints_of",
     "kinetic_energy_of",
-    "mend_elements",
     "named_rows",
+    "repair_elements",
     "repartition_hydrogen_mass",
     "require_atoms",
+    "rigid_water",
     "snapshot_of",
     "velocities_of",
 ]
@@ -53,6 +57,8 @@ GUESSED = "bonds_guessed_for"
 _STALE = 1.6
 #: ASE's unit of time in ps, to the power that velocities need.
 PS = 1000 * units.fs
+#: An O-H length that no water has, in Angstrom.
+_SHORTEST = 0.5
 _ITEM = f"atoms.info[{BONDS!r}]"
 _REMEDY = f"put pairs of atoms into {_ITEM}"
 
@@ -73,6 +79,57 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     snapshot = snapshot_of(atoms)
     numbers = partial(selected_numbers, n=len(atoms))
     return rows_of(snapshot, Holding(constrain, **options), numbers, _REMEDY)
+
+
+def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None, *, reach: float = 1.3) -> Distance:
+    """Hold all water molecules rigid: three distances each.
+
+    A water is an oxygen with two hydrogens within `reach` of it (minimum image), which are near no other oxygen, and
+    without a third; wherever they are in the list of atoms.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+    geometry : str, (float, float) or None
+        A named model, such as 'tip3p' (0.9572 angstrom, 104.52 degrees), or O-H length and H-O-H angle in degrees. None
+        holds each molecule as it is.
+    reach : float
+        Longest O-H distance that counts as a bond, in Angstrom.
+
+    Raises
+    ------
+    InputError
+        No `Atoms`, no water in it, or one whose hydrogens are nearer than any are (positions in nm); a geometry or a
+        reach that is none.
+    """
+    require_atoms(atoms)
+    shape = None if geometry is None else Holding("none", water_geometry=geometry).geometry()[0]
+    part = np.flatnonzero(np.isin(atoms.numbers, (1, 8)) & np.isfinite(atoms.positions).all(axis=1))
+    lattice = lattice_of(atoms.cell.array if atoms.pbc.any() else None, atoms.pbc)
+    pairs, apart = close_pairs(atoms.positions[part], lattice, positive(reach, "reach"))
+    oxygen = atoms.numbers[part] == 8
+    mixed = oxygen[pairs].sum(axis=1) == 1
+    pairs, apart = pairs[mixed], apart[mixed]
+    pairs = np.where(oxygen[pairs[:, :1]], pairs, pairs[:, ::-1])  # oxygen, hydrogen
+    count = np.bincount(pairs.ravel(), minlength=len(part))
+    pairs = pairs[(count[pairs] == (2, 1)).all(axis=1)]
+    pairs = pairs[np.lexsort(pairs.T[::-1])]
+    whole = np.bincount(pairs[:, 0], minlength=len(part))[pairs[:, 0]] == 2
+    triples = part[np.concatenate([pairs[whole][::2], pairs[whole][1::2, 1:]], axis=1)]
+    if len(triples) == 0:
+        raise InputError(
+            f"no water found: an oxygen with two hydrogens within {reach:g} Angstrom that are near no other oxygen; "
+            "hold other molecules with Distance",
+            item="atoms",
+        )
+    if apart.min() < _SHORTEST:
+        raise InputError(
+            f"a hydrogen is {apart.min():.3g} Angstrom away from the oxygen of its water; positions of Atoms are in "
+            "Angstrom: multiply by 10 where these are in nm",
+            item="atoms",
+            atoms=triples[:, 0],
+        )
+    return water_rows(triples, shape)
 
 
 def named_rows(atoms: Atoms, name: str) -> HeldRows:
@@ -107,7 +164,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     """Topology and positions of `atoms`.
 
     Atoms with names and residues get the element that the name says, since ASE reads PDB files without a column of
-    elements as if 'HG' were mercury; `mend_elements` corrects the atoms themselves.
+    elements as if 'HG' were mercury; `repair_elements` corrects the atoms themselves.
 
     Raises
     ------
@@ -135,7 +192,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residues = np.zeros(n, np.int64)
         residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
     if known and "atomtypes" in arrays:
-        elements, masses = _mended(elements, masses, names, residues, residue_names, "masses" in arrays)
+        elements, masses = _repaired(elements, masses, names, residues, residue_names, "masses" in arrays)
     bonds, guessed = _given_bonds(atoms)
     charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
     topology = Topology(
@@ -202,7 +259,7 @@ def _given_bonds(atoms: Atoms) -> tuple[IntArray, bool]:
     return check_pairs(bonds, len(atoms), _ITEM), guessed
 
 
-def mend_elements(atoms: Atoms) -> int:
+def repair_elements(atoms: Atoms) -> int:
     """Give atoms of residues the elements that their names say, in place; how many changed.
 
     ASE's reader takes atom names for symbols where a PDB file has no column of elements. Elements other than hydrogen
@@ -290,7 +347,7 @@ def _had_elements(elements: NDArray[np.str_], by_name: NDArray[np.str_], names: 
     return any(name[:2].capitalize() in atomic_numbers for name in set(names[right].tolist()) if name[1:2].isalpha())
 
 
-def _mended(
+def _repaired(
     elements: NDArray[np.str_],
     masses: NDArray[np.float64],
     names: NDArray[np.str_],
@@ -322,7 +379,7 @@ def _mended(
     warnings.warn(
         f"{int(wrong.sum())} atoms have elements that their names contradict, such as {names[atom]} of "
         f"{residue_names[residues[atom]]}, which is no {elements[atom]}; the names are followed. "
-        "kcons.ase.mend_elements(atoms) corrects the atoms",
+        "kcons.ase.repair_elements(atoms) corrects the atoms",
         UserWarning,
         stacklevel=4,
     )

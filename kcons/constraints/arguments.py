@@ -36,11 +36,8 @@ LARGEST = 1e150
 def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
     """`values` themselves if they are an array of float64, or a float64 copy of real numbers.
 
-    Raises
-    ------
-    InputError
-        Complex numbers, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities, whose
-        units would be; objects, text, rows of different length.
+    Complex numbers are refused, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities,
+    whose units would be.
     """
     if type(values) is np.ndarray and values.dtype is _FLOAT:
         return values
@@ -110,24 +107,13 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def check_out(out: FloatArray, shape: tuple[int, ...], item: str = "out") -> None:
-    """Refuse arrays that results cannot be written into.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse arrays that results cannot be written into."""
     if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
         raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
 
 
 def atom_array(atoms: Any, item: str) -> NDArray[Any]:
-    """Atoms as an array of any shape, a single one as an array of one.
-
-    Raises
-    ------
-    InputError
-        Rows of different length; what is no array.
-    """
+    """Atoms as an array of any shape, a single one as an array of one."""
     try:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
@@ -143,13 +129,7 @@ def atom_column(atoms: Any, item: str) -> NDArray[Any]:
 
 
 def check_pairs(pairs: ArrayLike, n_atoms: int | None = None, item: str = "bonds") -> IntArray:
-    """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet.
-
-    Raises
-    ------
-    InputError
-        Another shape; numbers that are no integers; atoms that do not exist.
-    """
+    """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet."""
     try:
         table = np.asarray(pairs)
     except ValueError as error:
@@ -194,10 +174,7 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
         Names of what it is called with.
     hint : str
         Ends the sentence.
-
-    Raises
-    ------
-    InputError
+    needed : bool
     """
     if not callable(function) and (needed or function is not None):
         raise InputError(
@@ -217,13 +194,7 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
 
 
 def finite_number(value: Any, item: str) -> float:
-    """`value` as a float.
-
-    Raises
-    ------
-    InputError
-        It has units, is no number, or is not finite.
-    """
+    """`value` as a float."""
     if type(value) is float and math.isfinite(value):  # each call of the engine comes through here
         return value
     refuse_units(value, item)
@@ -250,13 +221,7 @@ def _value_text(value: Any) -> str:
 
 
 def positive(value: float, item: str) -> float:
-    """`value` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number above zero, or infinite.
-    """
+    """`value` as a float, which has to be finite and above zero."""
     number = math.nan if isinstance(value, str | bytes | bool) else _float(value)
     if not (math.isfinite(number) and number > 0):
         raise InputError(f"{item} is {_value_text(value)}; give a positive number", item=item.rpartition(": ")[2])
@@ -286,13 +251,7 @@ def unit(vectors: ArrayLike, item: str) -> FloatArray:
 
 
 def whole_number(value: Any, item: str, least: int = 1, most: int | None = None) -> int:
-    """`value` as an int.
-
-    Raises
-    ------
-    InputError
-        It is no whole number, or below `least` or above `most`.
-    """
+    """`value` as an int, from `least` to `most`."""
     try:
         found = int(value)
         good = bool(found == value) and least <= found and (most is None or found <= most)
@@ -420,7 +379,7 @@ def quantity_text(values: Any) -> str:
 
 
 def refuse_units(values: Any, item: str) -> None:
-    """Raise `InputError` for Quantities where nobody knows which units the other numbers are in."""
+    """Refuse Quantities where nobody knows which units the other numbers are in."""
     if has_units(values):
         raise InputError(
             f"{item} has units ({quantity_text(values)}), and only kcons.openmm knows what the other numbers are in; "

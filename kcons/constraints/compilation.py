@@ -318,6 +318,11 @@ def cfunc(signature: Any, *, cache: bool = False, **options: Any) -> Callable[[A
     return made
 
 
+def has_a_file(function: Any) -> bool:
+    """Whether a function was written in a file, beside which or for which kernels can be kept."""
+    return Path(function.__code__.co_filename).is_file()
+
+
 def _nothing() -> None:
     """What `keep_somewhere` asks Numba to keep."""
 

@@ -34,7 +34,7 @@ from kcons.constraints.arguments import (
     plain_target,
     read_only,
 )
-from kcons.constraints.compilation import njit
+from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError
@@ -137,11 +137,12 @@ class Constraint:
     def __init_subclass__(cls, base: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         cls.family = cls.__name__
-        if not base:
+        # The name of a family of another module is not taken from it.
+        if not base and FAMILIES.get(cls.family, cls).__module__ == cls.__module__:
             FAMILIES[cls.family] = cls
         if cls.row is not None and cls.kind is RowKind.INTERPRETED:
             cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
-        if "__init__" in cls.__dict__:
+        if "__init__" in cls.__dict__ or cls.__init__ is Constraint.__init__:
             cls.__init__ = checked(cls.__init__)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
@@ -426,7 +427,7 @@ class Constraint:
         Raises
         ------
         InputError
-            If an entry is missing, unknown or of the wrong shape.
+            If an entry is missing or unknown.
         """
         names = {"family", "atoms", "target", *cls.per_row, *cls.shared}
         found = set(data) - {"units"}
@@ -447,7 +448,7 @@ class Constraint:
 
 @functools.cache
 def _compiled(row: Callable[[Any, Any, Any, Any], None]) -> Any:
-    return njit(cache=True, error_model="numpy")(row)
+    return njit(cache=has_a_file(row), error_model="numpy")(row)
 
 
 def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
@@ -492,13 +493,7 @@ def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:
-    """One constraint, or several, as a list.
-
-    Raises
-    ------
-    InputError
-        Something else.
-    """
+    """One constraint, or several, as a list; `InputError` for something else."""
     found: list[Any]
     found = [given] if isinstance(given, Constraint | str) or not isinstance(given, Iterable) else list(given)
     for entry in found:

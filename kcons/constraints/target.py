@@ -55,12 +55,12 @@ class MovingTarget:
 
     def at(self, time: float, rows: int) -> FloatArray:
         """Target at `time`, shape (rows,)."""
-        return _per_row(self.value(time), rows, time)
+        return _per_row(self.value(time), rows, f" at t = {time:g}")
 
     def rate_at(self, time: float, rows: int, period: float | None = None) -> FloatArray:
         """First time derivative, shape (rows,), of values that may jump by a `period`."""
         if self.rate is not None:
-            return _per_row(self.rate(time), rows, time)
+            return _per_row(self.rate(time), rows, f" at t = {time:g}")
         if self.acceleration is not None:
             raise InputError("a moving target with an acceleration also needs its rate", item="target")
         return first_derivative(lambda t: self.at(t, rows), time, self.time_step, period)
@@ -68,7 +68,7 @@ class MovingTarget:
     def acceleration_at(self, time: float, rows: int, period: float | None = None) -> FloatArray:
         """Second time derivative, shape (rows,), of values that may jump by a `period`."""
         if self.acceleration is not None:
-            return _per_row(self.acceleration(time), rows, time)
+            return _per_row(self.acceleration(time), rows, f" at t = {time:g}")
         if self.rate is not None:
             return first_derivative(lambda t: self.rate_at(t, rows), time, self.time_step)
         return second_derivative(lambda t: self.at(t, rows), time, self.time_step, period)
@@ -105,44 +105,23 @@ class MovingTarget:
 Target: TypeAlias = Annotated[float | ArrayLike | MovingTarget | TimeFunction | None, HELD]
 
 
-def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:
-    array = numbers(value, "target")
-    if array.ndim > 1 and array.size == rows:
-        array = array.ravel()  # for example (n, 3) for three rows an atom
-    try:
-        array = np.broadcast_to(array, (rows,))
-    except ValueError:
-        raise InputError(
-            f"the target at t = {time:g} has shape {array.shape}; give one number or {rows}", item="target"
-        ) from None
-    wrong = out_of_range(array)
-    if wrong is not None:
-        raise InputError(f"the target at t = {time:g} is {wrong[1]}", item="target")
-    return array
-
-
 def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
-    """Normalise what a user gave: None, an array of shape (rows,), or a `MovingTarget`.
-
-    Raises
-    ------
-    InputError
-        If an explicit target is no number, not finite, so large that its square overflows, or has the wrong number of
-        entries.
-    """
+    """What a user gave as None, a read-only array of shape (rows,), or a `MovingTarget`."""
     if target is None or isinstance(target, MovingTarget):
         return target
-    if callable(target):
-        return MovingTarget(target)
+    return MovingTarget(target) if callable(target) else read_only(np.array(_per_row(target, rows), order="C"))
+
+
+def _per_row(target: Any, rows: int, when: str = "") -> FloatArray:
     array = numbers(target, "target")
     if array.ndim > 1 and array.size == rows:
-        array = array.ravel()
-    if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, rows)):
-        raise InputError(f"target has shape {array.shape}; give one number or {rows}", item="target")
+        array = array.ravel()  # for example (n, 3) for three rows an atom
+    if array.ndim > 1 or array.size not in (1, rows):
+        raise InputError(f"the target{when} has shape {array.shape}; give one number or {rows}", item="target")
     wrong = out_of_range(array)
     if wrong is not None:
-        raise InputError(f"the target of row {wrong[0]} is {wrong[1]}", item="target")
-    return read_only(np.array(np.broadcast_to(array, (rows,)), order="C"))
+        raise InputError(f"the target of row {wrong[0]}{when} is {wrong[1]}", item="target")
+    return np.broadcast_to(array, (rows,))
 
 
 # -- derivatives that a user gave, and central differences for those that were not given --------------

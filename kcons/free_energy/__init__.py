@@ -5,7 +5,7 @@
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
-- `windows`: recording in ASE and OpenMM, and many windows, by any executor
+- `windows`: recording in runs of ASE and OpenMM, and many windows by any executor
 - `scans`: relaxed scans
 """
 
@@ -22,8 +22,7 @@ _NAMES = {
     "windows.window": ("Settings", "Window"),
     "windows.ase_windows": ("AseRecorder", "AseWindows"),
     "windows.openmm_windows": ("HeldCoordinatesReporter", "OpenMMWindows"),
-    "windows.free_energy": ("FreeEnergy", "WindowResult"),
-    "windows.driver": ("Windows",),
+    "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "windows.input_file": ("InputFile", "read_input"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),

@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
-from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
+from kcons.free_energy.held_coordinates import AT_ONCE, HeldCoordinates, Sample
 from kcons.steppers.files import in_one_piece, stored_arrays
 from kcons.steppers.state import State, System
 
+#: Atoms of all configurations that wait to be looked at, at most.
+_ATOMS = 200_000
 #: What a sample has once, and not for each coordinate.
 _NUMBERS = ("time", "log_det_z", "off")
 
@@ -193,6 +195,27 @@ class Series:
             np.savetxt(opened, np.column_stack(columns), fmt="%.12g")
 
 
+class Collector:
+    """Configurations of one cell that wait to be looked at together, which costs a tenth of one after another."""
+
+    def __init__(self, coordinates: HeldCoordinates, series: Series) -> None:
+        self.coordinates, self.series = coordinates, series
+        self._waiting: list[tuple[FloatArray, FloatArray, FloatArray, float]] = []
+
+    def add(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float) -> None:
+        """Positions, velocities and applied forces at a time; arrays are copied."""
+        x, v, f = (np.array(array, dtype=np.float64) for array in (x, v, f))
+        self._waiting.append((x, v, f, time))
+        if len(self._waiting) == min(AT_ONCE, 1 + _ATOMS // len(self._waiting[0][0])):
+            self.look()
+
+    def look(self) -> None:
+        """Put samples of all that waits into the series."""
+        waiting, self._waiting = self._waiting, []
+        for sample in self.coordinates.samples(*zip(*waiting, strict=True)) if waiting else ():
+            self.series.append(sample)
+
+
 class Recorder:
     """An observer of `kcons.run` that keeps a `Series`.
 
@@ -218,17 +241,25 @@ class Recorder:
     def __init__(self, system: System, coordinates: HeldCoordinates, series: Series | None = None) -> None:
         self.system = system
         self.coordinates = coordinates
-        self.series = Series(coordinates.names, coordinates.periods) if series is None else series
-        mine, its = ((s.names, s.periods.tolist()) for s in (coordinates, self.series))
+        series = Series(coordinates.names, coordinates.periods) if series is None else series
+        mine, its = ((s.names, s.periods.tolist()) for s in (coordinates, series))
         if mine != its:
             raise InputError(
                 f"the series is of {', '.join(its[0])} with periods {its[1]}, the coordinates are {', '.join(mine[0])} "
                 f"with periods {mine[1]}; go on with a series of the same, or leave it out",
                 item="series",
             )
+        self._collector = Collector(coordinates, series)
 
     def __call__(self, state: State) -> None:
-        x, v, forces = self.system.taken(state)  # in the cell of the state
+        x, v, forces = self.system.kernel_arrays(state)  # in the cell of the state
         if forces is None:
             forces = self.system.forces(x, v, state.time, state.step)
-        self.series.append(self.coordinates.sample(x, v, forces, state.time))
+        self._collector.add(x, v, forces, state.time)
+        if self.system.motion.lattice is not None:  # the next may be in another cell
+            self._collector.look()
+
+    @property
+    def series(self) -> Series:
+        self._collector.look()
+        return self._collector.series

@@ -104,7 +104,7 @@ class SolverSequence:
                 self.iterations[k] = outcome.iterations
                 found.append(lam)
             if images is not None:
-                rows.refuse_loose_links(x, self.numbers)
+                rows.refuse_unheld_links(x, self.numbers)
                 x[images.atoms] -= shifts
                 if len(plan.pinned):
                     x[plan.pinned] = plan.pinned_targets(targets)  # without the rounding of there and back
@@ -116,7 +116,7 @@ class SolverSequence:
                     np.copyto(velocities, saved[1])
             if isinstance(error, ConvergenceError):
                 # Atoms that have reached half the cell are the cause, and no step size a remedy.
-                rows.refuse_loose_links(tried, self.numbers)
+                rows.refuse_unheld_links(tried, self.numbers)
             raise
         if multipliers is not None:
             self._collect(found, multipliers)

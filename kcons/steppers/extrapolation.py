@@ -155,7 +155,7 @@ class Extrapolation:
         plan = _Plan(first_step or (min(FIRST / rate, left) if rate > 0 else left), columns)
         while state.time != until:
             state, plan = self._advanced(system, state, until, plan, speed)
-            yield state.shown()
+            yield state.read_only()
 
     @np.errstate(over="ignore", invalid="ignore")
     def _speed_and_rate(self, system: System, state: State) -> tuple[float, float]:
@@ -279,7 +279,7 @@ class _Table:
         system, start, change = self.system, self.start, self.line[-1]
         (x, shift), number = system.near_origin(start), start.step + 1
         time, left_over = start.later(self.size) if until is None else (until, 0.0)
-        x, v = x + change[0], system.taken(start)[1] + change[1]
+        x, v = x + change[0], system.kernel_arrays(start)[1] + change[1]
         check_finite(x, "position", number)
         check_finite(v, "velocity", number)
         x = system.motion.project_positions(x, x, time=time, reference_time=time)

@@ -19,12 +19,10 @@ from kcons.errors import ConvergenceError, ImageError, InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.program import Program, Row
 from kcons.steppers.stages.compiled_operations import (
-    COUNT,
     ENGINE,
     FAR,
     ITERATIONS,
     LENGTH,
-    PAIRS,
     PYTHON,
     ROOM,
     WIDTH,
@@ -187,7 +185,7 @@ class Interpreter:
     ) -> None:
         self.system, self.dt, self.program, self.start = system, dt, program, start
         self.steps = 1 if start.remainder is not None else steps
-        x, v, f = system.taken(start)
+        x, v, f = system.kernel_arrays(start)
         self.shape = shape = x.shape
         self.shift: FloatArray | None = None
         if start.remainder is not None:
@@ -198,13 +196,13 @@ class Interpreter:
         self.known = f is not None
         self.forces: FloatArray = np.zeros(shape) if f is None or system.force is None else f
         self.low: FloatArray | None = None
-        begin = ROOM + len(program.numbers)
+        begin = len(program.numbers)
         first = begin + (3 * x.size if program.pairs else 0)
         self.room = room = np.zeros(first + len(numbers))
-        room[PAIRS], room[ITERATIONS], room[COUNT] = program.pairs, -1.0, len(program.rows)
-        room[ROOM:begin] = program.numbers
+        room[:begin] = program.numbers
         self.numbers = room[first:]
-        self.numbers[:] = numbers
+        if len(numbers):
+            room[first:] = numbers
         if program.pairs:
             self.low, self.push, self.spare = room[begin:first].reshape(3, *shape)
         if system.friction is not None:  # flights take another time than their length

@@ -18,7 +18,17 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import address_of
 from kcons.steppers.operations import Fly, Kick, Operation
 from kcons.steppers.stages import compiled_operations as kernel
-from kcons.steppers.stages.compiled_operations import ADDRESS, CALL, FUNCTION, PYTHON, WIDTH
+from kcons.steppers.stages.compiled_operations import (
+    ADDRESS,
+    CALL,
+    COUNT,
+    FUNCTION,
+    ITERATIONS,
+    PAIRS,
+    PYTHON,
+    ROOM,
+    WIDTH,
+)
 
 #: Operations that show positions to a force function, after which they are not written to again.
 SHOWN = ("evaluate", "settle")
@@ -104,13 +114,14 @@ class Program:
 
     @property
     def numbers(self) -> FloatArray:
-        """What the kernel reads of the rows."""
+        """What a room begins with, of which the kernel reads the rows."""
         if self._numbers is None:
-            table = np.zeros((len(self.rows), WIDTH))
-            for line, row in zip(table, self.rows, strict=True):
+            self._numbers = np.zeros(ROOM + WIDTH * len(self.rows))
+            self._numbers[PAIRS], self._numbers[ITERATIONS], self._numbers[COUNT] = self.pairs, -1.0, len(self.rows)
+            for line, row in zip(self._numbers[ROOM:].reshape(-1, WIDTH), self.rows, strict=True):
                 line[:ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
-                line[ADDRESS] = 0 if row.verb != CALL else address_of(row.function, FUNCTION)
-            self._numbers = table.ravel()
+                if row.verb in (CALL, kernel.CIRCLE):
+                    line[ADDRESS] = address_of(row.function, FUNCTION if row.verb == CALL else kernel.CIRCLES)
         return self._numbers
 
     def __getstate__(self) -> dict[str, Any]:
@@ -138,7 +149,8 @@ def _rows(
             for length, end in zip(operation.flights, operation.ends, strict=True):
                 left -= 1
                 there, group = 1 + left % 2, groups.get(kick.group, 0)
-                yield Row(verb, what, here, there, length, kick.fraction, group, time, end, 0, operation)
+                passed = length, kick.fraction, group, time, end
+                yield Row(verb, what, here, there, *passed, 0, operation, kernel.fly_circles)
                 here, time, kick = there, end, Kick(0.0)
         else:
             what = CALL if verb in functions else kernel.PROJECT if verb == "project" else PYTHON

@@ -100,7 +100,7 @@ class ProjectedVerlet:
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Positions, velocities, and forces where these are those at the end."""
         start, number = system.with_forces(start), start.step + 1
-        x0, v0, f0 = system.taken(start)
+        x0, v0, f0 = system.kernel_arrays(start)
         assert f0 is not None
         a0 = self._acceleration(system, x0, v0, f0, start.time, number)
         half = v0 + (0.5 * dt) * a0
@@ -146,7 +146,7 @@ class ProjectedRungeKutta4(ProjectedVerlet):
     def _advance(
         self, system: System, start: State, dt: float, time: float
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0, _ = system.taken(replace(start, forces=None))
+        x0, v0, _ = system.kernel_arrays(replace(start, forces=None))
         middle, number = start.time + 0.5 * dt, start.step + 1
 
         def slope(x: FloatArray, v: FloatArray, t: float) -> FloatArray:

@@ -181,7 +181,7 @@ def run(
     done = 0
     try:
         for observer, _ in rhythms:
-            observer(state.shown())
+            observer(state.read_only())
         while done < steps:
             # Until somebody looks.
             n = min([steps - done, *(rhythm - done % rhythm for _, rhythm in rhythms)])
@@ -195,7 +195,7 @@ def run(
             schedule.made(n, check_every, state, dt, spare=spare)
             for observer, rhythm in rhythms:
                 if done % rhythm == 0:
-                    observer(state.shown())
+                    observer(state.read_only())
     except BaseException as error:  # also one of the forces, or of the keyboard: nothing recorded is lost
         if record is not None:
             error.trajectory = kept  # type: ignore[attr-defined]

@@ -33,7 +33,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
 from kcons.steppers.stages.compiled_operations import beyond, check_finite
 from kcons.steppers.stages.friction import Friction
-from kcons.steppers.stages.packed_system import PackedSystem, more_tables, spheres_of, tables_without_rows
+from kcons.steppers.stages.packed_system import PackedSystem, spheres_of, tables_without_rows
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -41,7 +41,7 @@ FAR = 8.0
 #: Residual of initial positions (by the row's scale) and velocities (by the speed) that is taken for rounding.
 START_TOLERANCE = 1e-9
 
-#: What the stages of a step together round, of its kick.
+#: Rounding of velocities in all stages of a step, relative to its kick.
 KICK_ROUNDING = 64 * float(np.finfo(float).eps)
 
 _FLOAT = np.dtype(np.float64)
@@ -179,7 +179,7 @@ class State:
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
 
-    def shown(self) -> State:
+    def read_only(self) -> State:
         """The same state for a function of the user, who can read its arrays and not change them."""
         view = object.__new__(_Shown)
         object.__setattr__(view, "__dict__", vars(self))
@@ -434,7 +434,7 @@ class System:
             )
         return f
 
-    def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    def kernel_arrays(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Positions, velocities and forces of a state, as the kernels can take them.
 
         Raises
@@ -458,7 +458,7 @@ class System:
         """The state with its forces filled in."""
         if state.has_forces_of(self):
             return state
-        x, v, _ = self.taken(state)
+        x, v, _ = self.kernel_arrays(state)
         origin = ref(self), state.positions, state.velocities, state.time
         return replace(state, forces=self.forces(x, v, state.time, state.step), origin=origin)
 
@@ -499,9 +499,14 @@ class System:
 
     @cached_property
     def _more_tables(self) -> tuple[NDArray[Any], ...]:
-        held = self._free_of_origin
+        """What is behind the rows in the tables of kernels.
+
+        1/m; atoms none of which is far from the first where the system is near the origin (none: it always is); how
+        many times farther from the origin than from any other the first has to be then; great circles.
+        """
+        held, spheres = self._free_of_origin, self.great_circles
         atoms = np.zeros(0, dtype=np.int64) if held is None else np.append(self.anchor, held)
-        return more_tables(self.weights, atoms, self.far, self.great_circles)
+        return self.weights.ravel(), atoms, np.array([self.far]), np.zeros(0) if spheres is None else spheres.ravel()
 
     @cached_property
     def packed(self) -> PackedSystem | None:
@@ -536,7 +541,7 @@ class System:
 
         Where rows know a place in space, they take all positions as they are.
         """
-        x, _, _ = self.taken(state)
+        x, _, _ = self.kernel_arrays(state)
         if state.remainder is None or self._free_of_origin is None:
             return x, None
         shift = x[self.anchor]

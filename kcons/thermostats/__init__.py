@@ -1,5 +1,6 @@
 """Thermostats on constraints. Each is a stepper.
 
+- `bodies`: what rows tie together, and what may move as one
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
@@ -13,7 +14,7 @@
 """
 
 from kcons.thermostats.configurational_temperature import configurational_sample, configurational_temperature
-from kcons.thermostats.correlated_series import Estimate, mean
+from kcons.thermostats.correlated_series import Estimate, autocorrelation_time, evaluations_per_sample, mean
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
@@ -24,8 +25,6 @@ from kcons.thermostats.multistep import (
     ForceGroups,
     IsokineticSpheres,
     LangevinRespa,
-    autocorrelation_time,
-    evaluations_per_sample,
 )
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.pressure import (

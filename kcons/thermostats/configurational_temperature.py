@@ -20,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.thermostats.correlated_series import Estimate, checked, few, spread
-from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.isokinetic.step import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Standard errors by which the mean curvature must differ from 0 for a ratio to have an error.
@@ -101,7 +101,7 @@ def configurational_sample(
     x, time = state.positions, state.time
     forces = system.with_forces(state).forces
     assert forces is not None
-    square = float((forces * paced(system, x, forces, time)).sum())
+    square = float((forces * constrained_acceleration(system, x, forces, time)).sum())
     total = 0.0
     for _ in range(whole_number(directions, "directions")):
         v = thermal_velocities(system, x, 1.0, rng, time=time)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -205,6 +205,39 @@ def mean(values: ArrayLike) -> Estimate:
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=2)
     return Estimate(float(series.mean()), found.error)
+
+
+def autocorrelation_time(values: ArrayLike) -> float:
+    """Statistical inefficiency of a series, in values: so many of them tell as much of the mean as an independent one.
+
+    1 for a series that does not change, or whose values swing back.
+
+    Raises
+    ------
+    InputError
+        Fewer than 32 values; a NaN or infinity.
+    """
+    series = checked(numbers(values, "values"), "values")
+    error = spread(series).error
+    return max(1.0, error**2 * len(series) / float(series.var(ddof=1))) if error else 1.0
+
+
+def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:
+    """Evaluations of the (slow) forces for one independent sample of what was observed.
+
+    Parameters
+    ----------
+    values : array_like, shape (n_values,)
+        An observable along a run, after equilibration.
+    evaluations : float
+        Of the forces in question from one value to the next, for example from `ForceGroups.evaluations`.
+
+    Raises
+    ------
+    InputError
+        As for `autocorrelation_time`; evaluations not positive.
+    """
+    return positive(evaluations, "evaluations") * autocorrelation_time(values)
 
 
 def slope(times: FloatArray, values: FloatArray) -> Estimate:

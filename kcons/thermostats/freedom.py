@@ -16,6 +16,7 @@ from kcons.constraints.vectors import extent
 from kcons.errors import InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, System
+from kcons.thermostats.bodies import UNCHANGED, bodies, placed_rows, row_changes, shifts
 
 Momentum = Literal["auto", "conserved", "free"]
 
@@ -30,8 +31,6 @@ EXACT = 1e-12
 AT_REST = 1e-16
 #: How far the system is shifted, relative to its size, to see whether forces depend on its place.
 SHIFT = 1e-2
-#: How far each atom is moved to see whether a surface is curved.
-TURN = 1e-3
 #: How far each atom is moved besides, so that nothing cancels by symmetry.
 SHAKE = 1e-4
 #: Steps after which it is looked whether bodies feel each other; shorter runs have no averages.
@@ -159,30 +158,15 @@ def open_directions(motion: Motion, positions: FloatArray, time: float = 0.0) ->
 
     All three unless a row knows a place in space. A plane leaves two, a cylinder its axis, fixed atoms none.
     """
-    held = motion.constraint_set
-    placed = np.zeros(held.n_rows, dtype=bool)
-    first = 0
-    for item in held.constraints:
-        placed[first : first + item.n_rows] = not item.translation_invariant
-        first += item.n_rows
+    placed = placed_rows(motion.constraint_set)
     if not placed.any():
         return np.eye(3)
     # A shift d changes a row by its gradient summed over the atoms, times d; for all places if for a few at random.
-    rng = np.random.default_rng(0)
-    size = extent(positions) or 1.0
-    every = np.tile(np.eye(3), (motion.n_atoms, 1))
-    sums = []
-    for spread in (0.0, TURN * size, TURN * size):
-        x = positions + spread * rng.standard_normal(positions.shape)
-        with np.errstate(all="ignore"):
-            rows = held.jacobian(x, time)
-        if not np.isfinite(rows.data).all():
-            return np.zeros((0, 3))  # a surface that is not defined nearby has a place in space
-        change = np.asarray(rows @ every)[placed]
-        scale = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())[placed]
-        sums.append(change / np.where(scale > 0, scale, 1.0)[:, None])
-    _, values, axes = np.linalg.svd(np.vstack(sums), full_matrices=True)
-    rank = int((values > 1e-9 * max(float(values[0]), 1e-300)).sum()) if values[0] > 1e-12 else 0
+    sums = np.vstack([change[placed] for change in row_changes(motion, positions, shifts, time)])
+    if not np.isfinite(sums).all():
+        return np.zeros((0, 3))  # a surface that is not defined nearby has a place in space
+    _, values, axes = np.linalg.svd(sums, full_matrices=True)
+    rank = int((values > UNCHANGED * max(float(values[0]), 1e-300)).sum()) if values[0] > 1e-12 else 0
     return np.ascontiguousarray(axes[rank:])
 
 
@@ -250,21 +234,14 @@ class RigidMotions:
         """Leave out motions that change rows, where their atoms are and nearby; all in a cell, and if rows move."""
         if motion.lattice is not None or motion.plan.driven:
             self._motions = np.zeros((0, 6))
-        moving = np.ones((len(x), 1))
-        moving[motion.fixed_atoms] = 0.0
-        for shaken in TURN * self._size * moving * np.random.default_rng(0).standard_normal((3, *x.shape)):
-            if not self.found:
-                return
-            with np.errstate(all="ignore"):
-                rows = motion.constraint_set.jacobian(x + shaken, time)
-                lengths = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
-            change = np.asarray(rows @ self.fields(x + shaken)) / np.where(lengths > 0, lengths, 1.0)[:, None]
-            self.keep(change if np.isfinite(change).all() else np.eye(6))  # a surface that is not defined nearby
+        for change in row_changes(motion, x, self.fields, time):
+            if self.found:
+                self.keep(change if np.isfinite(change).all() else np.eye(6))  # a surface that is not defined nearby
 
     def keep(self, change: FloatArray) -> None:
         """Leave out motions in which anything changes, by a change in each of the six, shape (k, 6)."""
         _, values, axes = np.linalg.svd(np.linalg.qr(change @ self._motions.T, mode="r"), full_matrices=True)
-        self._motions = axes[int((values > 1e-9).sum()) :] @ self._motions
+        self._motions = axes[int((values > UNCHANGED).sum()) :] @ self._motions
 
     def see(self, x: FloatArray, forces: FloatArray) -> None:
         """Leave out a motion in which the forces of this place do work."""
@@ -369,7 +346,8 @@ def _apart(system: System, state: State) -> bool:
     """
     if system.force is None:
         return False
-    x, forces, label = state.positions, state.forces, _bodies(system)
+    x, forces = state.positions, state.forces
+    label = bodies(system.motion, system.inverse_masses[:, 0] > 0)
     assert forces is not None
     count = int(label.max(initial=-1)) + 1
     if count < 2:
@@ -397,19 +375,6 @@ def _apart(system: System, state: State) -> bool:
     return True
 
 
-def _bodies(system: System) -> IntArray:
-    """What rows tie together, a number for each atom, shape (n_atoms,); -1 for those that are fixed."""
-    from scipy.sparse import diags
-    from scipy.sparse.csgraph import connected_components
-
-    moving = system.inverse_masses[:, 0] > 0
-    joins = system.motion.constraint_set.incidence.astype(np.float64) @ diags(moving.astype(np.float64))
-    found = connected_components(joins.T @ joins, directed=False)[1]
-    label = np.full(system.n_atoms, -1, dtype=np.int64)
-    label[moving] = np.unique(found[moving], return_inverse=True)[1]
-    return label
-
-
 def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
     """Different atom numbers in order.
 
@@ -428,8 +393,21 @@ def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
     return numbers
 
 
-def refuse_friction(system: System) -> None:
-    """Raise `UnsupportedError` where the system has friction of its own, which takes out heat that no noise brings."""
+def refuse_dissipation(system: System, why: str) -> None:
+    """Refuse friction of the system, which takes out heat that no noise brings, and velocity-dependent forces.
+
+    Parameters
+    ----------
+    system : System
+    why : str
+        What a thermostat lacks for the latter, and what to do.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    if system.velocity_dependent:
+        raise UnsupportedError(f"forces that depend on the velocities have no {why}")
     if system.friction is not None:
         raise UnsupportedError(
             "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "

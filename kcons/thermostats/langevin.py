@@ -11,13 +11,13 @@ import numpy as np
 from kcons.constraints.arguments import finite_number, positive, seed_number, whole_number
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.program import Program, Row
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
 from kcons.thermostats.noise import fill_normal
 
 #: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, gamma and k_B T,
@@ -46,8 +46,8 @@ class _Generator(threading.local):
 _GENERATOR = _Generator()
 
 
-def wound(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
-    """The generator of this thread at the stretch of the key's stream that belongs to a part of a step."""
+def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
+    """This thread's generator of numbers that are a function of a key, the number of a step and its part."""
     generator = _GENERATOR
     generator.key[:] = key
     generator.counter[2:] = number, part
@@ -85,9 +85,7 @@ class SeededBath(Interpreted):
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
+        refuse_dissipation(system, "place in this scheme; use friction")
 
     def depends_on(self, system: System, state: State) -> Any:
         return self.thermal_energy, self.friction, self.seed
@@ -99,7 +97,7 @@ class SeededBath(Interpreted):
 
     def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
         """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
-        return wound((self.seed, 0), number, part).standard_normal(shape)
+        return noise_generator((self.seed, 0), number, part).standard_normal(shape)
 
 
 class Langevin(SeededBath):

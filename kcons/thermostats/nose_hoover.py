@@ -28,7 +28,7 @@ from kcons.thermostats.freedom import (
     may_be,
     momentum_share,
     open_directions,
-    refuse_friction,
+    refuse_dissipation,
     warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
@@ -143,9 +143,7 @@ class NoseHooverChain(Interpreted):
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use Langevin")
+        refuse_dissipation(system, "place in this scheme; use Langevin")
         if system.motion.plan.driven:
             raise UnsupportedError(
                 "targets move, or rows hold velocities, and scaled velocities would not follow them; use Langevin"

@@ -11,7 +11,7 @@ from kcons.constraints.arguments import generator_of, numbers, refuse_other
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.isokinetic.step import constrained_acceleration
 from kcons.thermostats.multistep import ForceGroups
 from kcons.thermostats.temperature_split import configuration, flight_of
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -76,7 +76,7 @@ def slow_share(
             for name in force.groups:
                 f = system.accepted(force.of(name, there, 0.0), number, True)
                 check_finite(f, "force", number)
-                pace = math.copysign(1.0, way) * paced(system, there, f, 0.0)
+                pace = math.copysign(1.0, way) * constrained_acceleration(system, there, f, 0.0)
                 changes += np.array([name == group, True])[:, None, None] * pace
         squares = [system.motion.project_velocities(here, c) ** 2 * system.masses[:, None] for c in changes]
         slow, whole = slow + float(squares[0].sum()), whole + float(squares[1].sum())

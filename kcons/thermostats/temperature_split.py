@@ -37,16 +37,15 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.thermostats.bodies import UNCHANGED, bodies, row_changes
 from kcons.thermostats.configurational_temperature import temperature
 from kcons.thermostats.correlated_series import FEWEST, Estimate
 from kcons.thermostats.freedom import atom_numbers
-from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.isokinetic.step import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Typical move for a difference, as a share of the distance to the next atom.
 MOVE = 1e-3
-#: Change of a row by a shift or a turn that is taken for rounding, relative to its gradient.
-UNCHANGED = 1e-9
 #: Moment of inertia about an axis, relative to the largest, below which there is no turn.
 THIN = 1e-9
 #: Share of its thermal energy below which a cluster has no motion of its own.
@@ -55,8 +54,6 @@ RIGID = 1e-9
 BALANCED = 1e-7
 #: Violation of a row, relative to its scale, that no temperature shows; OpenMM's own integrators leave 1e-5.
 OFF = 1e-4
-#: How far atoms are moved, as a share of the size of all, to see whether a row knows a place in space.
-_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -105,24 +102,18 @@ class Clusters:
     """
 
     def __init__(self, motion: Motion, positions: FloatArray, moving: NDArray[np.bool_]) -> None:
-        from scipy.sparse import diags
-        from scipy.sparse.csgraph import connected_components
-
         held = motion.constraint_set
-        self._held = held
+        self._motion, self._held = motion, held
         self._masses = np.where(moving, held.masses, 0.0)
-        joins = held.incidence.astype(np.float64) @ diags(moving.astype(np.float64))
-        found = connected_components(joins.T @ joins, directed=False)[1]
-        self.label: IntArray = np.full(len(moving), -1, dtype=np.int64)
-        self.label[moving] = np.unique(found[moving], return_inverse=True)[1]
+        self.label: IntArray = bodies(motion, moving)
         self.count = int(self.label.max(initial=-1)) + 1
         self._moving = np.flatnonzero(moving)
         self._of = self.label[self._moving]
         self.mass: FloatArray = self.add_up(self._masses)
-        ends = joins.tocsr()
-        rows = np.repeat(np.arange(held.n_rows), np.diff(ends.indptr))
-        first = ends.indices[np.minimum(ends.indptr[rows], max(len(ends.indices) - 1, 0))]
-        self._tree = spanning_tree(np.stack([first, ends.indices], axis=1).astype(np.int64), len(moving))
+        rows, touched = held.incidence.nonzero()
+        rows, touched = rows[moving[touched]], touched[moving[touched]]
+        first = touched[np.searchsorted(rows, rows)]
+        self._tree = spanning_tree(np.stack([first, touched], axis=1).astype(np.int64), len(moving))
         self.shifts, self.turns = self._open(positions)
 
     def add_up(self, values: FloatArray) -> FloatArray:
@@ -166,28 +157,23 @@ class Clusters:
         held = self._held
         if not held.n_rows:
             return every, several
-        touched = held.incidence.tocsr()
-        rows = np.repeat(np.arange(held.n_rows), np.diff(touched.indptr))
-        cluster = self.label[touched.indices]
         shifts, turns = every.copy(), several.copy()
-        rng = np.random.default_rng(0)
+        rows, touched = held.incidence.nonzero()
         whole = self._whole(positions)
-        size = extent(whole) or 1.0
-        size = min(size, float(held.scale.min()))
-        for spread in (0.0, _SPREAD, _SPREAD):
-            y = whole + spread * size * rng.standard_normal(whole.shape)
-            with np.errstate(all="ignore"):
-                jacobian = held.jacobian(y, 0.0)
-            norm = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
-            p = self.arms(y)
+        size = min(extent(whole) or 1.0, float(held.scale.min()))
+        inside = (self.label >= 0)[:, None]
+
+        def fields(x: FloatArray) -> FloatArray:
+            p = self.arms(x)
             reach = math.sqrt(float((p * p).sum(axis=1).max(initial=0.0))) or 1.0
-            for axis in np.eye(3):
-                moves = (np.where((self.label >= 0)[:, None], axis, 0.0), np.cross(axis, p) / reach)
-                for field, may in zip(moves, (shifts, turns), strict=True):
-                    change = np.abs(jacobian @ field.ravel())
-                    tied = ~(change <= UNCHANGED * norm)  # NaN: a surface that is not defined here
-                    hit = cluster[tied[rows]]
-                    may[hit[hit >= 0]] = False
+            moves = [np.where(inside, axis, 0.0) for axis in np.eye(3)]
+            return np.stack([m.ravel() for m in (*moves, *(np.cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
+
+        for change in row_changes(self._motion, whole, fields, 0.0, size):
+            kept: NDArray[np.bool_] = np.asarray(np.abs(change) <= UNCHANGED)  # not NaN: a surface that ends there
+            for may, some in ((shifts, kept[:, :3]), (turns, kept[:, 3:])):
+                hit = self.label[touched[~np.asarray(some.all(axis=1))[rows]]]
+                may[hit[hit >= 0]] = False
         return shifts, turns
 
 
@@ -381,7 +367,7 @@ class TemperatureSplit:
         turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
         whole = np.zeros_like(shift)
         if self._rest is None or self._rest.any():
-            whole = clusters.add_up((f * paced(self._system, x, f, 0.0)).sum(axis=1))
+            whole = clusters.add_up((f * constrained_acceleration(self._system, x, f, 0.0)).sum(axis=1))
         return np.stack([shift, turn, whole])
 
     def _curvatures(self, x: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:

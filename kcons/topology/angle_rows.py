@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import minimum_image, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross, dot, norm
-from kcons.topology.rigid_groups import inside_bodies
+from kcons.topology.rigid_groups import body_numbers, inside_bodies
 from kcons.topology.ring_systems import RingSystems, ring_rows, ring_systems
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles
 
@@ -72,17 +72,11 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
 
 def _labels(n: int, bonds: IntArray, systems: RingSystems, rigid: Sequence[IntArray]) -> IntArray:
     """A number for each bond, the same for bonds of one ring system or rigid group; -1 for all others."""
-    label = systems.of_bond.copy()
-    first = len(systems.rings)
-    for atoms in rigid:
-        # Atoms may belong to several bodies: those are looked at one by one.
-        apart = len(np.unique(atoms)) == atoms.size
-        for some in [atoms] if apart else atoms[:, None]:
-            body = np.full(n, -1)
-            body[some.ravel()] = np.repeat(np.arange(len(some)), some.shape[1])
-            inside = (label < 0) & (body[bonds[:, 0]] >= 0) & (body[bonds[:, 0]] == body[bonds[:, 1]])
-            label[inside] = first + body[bonds[inside, 0]]
-            first += len(some)
+    label, first = systems.of_bond.copy(), len(systems.rings)
+    for body in body_numbers(n, rigid):
+        both = body[bonds]
+        inside = (label < 0) & (both[:, 0] >= 0) & (both[:, 0] == both[:, 1])
+        label[inside] = first + both[inside, 0]
     return label
 
 

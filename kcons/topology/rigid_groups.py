@@ -9,7 +9,7 @@ nearby, so that no atom takes part in many rows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -467,15 +467,21 @@ def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> No
         )
 
 
-def inside_bodies(n_atoms: int, pairs: IntArray, groups: Sequence[IntArray]) -> BoolArray:
-    """Which of the pairs lie within one body, a mask of shape (n_pairs,)."""
-    inside = np.zeros(len(pairs), dtype=bool)
+def body_numbers(n_atoms: int, groups: Sequence[IntArray]) -> Iterator[IntArray]:
+    """The body of each atom, -1 for none, shape (n_atoms,); several where atoms belong to more than one."""
+    first = 0
     for atoms in groups:
-        # Atoms may belong to several bodies: those are looked at one by one.
-        body = np.full(n_atoms, -1, dtype=np.int64)
-        body[atoms.ravel()] = np.repeat(np.arange(len(atoms)), atoms.shape[1])
-        inside |= (body[pairs] >= 0).all(axis=1) & (body[pairs[:, 0]] == body[pairs[:, -1]])
-        if len(np.unique(atoms)) < atoms.size:
-            for one in atoms:
-                inside |= np.isin(pairs, one).all(axis=1)
+        apart = len(np.unique(atoms)) == atoms.size
+        for some in [atoms] if apart else atoms[:, None]:
+            body = np.full(n_atoms, -1, dtype=np.int64)
+            body[some.ravel()] = first + np.repeat(np.arange(len(some)), some.shape[1])
+            first += len(some)
+            yield body
+
+
+def inside_bodies(n_atoms: int, lists: IntArray, groups: Sequence[IntArray]) -> BoolArray:
+    """Which lists of atoms, shape (n, width), lie within one body, a mask of shape (n,)."""
+    inside = np.zeros(len(lists), dtype=bool)
+    for body in body_numbers(n_atoms, groups):
+        inside |= (body[lists[:, 0]] >= 0) & (body[lists] == body[lists[:, :1]]).all(axis=1)
     return inside

@@ -12,12 +12,6 @@ from ase.build import bcc100, molecule
 from ase.calculators.emt import EMT
 from ase.constraints import (
     FixAtoms,
-    FixBondLengths,
-    FixCartesian,
-    FixedLine,
-    FixedPlane,
-    FixInternals,
-    FixSubsetCom,
     Hookean,
 )
 from ase.io import read, write
@@ -140,13 +134,6 @@ def test_atoms_can_be_deleted_as_with_fix_atoms():
         del bound[2]
 
 
-def test_two_objects_on_the_same_atoms_are_still_refused():
-    atoms = slab()
-    constrain(atoms, [FixedAtoms([0]), Distance([[12, 13]])])
-    with pytest.raises(UnsupportedError, match="ConstraintsWithFixedAtoms acts on atom 12"):
-        constrain(atoms, Distance([[12, 11]]))
-
-
 @pytest.mark.filterwarnings("ignore:Vibrations displaces")
 def test_vibrations_leave_out_the_fixed_atoms_alone(tmp_path):
     atoms = slab()
@@ -228,9 +215,3 @@ def test_what_no_object_of_ase_holds_is_named():
     half = molecule("CH3CH2OH")
     constrain(half, [CenterOfMass([0, 1], axes=(0, 2)), LinearCombination([0, 1], [[1.0, 0, 0], [1.0, 0, 0]])])
     assert plain_kinds(half, missing="leave out") == []
-
-
-def test_each_kind_is_one_of_ase():
-    """The names above are classes of ASE."""
-    known = (FixAtoms, FixBondLengths, FixCartesian, FixedLine, FixedPlane, FixInternals, FixSubsetCom)
-    assert {name for names in ROWS for name in names.split()} == {each.__name__ for each in known}

@@ -40,7 +40,6 @@ from kcons.errors import (
     ContradictionError,
     ConvergenceError,
     InputError,
-    KconsError,
     SingularGeometryError,
     UnsupportedError,
 )
@@ -48,27 +47,27 @@ from kcons.steppers import BlanesMoan4
 
 
 @pytest.mark.parametrize(
-    ("other", "hint"),
+    "other",
     [
-        (FixAtoms([0]), "FixedAtoms"),
-        (FixBondLengths([[0, 4]]), "Distance"),
-        (FixedPlane([1], (0, 0, 1)), "Plane"),
-        (FixCartesian([2]), "LinearCombination"),
-        (Constraints(Distance([2, 4])), ""),
-        (FixedMode(np.eye(6)[:, :3]), ""),  # of atoms 0, 1 and 2; it says itself that it acts on none
+        *(FixAtoms([0]), FixBondLengths([[0, 4]]), FixedPlane([1], (0, 0, 1)), FixCartesian([2])),
+        Constraints(Distance([2, 4])),
+        FixedMode(np.eye(6)[:, :3]),  # of atoms 0, 1 and 2; it says itself that it acts on none
     ],
     ids=lambda v: type(v).__name__,
 )
 @pytest.mark.parametrize("first", [True, False])
-def test_company_on_the_same_atoms_is_refused(other, hint, first):
+def test_company_on_the_same_atoms_is_refused(other, first):
     atoms, held = rigid(2)
     held.restore(atoms)
     atoms.set_constraint([held, other] if first else [other, held])
     before = atoms.positions.copy()
-    with pytest.raises(UnsupportedError, match=f"{type(other).__name__} acts on atom.*one Constraints object.*{hint}"):
+    with pytest.raises(UnsupportedError, match=f"{type(other).__name__} acts on atom.*one Constraints object"):
         atoms.set_positions(before + np.random.default_rng(0).normal(scale=0.01, size=(6, 3)))
     assert np.array_equal(atoms.positions, before)
     with pytest.raises(UnsupportedError):
+        atoms.get_forces()
+    if not isinstance(other, FixedMode):
+        attach(atoms)  # as it is told
         atoms.get_forces()
 
 
@@ -100,7 +99,7 @@ def test_fix_com_beside_a_surface_is_refused():
     atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
     held = constrain(atoms, Sphere([0], [0, 0, 0]))
     atoms.set_constraint([FixCom(), held])
-    with pytest.raises(UnsupportedError, match=r"FixCom acts on atom 0.*CenterOfMass"):
+    with pytest.raises(UnsupportedError, match=r"FixCom acts on atom 0"):
         atoms.set_momenta(np.ones((2, 3)))
 
 
@@ -115,21 +114,6 @@ def test_new_masses_are_noticed():
     assert slip(atoms, held) <= 1e-14
     atoms.numbers[1] = 8
     assert np.array_equal(held.engine(atoms).masses, atoms.get_masses())
-
-
-def test_masses_of_other_atoms_do_not_rebuild_the_engine():
-    atoms = loose_waters(2)
-    held = constrain(atoms, Distance([0, 1]))
-    engine = held.engine(atoms)
-    masses = atoms.get_masses()
-    atoms.set_masses(masses)
-    engine = held.engine(atoms)
-    masses[5] = 3.0
-    atoms.set_masses(masses)
-    assert held.engine(atoms) is engine
-    masses[0] = 3.0
-    atoms.set_masses(masses)
-    assert held.engine(atoms) is not engine
 
 
 def test_new_cell_is_noticed_and_targets_stay():
@@ -265,35 +249,22 @@ def test_bad_input_is_named(atoms, rows, error, message):
     assert atoms.constraints == []
 
 
-def failing_positions():
-    turned = molecule("H2O")
-    turned.rotate(90, "x")
-    turned.rotate(90, "y")
-    nan = molecule("H2O").positions
-    nan[2, 0] = np.nan
-    inf = molecule("H2O").positions
-    inf[0, 0] = np.inf
-    apart = turned.positions + np.array([[0, 0, 3], [0, 0, -3], [0, 0, 0]])
-    return {"a step too large": apart, "nan": nan, "inf": inf}
-
-
-@pytest.mark.parametrize("case", failing_positions())
-def test_failing_position_hook_changes_nothing(case):
+def test_a_step_too_large_changes_nothing():
     atoms = molecule("H2O")
     held = constrain(atoms, rigid_water(atoms))
-    new = failing_positions()[case]
+    turned = atoms.copy()
+    turned.rotate(90, "x")
+    turned.rotate(90, "y")
+    new = turned.positions + np.diag([3.0, -3.0, 0.0])
     asked, before = new.copy(), atoms.positions.copy()
-    with pytest.raises(KconsError) as caught:
+    with pytest.raises(ConvergenceError) as caught:
         held.adjust_positions(atoms, new)
-    assert np.array_equal(new, asked, equal_nan=True)
-    with pytest.raises(KconsError):
+    assert np.array_equal(new, asked)
+    assert any("smaller timestep" in note for note in caught.value.__notes__)
+    with pytest.raises(ConvergenceError):
         atoms.set_positions(new)
     assert np.array_equal(atoms.positions, before)
-    if case == "a step too large":
-        assert isinstance(caught.value, ConvergenceError)
-        assert any("smaller timestep" in note for note in caught.value.__notes__)
-    # and the object still works
-    atoms.set_positions(before + 0.01)
+    atoms.set_positions(before + 0.01)  # and the object still works
 
 
 @pytest.mark.parametrize("hook", ["adjust_positions", "adjust_momenta", "adjust_forces"])
@@ -322,7 +293,7 @@ def test_time_step_too_large_in_dynamics():
 def test_a_second_object_of_kcons_says_how_to_make_one():
     atoms = molecule("CH3OH")
     first = constrain(atoms, Distance([[0, 1]]))
-    with pytest.raises(UnsupportedError, match=r"Constraints acts on atom 0.*\[\*old\.constraints, \*new\]"):
+    with pytest.raises(UnsupportedError, match=r"Constraints acts on atom 0.*\[\*held, \*new\]"):
         constrain(atoms, Distance([[0, 2]]))
     assert atoms.constraints == [first]
 

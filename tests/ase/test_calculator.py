@@ -210,7 +210,8 @@ class Bad(Calculator):
 
 
 @pytest.mark.parametrize(
-    ("forces", "message"), [(np.zeros((2, 3)), r"shape \(2, 3\)"), (np.full((9, 3), np.nan), "atom 0 is not finite")]
+    ("forces", "message"),
+    [(np.zeros((2, 3)), r"shape \(9, 3\), not \(2, 3\)"), (np.full((9, 3), np.nan), "atom 0 is not finite")],
 )
 def test_bad_inner_calculator(forces, message):
     atoms, _ = ethanol(Bad(forces))

@@ -28,10 +28,9 @@ from kcons.ase import (
     attach,
     constrain,
     draw_velocities,
-    rigid_water,
 )
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge
-from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.errors import InputError, KconsError
 from kcons.steppers import Baumgarte, Geodesic, ProjectedVerlet, Rattle, Suzuki4
 
 # -- right ------------------------------------------------------------------------------------------
@@ -105,16 +104,6 @@ def test_ase_constraints_are_absorbed(beside_ours):
     assert held is None or off(atoms, held) <= 1e-14
     assert dyn.degrees_of_freedom == 27 - 3 - 2 - beside_ours
     assert dyn.get_temperature() == pytest.approx(atoms.get_temperature())
-
-
-def test_unknown_ase_constraint_is_refused():
-    from ase.constraints import FixedMode
-
-    atoms = molecule("H2O")
-    atoms.calc = Field()
-    atoms.set_constraint(FixedMode(np.ones((3, 3))))
-    with pytest.raises(UnsupportedError, match="FixedMode has no counterpart"):
-        ConstrainedDynamics(atoms, FS)
 
 
 def boxed() -> tuple[Atoms, Constraints]:
@@ -323,7 +312,7 @@ def test_what_constraints_hold_changed_between_steps_is_taken(change, rest):
 
 @pytest.mark.parametrize("change", ["masses", "elements"])
 def test_masses_of_free_atoms_changed_between_steps_are_taken(change):
-    """No row touches them, and the engine of the rows still fits; the steps do not."""
+    """No row touches them."""
 
     def go_on(atoms, dyn):
         if change == "masses":
@@ -429,24 +418,11 @@ def test_bad_time_and_forces():
             ConstrainedDynamics(atoms, FS, forces=forces)
 
 
-class Tired(EMT):
-    """Gives up after some evaluations, by an error of its own."""
-
-    def __init__(self, most):
-        super().__init__()
-        self.left = most
-
-    def calculate(self, *words):
-        self.left -= 1
-        if self.left < 0:
-            raise RuntimeError("SCF not converged")
-        super().calculate(*words)
-
-
 def test_the_step_and_the_temperature_are_named():
-    atoms = molecule("H2O")
-    atoms.calc = Tired(3)
-    constrain(atoms, rigid_water(atoms))
+    def tired(forces):
+        raise RuntimeError("SCF not converged")
+
+    atoms, _ = water(Field(bad=3, how=tired))
     draw_velocities(atoms, 300, rng=1)
     dynamics = ConstrainedDynamics(atoms, 1 * units.fs)
     dynamics.run(2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from pathlib import Path
 
 import ase.io
@@ -12,14 +13,14 @@ from ase import Atoms
 from ase.build import molecule
 
 from kcons.ase import (
-    ConstrainedDynamics,
     ConstrainedLangevin,
     constrain,
     constraints_of,
     draw_velocities,
     repartition_hydrogen_mass,
+    rigid_water,
 )
-from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, mend_elements, snapshot_of, velocities_of
+from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, repair_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
 
 
@@ -30,6 +31,9 @@ def peptide():
     atoms.new_array("residuenames", np.array(["SER"] * 4))
     atoms.new_array("residuenumbers", np.array([4] * 4))
     return atoms
+
+
+LANGEVIN = {"timestep": 1.0, "temperature_K": 300, "friction": 0.01}
 
 
 def test_bonds_are_guessed_where_none_are_given():
@@ -52,19 +56,10 @@ def test_a_molecule_that_ase_wrote_to_a_pdb_file_keeps_its_bonds(tmp_path):
             assert constraints_of(back, held)[0].n_rows == rows[0].n_rows
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        constraints_of,
-        lambda atoms: constrain(atoms, "hbonds"),
-        lambda atoms: constrain(atoms, []),
-        lambda atoms: ConstrainedDynamics(atoms, 1.0),
-        lambda atoms: ConstrainedLangevin(atoms, 1.0, temperature_K=300, friction=0.01),
-        lambda atoms: draw_velocities(atoms, temperature_K=300),
-    ],
-    ids=["constraints_of", "by name", "rows", "dynamics", "thermostat", "velocities"],
-)
+@pytest.mark.parametrize("call", [constraints_of, constrain, ConstrainedLangevin, draw_velocities, rigid_water])
 def test_a_list_of_frames_is_no_atoms(call):
+    more = {constrain: {"constraints": []}, ConstrainedLangevin: LANGEVIN, draw_velocities: {"temperature_K": 300}}
+    call = partial(call, **more.get(call, {}))
     with pytest.raises(InputError, match=r"atoms must be an ase.Atoms .* not list; of several, give one") as caught:
         call([molecule("H2O")])
     assert caught.value.item == "atoms"
@@ -94,10 +89,10 @@ def test_names_say_what_elements_are():
     assert topology.elements.tolist() == ["N", "C", "C", "H"]
     assert topology.masses[1] == pytest.approx(12.011) and topology.masses[3] == pytest.approx(1.008)
     assert atoms.symbols[1] == "Ca"  # until they are mended
-    assert mend_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
+    assert repair_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert mend_elements(atoms) == 0
+        assert repair_elements(atoms) == 0
     other = peptide()
     other.set_masses([14.0, 99.0, 12.0, 98.0])
     with pytest.warns(UserWarning):
@@ -110,17 +105,17 @@ def test_metals_of_a_file_with_elements_stay():
     atoms.symbols = "NCCoHg"
     atoms.arrays["atomtypes"][2] = "CO"
     with pytest.warns(UserWarning, match="1 elements are not what names suggest, such as Co of CO") as told:
-        assert mend_elements(atoms) == 1
+        assert repair_elements(atoms) == 1
     assert str(atoms.symbols) == "NCCoH" and len(told) == 1
     with pytest.warns(UserWarning, match="they are left"):
         assert snapshot_of(atoms).topology.elements[2] == "Co"
     atoms.symbols[1] = "Ca"  # nothing says that elements were in a file
-    assert mend_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
+    assert repair_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
 
 
 def test_there_and_back():
     atoms = peptide()
-    mend_elements(atoms)
+    repair_elements(atoms)
     atoms.new_array("chainids", np.array(["B"] * 4))
     atoms.info["bonds"] = np.array([[0, 1], [1, 2]])
     atoms.set_initial_charges([0.1, 0.2, -0.3, 0.0])

@@ -22,7 +22,6 @@ from ase.constraints import (
     FixedPlane,
     FixInternals,
     FixLinearTriatomic,
-    FixSubsetCom,
     Hookean,
     MirrorForce,
     dict2constraint,
@@ -105,13 +104,6 @@ def test_from_fix_linear_triatomic():
     assert atoms.get_angle(1, 0, 2) == pytest.approx(180, abs=1e-5)
     assert np.abs(held.engine(atoms).constraint_set.value(atoms.positions)).max() <= 1e-13
     assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-10)
-
-
-def test_from_fix_subset_com():
-    atoms = molecule("H2O")
-    atoms.set_constraint(FixSubsetCom([0, 2]))
-    (rows,) = from_ase_constraints(atoms)
-    assert np.array_equal(rows.atoms, [[0, 2]] * 3)
 
 
 def test_own_object_is_translated_to_its_rows():

@@ -166,27 +166,13 @@ def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, mo
     assert (tmp_path / "check-run" / "check.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("what", ["link to a file", "dangling link", "folder", "other file", "other picture"])
-def test_what_is_no_check_is_not_overwritten(folder, tmp_path, capsys, what):
-    out, other = tmp_path / "out", tmp_path / "other"
-    out.mkdir()
-    other.write_text("precious")
-    if what == "link to a file":
-        (out / "check.txt").symlink_to(other)
-    elif what == "dangling link":
-        (out / "check.json").symlink_to(tmp_path / "nowhere")
-    elif what == "folder":
-        (out / "check.png").mkdir()
-    elif what == "other file":
-        (out / "check.json").write_text('{"precious": 1}')
-    else:
-        (out / "check.png").write_text("precious")
-    before = sorted(path.name for path in out.iterdir())
-    arguments = [str(folder / "good.xtc"), "--topology", str(folder / "t.gro"), "--constrain", "none", "--no-rank"]
-    assert main(["check", *arguments, "--out", str(out)]) == 2
+@pytest.mark.parametrize("name", report.FILES)
+def test_what_is_no_check_is_not_overwritten(folder, tmp_path, capsys, name):
+    (tmp_path / name).write_text("precious")
+    arguments = [str(folder / "good.xtc"), "--topology", str(folder / "t.gro"), *OPTIONS]
+    assert main(["check", *arguments, "--out", str(tmp_path)]) == 2
     assert "give another folder (--out)" in capsys.readouterr().err
-    assert sorted(path.name for path in out.iterdir()) == before
-    assert other.read_text() == "precious" and not (tmp_path / "nowhere").exists()
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "precious"
 
 
 def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):

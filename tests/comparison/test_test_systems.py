@@ -292,12 +292,11 @@ def test_a_symmetric_top_precesses_evenly():
         assert found.error < 1e-11
 
 
-@pytest.mark.parametrize("start", rotor.VELOCITIES)
-def test_distances_of_the_top_stay_and_the_start_is_the_start(start):
-    v, h, pairs = rotor.VELOCITIES[start], 1e-4, rotor.PAIRS
+def test_distances_of_the_top_stay_and_the_start_is_the_start():
+    v, h, pairs = rotor.VELOCITIES, 1e-4, rotor.PAIRS
     flight = functools.partial(rotor.flight, rotor.POSITIONS, v, rotor.MASSES)
     np.testing.assert_allclose((flight(h).positions - flight(-h).positions) / (2 * h), v, atol=1e-7)
-    x = flight(test_systems.build(start).horizon).positions
+    x = flight(test_systems.build("rotor").horizon).positions
     was, now = (np.linalg.norm(y[pairs[:, 0]] - y[pairs[:, 1]], axis=1) for y in (rotor.POSITIONS, x))
     np.testing.assert_allclose(now, was, atol=1e-12)
 

@@ -39,7 +39,7 @@ print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 #: A kernel that calls another one, of another module: what it moves, and whether it was compiled.
 MOVES = """
 import numpy as np
-from kcons.thermostats.pressure.centre_moves import displacements
+from kcons.thermostats.pressure.pieces import displacements
 d = np.zeros((2, 3))
 displacements(
     np.array([[0.1, 0, 0], [2.9, 0, 0]]), np.array([0, 0]), np.array([0.5, 0.5]), np.ones((1, 3), dtype=bool),
@@ -263,6 +263,8 @@ def names_defined_by(source: Path) -> set[str]:
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("numba"):
+            found |= {alias.name for alias in node.names}  # kernels are kept for one version of Numba
         elif not isinstance(node, ast.Import | ast.ImportFrom):
             found |= {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
     return found

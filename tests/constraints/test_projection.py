@@ -68,21 +68,14 @@ LITERAL = [
 # -- generalized inverses ---------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("decades", "close"), [(0.5, 2e-14), (8, 2e-13)], ids=["alike", "of wildly different scale"])
 @PROPERTY
-@given(problems(decades=0.5))
-def test_penrose_conditions(p: Problem) -> None:
+@given(data=st.data())
+def test_penrose_conditions(decades: float, close: float, data: st.DataObject) -> None:
+    p = data.draw(problems(decades))
     inverse = projection.pseudo_inverse(p.A)
     assert inverse.rank == p.rank
-    assert max(projection.penrose_residuals(p.A, inverse.matrix)) < 2e-14
-
-
-@PROPERTY
-@given(problems(decades=8))
-def test_penrose_conditions_with_rows_of_wildly_different_scale(p: Problem) -> None:
-    inverse = projection.pseudo_inverse(p.A)
-    assert inverse.rank == p.rank
-    residuals = projection.penrose_residuals(p.A, inverse.matrix)
-    assert max(residuals) < 2e-13
+    assert max(projection.penrose_residuals(p.A, inverse.matrix)) < close
 
 
 @pytest.mark.parametrize(("A", "rank"), LITERAL)
@@ -134,16 +127,6 @@ def test_independent_rows_of_any_scale_keep_all_digits() -> None:
     found = projection.pseudo_inverse(p.A * scales[:, None]).matrix
     error = np.linalg.norm(found - expected, axis=0) / np.linalg.norm(expected, axis=0)
     assert error.max() < 1e-13
-
-
-def test_rank_does_not_depend_on_units() -> None:
-    rng = np.random.default_rng(2)
-    A = np.vstack([rng.normal(size=(4, 9))] * 2)
-    for scale in (1e-12, 1.0, 1e12):
-        scaled = A.copy()
-        scaled[3] *= scale
-        assert projection.rank(scaled) == 4
-        assert projection.full_rank_factors(scaled)[0].shape[1] == 4
 
 
 def complex_matrix(seed: int, rows: int, columns: int, rank: int, decades: float = 2.0) -> np.ndarray:
@@ -571,16 +554,6 @@ def test_isokinetic_closed_form() -> None:
     alpha = np.sum(v * f) / np.sum(masses[:, None] * v**2)
     expected = f / masses[:, None] - alpha * v
     np.testing.assert_allclose(projection.acceleration(row, masses, f, [0.0]), expected, rtol=0, atol=1e-14)
-
-
-def test_an_atom_held_in_place_takes_the_whole_force() -> None:
-    f = np.array([[1.0, -2, 3], [4, 5, 6]])
-    A = np.eye(6)[:3]
-    z = projection.constraint_force(A, [2.0, 3.0], f, np.zeros(3))
-    np.testing.assert_allclose(z, [-f[0], [0, 0, 0]], rtol=1e-15)
-    np.testing.assert_allclose(
-        projection.acceleration(A, [2.0, 3.0], f, np.zeros(3)), [[0, 0, 0], f[1] / 3], rtol=1e-15
-    )
 
 
 # -- solvability ------------------------------------------------------------------------------------

@@ -105,13 +105,13 @@ def test_a_moving_target_is_refused_when_it_becomes_too_large():
     target = MovingTarget(lambda t: 1.0 if t < 0.5 else 1e160, lambda t: 0.0, lambda t: 0.0)
     motion = Motion(ConstraintSet(Distance([0, 1], target), x, np.ones(2)), x)
     new, kept = x.copy(), x.copy()
-    with pytest.raises(InputError, match=r"target at t = 1 is 1e\+160, of which the square overflows"):
+    with pytest.raises(InputError, match=r"target of row 0 at t = 1 is 1e\+160, of which the square overflows"):
         motion.project_positions(new, x, time=1.0, out=new)
     np.testing.assert_array_equal(new, kept)
 
 
 def test_bad_values_of_a_function_are_named():
-    with pytest.raises(InputError, match="target at t = 2 is not finite"):
+    with pytest.raises(InputError, match="target of row 0 at t = 2 is not finite"):
         MovingTarget(lambda t: np.nan).at(2.0, 1)
     with pytest.raises(InputError, match=r"target at t = 2 has shape \(3,\); give one number or 2"):
         MovingTarget(lambda t: [1.0, 2.0, 3.0]).at(2.0, 2)

@@ -70,13 +70,6 @@ def test_powell_steps_too_far():
     assert off(atoms, held) <= 1e-12
 
 
-def test_scipy_fmin_fails_by_itself():
-    atoms = molecule("H2O")
-    atoms.calc = EMT()
-    with pytest.raises(TypeError):
-        OPTIMISERS["SciPyFmin"](atoms, logfile=None).run(ftol=1e-4, xtol=1e-4, steps=60)
-
-
 def test_basin_hopping():
     atoms, held = ethanol()
     start = atoms.get_potential_energy()
@@ -114,16 +107,3 @@ def test_cell_relaxation(cls):
     assert np.abs(atoms.get_forces()).max() <= 0.05
     assert np.abs(atoms.get_stress()).max() <= 0.003
     assert off(atoms, held) <= 1e-12
-
-
-def test_climbing_needs_ases_own_constraint():
-    atoms, _ = ethanol()
-    with pytest.raises(ValueError, match="FixInternals"):
-        OPTIMISERS["BFGSClimbFixInternals"](atoms, climb_coordinate=[[None, [0, 1]]], logfile=None)
-
-
-def test_old_bfgs_fails_by_itself():
-    atoms = molecule("H2O")
-    atoms.calc = EMT()
-    with pytest.raises(ValueError, match="broadcast"):
-        OPTIMISERS["oldBFGS"](atoms, logfile=None).run(fmax=0.05)

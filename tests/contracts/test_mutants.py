@@ -132,7 +132,7 @@ def test_modules_that_took_in_a_function_are_found():
     assert {
         "solvers/kernels/two_and_four_wide.py",
         "solvers/sparse/distances.py",
-        "solvers/addressable_solvers.py",
+        "solvers/distance_clusters.py",
         "motion/motion.py",
     } <= names
     assert "errors.py" not in names

@@ -22,7 +22,7 @@ from kcons.comparison import environment
 from kcons.constraints import Distance
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold, molecular_pressure
 from kcons.steppers.files import text
-from kcons.thermostats.multistep import autocorrelation_time
+from kcons.thermostats import autocorrelation_time
 
 N, SIDE, KT = 30, 6.0, 0.00831446261815324 * 300
 #: In bar, for a mean volume of SIDE^3 with N molecules.

@@ -223,15 +223,6 @@ def first_runs(name: str) -> Runs:
 
 
 @HOLONOMIC
-def test_rattle_has_order_two(name: str) -> None:
-    runs = first_runs(name)
-    for item in ("positions", "velocities"):
-        errors = runs.errors(item)
-        slopes = np.log2(errors[:-1] / errors[1:])
-        np.testing.assert_allclose(slopes, 2.0, rtol=0, atol=0.05, err_msg=item)
-
-
-@HOLONOMIC
 def test_rattle_extrapolates_to_the_reference(name: str) -> None:
     """Nothing but even powers of dt separates RATTLE from the exact solution: four more digits without two of them."""
     runs = first_runs(name)

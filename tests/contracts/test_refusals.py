@@ -250,7 +250,7 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ('constraints_of(ATOMS, "bond")', InputError, "constrain"),
     ("constraints_of(ATOMS, 3)", InputError, "constrain"),
     ("rigid_water(3)", InputError, "atoms"),
-    ('rigid_water(ATOMS, "tip9p")', InputError, "geometry"),
+    ('rigid_water(ATOMS, "tip9p")', InputError, "water_geometry"),
     ("from_ase_constraints(3)", InputError, "atoms"),
     ('to_ase_constraints(ATOMS, missing="drop")', InputError, "missing"),
     ("attach(3)", InputError, "atoms"),

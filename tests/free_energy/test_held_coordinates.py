@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
+import sympy
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import (
@@ -26,103 +29,67 @@ CHAIN = np.array(
 MASSES = np.array([1.0, 12.0, 14.0, 16.0, 12.0, 1.5])
 
 
-class Jet:
-    """A number with its gradient and second derivatives: automatic differentiation, forward."""
-
-    def __init__(self, value, gradient, hessian):
-        self.value, self.gradient, self.hessian = value, gradient, hessian
-
-    def __sub__(self, other):
-        return Jet(self.value - other.value, self.gradient - other.gradient, self.hessian - other.hessian)
-
-    def __add__(self, other):
-        return Jet(self.value + other.value, self.gradient + other.gradient, self.hessian + other.hessian)
-
-    def __mul__(self, other):
-        both = np.outer(self.gradient, other.gradient)
-        return Jet(
-            self.value * other.value,
-            self.value * other.gradient + other.value * self.gradient,
-            self.value * other.hessian + other.value * self.hessian + both + both.T,
-        )
-
-    def through(self, value, first, second):
-        """A function of this number with the value and the derivatives given."""
-        square = np.outer(self.gradient, self.gradient)
-        return Jet(value, first * self.gradient, first * self.hessian + second * square)
-
-    def sqrt(self):
-        root = np.sqrt(self.value)
-        return self.through(root, 0.5 / root, -0.25 / root**3)
-
-    def inverse(self):
-        return self.through(1 / self.value, -1 / self.value**2, 2 / self.value**3)
-
-    def arccos(self):
-        sine = np.sqrt(1 - self.value**2)
-        return self.through(np.arccos(self.value), -1 / sine, -self.value / sine**3)
-
-
-COORDINATES = [
-    [Jet(CHAIN[a, k], np.eye(3 * N)[3 * a + k], np.zeros((3 * N, 3 * N))) for k in range(3)] for a in range(N)
-]
-
-
-def product(a, b, c, d):
-    """(x_a - x_b) . (x_c - x_d)."""
-    terms = [
-        (p - q) * (r - s)
-        for p, q, r, s in zip(COORDINATES[a], COORDINATES[b], COORDINATES[c], COORDINATES[d], strict=True)
+@cache
+def derivatives(kind):
+    """Gradient and second derivatives of a square, a length or an angle, of the coordinates of its atoms."""
+    x, y, z = (sympy.Matrix(sympy.symbols(f"x{a} y{a} z{a}")) for a in range(3))
+    u, w = x - y, z - y
+    made = {"square": u.dot(u), "length": sympy.sqrt(u.dot(u))}
+    made["angle"] = sympy.acos(u.dot(w) / sympy.sqrt(u.dot(u) * w.dot(w)))
+    own = [*x, *y, *z][: 9 if kind == "angle" else 6]
+    first = [made[kind].diff(symbol) for symbol in own]
+    second = [
+        [slope.diff(symbol) for symbol in own[: k + 1]] + [0] * (len(own) - k - 1) for k, slope in enumerate(first)
     ]
-    return terms[0] + terms[1] + terms[2]
+    return sympy.lambdify(own, [first, second])
 
 
-def length(a, b):
-    return product(a, b, a, b).sqrt()
+def exact(kind, *atoms):
+    """The same of the chain, in all of its coordinates: exact but for rounding."""
+    places = (3 * np.array(atoms)[:, None] + range(3)).ravel()
+    gradient, hessian = np.zeros(3 * N), np.zeros((3 * N, 3 * N))
+    gradient[places], lower = derivatives(kind)(*CHAIN.ravel()[places])
+    hessian[np.ix_(places, places)] = np.tril(lower) + np.tril(lower, -1).T
+    return gradient, hessian
 
 
-def angle(a, b, c):
-    return (product(a, b, c, b) * (length(a, b) * length(c, b)).inverse()).arccos()
-
-
-#: Coordinates, other constraints, and the same as jets in the same order.
+#: Coordinates, other constraints, and the same by name in the same order.
 CASES = {
-    "one, alone": ({"r": Distance([[0, 3]])}, [], [length(0, 3)]),
+    "one, alone": ({"r": Distance([[0, 3]])}, [], [("length", 0, 3)]),
     "one beside bonds": (
         {"r": Distance([[0, 3]])},
         [Distance([[0, 1], [1, 2], [2, 3]])],
-        [length(0, 3), length(0, 1), length(1, 2), length(2, 3)],
+        [("length", 0, 3), ("length", 0, 1), ("length", 1, 2), ("length", 2, 3)],
     ),
     "an angle beside bonds": (
         {"angle": Angle([[0, 1, 2]])},
         [Distance([[0, 1], [1, 2], [2, 4]])],
-        [angle(0, 1, 2), length(0, 1), length(1, 2), length(2, 4)],
+        [("angle", 0, 1, 2), ("length", 0, 1), ("length", 1, 2), ("length", 2, 4)],
     ),
     "two that share an atom": (
         {"far": Distance([[1, 5]]), "angle": Angle([[1, 2, 3]])},
         [Distance([[1, 2], [3, 4]])],
-        [length(1, 5), angle(1, 2, 3), length(1, 2), length(3, 4)],
+        [("length", 1, 5), ("angle", 1, 2, 3), ("length", 1, 2), ("length", 3, 4)],
     ),
     "a square": (
         {"s": Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 4]], target=None)},
         [],
-        [product(0, 4, 0, 4)],
+        [("square", 0, 4)],
     ),
 }
 
 
 def held(name: str) -> tuple[ConstraintSet, dict, list]:
-    coordinates, others, jets = CASES[name]
-    return ConstraintSet([*others, *coordinates.values()], CHAIN, MASSES), coordinates, jets
+    coordinates, others, rows = CASES[name]
+    return ConstraintSet([*others, *coordinates.values()], CHAIN, MASSES), coordinates, rows
 
 
 class Exact:
     """Gradients and second derivatives of c = (coordinates, other constraints), and what follows."""
 
-    def __init__(self, jets: list[Jet], d: int) -> None:
+    def __init__(self, rows: list[tuple], d: int) -> None:
         self.d = d
-        self.A = np.array([jet.gradient for jet in jets])
-        self.C = np.array([jet.hessian for jet in jets])
+        self.A, self.C = map(np.array, zip(*(exact(*each) for each in rows), strict=True))
         self.Mi = np.repeat(1 / MASSES, 3)
         self.H = self.A * self.Mi @ self.A.T
 
@@ -157,7 +124,7 @@ class Exact:
 @pytest.mark.parametrize("case", CASES)
 def test_mean_force_is_the_one_of_the_definition(case):
     """lambda averaged over velocities, and kT G, against the divergence with exact second derivatives."""
-    constraint_set, coordinates, jets = held(case)
+    constraint_set, coordinates, rows = held(case)
     motion = Motion(constraint_set, CHAIN)
     mine = HeldCoordinates(motion, coordinates, CHAIN)
     kT = 0.7
@@ -168,8 +135,8 @@ def test_mean_force_is_the_one_of_the_definition(case):
     basis = np.linalg.svd(a)[2][len(a) :] / root
     kinetic = sum(mine.sample(CHAIN, v.reshape(N, 3), force).kinetic for v in basis) * kT
     sample = mine.sample(CHAIN, np.zeros((N, 3)), force)
-    exact = Exact(jets, len(mine)).mean_force(force, kT)
-    np.testing.assert_allclose(sample.multiplier + kinetic + kT * sample.gradient, exact, rtol=0, atol=2e-12)
+    wanted = Exact(rows, len(mine)).mean_force(force, kT)
+    np.testing.assert_allclose(sample.multiplier + kinetic + kT * sample.gradient, wanted, rtol=0, atol=2e-12)
     np.testing.assert_allclose(kT * sample.mean_kinetic, kinetic, rtol=0, atol=2e-12)
     assert np.abs(kinetic).min() > 1e-3 and (case == "one, alone" or np.abs(sample.gradient).min() > 1e-3)
 

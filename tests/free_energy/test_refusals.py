@@ -37,7 +37,7 @@ from kcons.free_energy import (
     work_along,
     work_profile,
 )
-from kcons.free_energy.scans.grid import Grid
+from kcons.free_energy.scans.scan_result import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
 CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)

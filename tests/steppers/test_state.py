@@ -333,7 +333,7 @@ def test_copies_know_whose_forces_they_carry() -> None:
     end = Rattle().step(here, start, 0.05)
     own = end.copied()
     assert own.positions is not end.positions and own.has_forces_of(here) and not own.has_forces_of(there)
-    assert end.shown().has_forces_of(here) and not end.shown().has_forces_of(there)
+    assert end.read_only().has_forces_of(here) and not end.read_only().has_forces_of(there)
     # Made by hand: of any system, and where they were given only.
     hand = State(end.positions, end.velocities, forces=end.forces)
     assert hand.has_forces_of(here) and hand.has_forces_of(there)

@@ -14,6 +14,7 @@ from stepper_systems import (
     gravity,
     growing_rod,
     rotor,
+    skate,
     spherical_pendulum,
     system_of,
 )
@@ -226,13 +227,10 @@ def test_wrong_forces_name_the_step(stepper, damage, message) -> None:
 
 @ALL
 def test_an_error_of_the_force_function_passes_through(stepper) -> None:
-    def damage(f):
-        raise ZeroDivisionError("in the calculator")
-
-    system, state = molecule(breaks_at(2, damage))
+    system, state = molecule(breaks_at(2, lambda f: 1 / 0))
     state = run(system, state, 0.05, 1, stepper=stepper)
     before = copies(state)
-    with pytest.raises(ZeroDivisionError, match="in the calculator"):
+    with pytest.raises(ZeroDivisionError):
         stepper.step(system, state, 0.05)
     assert_untouched(state, before)
 
@@ -273,35 +271,32 @@ def test_steps_of_no_number_and_of_zero(stepper) -> None:
 
 
 @REVERSIBLE
-@pytest.mark.parametrize("make", [molecule, rotor, spherical_pendulum, growing_rod], ids=lambda f: f.__name__)
-def test_negative_step_takes_a_step_back(stepper, make) -> None:
+@pytest.mark.parametrize("make", [molecule, rotor, spherical_pendulum, growing_rod, skate], ids=lambda f: f.__name__)
+def test_steps_are_taken_back(stepper, make) -> None:
+    """One, and steps of any length by the same in reverse."""
     system, start = make()
-    back = stepper.step(system, stepper.step(system, start, 0.05), -0.05)
-    assert np.abs(back.positions - start.positions).max() <= 4e-15
-    assert np.abs(back.velocities - start.velocities).max() <= 1e-14
-    assert back.time == start.time
+    for steps, allowed in (([0.05], 4e-15), ([0.01, 0.02, 0.005, -0.01, 0.03], 6e-15)):
+        state = start
+        for dt in [*steps, *(-h for h in reversed(steps))]:
+            state = stepper.step(system, state, dt)
+            held = system.motion.constraint_set
+            assert np.abs(held.value(state.positions, state.time)[held.holonomic]).max() <= 1e-14
+        assert np.abs(state.positions - start.positions).max() <= allowed
+        assert np.abs(state.velocities - start.velocities).max() <= 2e-14
+        assert state.time == pytest.approx(0, abs=1e-16)
 
 
 @REVERSIBLE
-def test_step_size_may_change_on_the_way(stepper) -> None:
-    """Forward by steps of any length, and back by the same in reverse."""
-    system, start = molecule()
-    steps = [0.01, 0.02, 0.005, -0.01, 0.03]
-    state = start
-    for dt in [*steps, *(-h for h in reversed(steps))]:
-        state = stepper.step(system, state, dt)
-        assert np.abs(system.motion.constraint_set.value(state.positions)).max() <= 1e-14
-    assert np.abs(state.positions - start.positions).max() <= 4e-15
-    assert state.time == pytest.approx(0, abs=1e-16)
-
-
-@REVERSIBLE
-def test_opposite_velocities_lead_back(stepper) -> None:
-    system, start = spherical_pendulum()
+@pytest.mark.parametrize("make", [spherical_pendulum, rotor], ids=lambda f: f.__name__)
+def test_opposite_velocities_and_negative_steps_lead_back(stepper, make) -> None:
+    system, start = make()
     end = run(system, start, 0.05, 200, stepper=stepper)
     back = run(system, end.reversed(), 0.05, 200, stepper=stepper)
-    assert np.abs(back.positions - start.positions).max() <= 1e-12
-    assert np.abs(back.velocities + start.velocities).max() <= 1e-12
+    negative = run(system, end, -0.05, 200, stepper=stepper)
+    for state, sign in ((back, -1), (negative, 1)):
+        assert np.abs(state.positions - start.positions).max() <= 1e-12
+        assert np.abs(sign * state.velocities - start.velocities).max() <= 1e-12
+    assert negative.time == pytest.approx(start.time, abs=1e-12)
 
 
 # -- invariance -------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def test_the_study_goes_on_and_finds_faults(tmp_path, monkeypatch, capsys):
     assert "Rattle" in capsys.readouterr().out
     head, table = harness.read(tmp_path / "stability.csv")
     assert head["settings"] == "quick=True" and set(table.part) == {"reversal", "molecules"}
-    assert table[table.part == "molecules"]["count"].sum() == 300
+    assert table[table.part == "molecules"]["count"].sum() == 100
     monkeypatch.setattr(stability, "molecules", lambda *_: pytest.fail("done before"))
     assert stability.main(given) == 0
     # A molecule that ends silently off its rows, and a step of kcons that does.

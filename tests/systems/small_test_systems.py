@@ -38,7 +38,6 @@ STORED = {
     "butane": "A07_butane_bonds_angles_fixed",
     "dumbbells": "A05_two_dumbbells_lj",
     "rotor": "A06_asymmetric_top4",
-    "tennis-racket": "A06_tennis_racket4",
     "pendulum": "A03_planar_pendulum_179p9deg",
     "double-pendulum": "A04_double_pendulum",
     "triple-pendulum": "A04_triple_pendulum",

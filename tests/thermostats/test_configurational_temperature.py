@@ -23,23 +23,6 @@ from kcons.thermostats import (
 )
 
 
-def test_errors_of_correlated_series():
-    """An autoregressive series of known spread: the error of its mean is known."""
-    rng = np.random.default_rng(0)
-    a, n, found = 0.9, 4096, []
-    truth = math.sqrt((1 + a) / (1 - a) / (1 - a * a) / n)
-    for _ in range(200):
-        noise, series, last = rng.standard_normal(n), np.empty(n), rng.standard_normal() / math.sqrt(1 - a * a)
-        for k in range(n):
-            last = series[k] = a * last + noise[k]
-        found.append(mean(series))
-    errors = np.array([f.error for f in found])
-    spread = np.std([f.value for f in found])
-    assert spread == pytest.approx(truth, rel=0.2)
-    assert errors.mean() == pytest.approx(truth, rel=0.15)
-    assert (np.abs([f.value / f.error for f in found]) <= 3).mean() >= 0.98
-
-
 def test_what_does_not_change_is_no_distance_or_an_infinite_one_away():
     still = mean(np.ones(40))
     assert (still.off(1.0), still.off(2.0), still.off(0.5)) == (0.0, -math.inf, math.inf)

@@ -251,13 +251,8 @@ def test_a_surface_that_ends_nearby_has_a_place():
         [0], lambda x: np.sqrt(0.5 - x[:, 0]), lambda x: np.c_[-0.5 / np.sqrt(0.5 - x[:, 0]), 0 * x[:, 1:]], None
     )
     near = ConstraintSet([edge], x - np.array([0.01, 0, 0]), [1.0, 1.0])
-    found = open_directions(_Held(near, 2), x - np.array([0.0001, 0, 0]))
-    assert found.shape == (0, 3)
-
-
-class _Held:
-    def __init__(self, constraint_set, n_atoms):
-        self.constraint_set, self.n_atoms = constraint_set, n_atoms
+    motion = Motion(near, x - np.array([0.01, 0, 0]))
+    assert open_directions(motion, x - np.array([0.0001, 0, 0])).shape == (0, 3)
 
 
 def test_a_sphere_has_no_open_direction_and_a_far_plane_two():

@@ -2,5 +2,4 @@
 
 - `one_piece`: clusters made whole along their rows
 - `images`: the images of the atoms of rows, followed in time
-- `in_cell`: the cell of a set, and how it changes
 """

@@ -12,11 +12,10 @@ set-up:
   the images found there.
 
 Rows with a place in space are neither: they take all of their atoms as they are stored. What solvers get is made
-whole, so that these rows take off by how much (`PeriodicRows.moved`).
+whole, so that these rows take off by how much (`ConstraintSet.moved`).
 
-A link of the tree that no constant distance holds is *loose*: its image is unambiguous only as long as it is
-shorter than half the cell. `Images.make_whole` reports how near the worst one is, and `Images.refuse_loose_links`
-raises before it flips.
+A link of the tree that no constant distance holds is *unheld*: its image is unambiguous only as long as it is
+shorter than half the cell. `ConstraintSet.refuse_unheld_links` raises before it flips.
 
 A framework that closes upon itself through the boundary (a sheet, a polymer) has rows whose images differ from
 those of the tree by whole cells, the same at all times: `Constraint.cell_offsets`.
@@ -42,7 +41,7 @@ ALL_PAIRS_WIDTH = 12
 BOND_LIKE = 1.5
 #: Part of half the cell from which a held distance is followed along the tree: off its row it may be longer than half.
 NEARLY = 0.9
-#: Parts of the cell at which a loose link is taken to have reached half of it.
+#: Parts of the cell at which an unheld link is taken to have reached half of it.
 _HALF = 0.5 - 1e-9
 
 
@@ -54,15 +53,15 @@ class Images:
     ----------
     atoms, parents : ndarray of int, shape (k,)
         Parents come before their children; a root is its own parent and keeps the image it is stored in.
-    loose : ndarray of int, shape (k,)
-        For loose links the row they come from, -1 for others.
+    unheld : ndarray of int, shape (k,)
+        For unheld links the row they come from, -1 for others.
     longest : float
         The longest of the other links.
     """
 
     atoms: IntArray
     parents: IntArray
-    loose: IntArray
+    unheld: IntArray
     longest: float = 0.0
 
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -83,14 +82,14 @@ class Images:
     def bodies(self) -> IntArray:
         """For each atom the first of those that constant distances tie it to."""
         first = np.arange(int(self.atoms.max(initial=-1)) + 1)
-        for atom, parent, loose in zip(self.atoms, self.parents, self.loose, strict=True):
-            if loose < 0:
+        for atom, parent, unheld in zip(self.atoms, self.parents, self.unheld, strict=True):
+            if unheld < 0:
                 first[atom] = first[parent]
         return first
 
     def reached_half(self, y: FloatArray, lattice: FloatArray) -> int:
-        """A loose link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
-        links = np.flatnonzero(self.loose >= 0)
+        """An unheld link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
+        links = np.flatnonzero(self.unheld >= 0)
         if not len(links):
             return -1
         parts = np.abs((y[self.atoms[links]] - y[self.parents[links]]) @ lattice[1]).max(axis=1)
@@ -107,11 +106,11 @@ class Images:
         keep = kept[self.atoms]
         if not keep.any():
             return None
-        here, parents, loose = self.atoms[keep], self.parents[keep], self.loose[keep]
+        here, parents, unheld = self.atoms[keep], self.parents[keep], self.unheld[keep]
         parents = np.where(kept[parents], parents, here)
-        # A loose link may come from a row that is not among these; any of them may name it.
-        place = np.minimum(np.searchsorted(rows, loose), max(len(rows) - 1, 0))
-        return Images(numbers[here], numbers[parents], np.where(loose < 0, -1, place), self.longest)
+        # An unheld link may come from a row that is not among these; any of them may name it.
+        place = np.minimum(np.searchsorted(rows, unheld), max(len(rows) - 1, 0))
+        return Images(numbers[here], numbers[parents], np.where(unheld < 0, -1, place), self.longest)
 
     def ancestors(self, needed: IntArray, n_atoms: int) -> IntArray:
         """`needed` and the atoms by which they are made whole."""
@@ -206,7 +205,7 @@ def find_images(
     result = [marked.get(id(item), item) for item in given]
     if not keep.any():
         return result, None
-    return result, Images(images.atoms[keep], images.parents[keep], images.loose[keep], images.longest)
+    return result, Images(images.atoms[keep], images.parents[keep], images.unheld[keep], images.longest)
 
 
 class _Links:
@@ -306,7 +305,7 @@ class _Links:
         frameworks[label[self._closing]] = True
 
     def untied(self, images: Images) -> IntArray:
-        """Distances of half the cell or more that close, through the boundary, what loose links alone tie."""
+        """Distances of half the cell or more that close, through the boundary, what unheld links alone tie."""
         given = self.held and self.item.target is not None
         long = np.flatnonzero(self._closing & self.whole & given)
         if not len(long):
@@ -424,14 +423,14 @@ def _tree(
             firm[item.atoms.ravel()] = True
     roots = np.concatenate([np.flatnonzero(firm), np.flatnonzero(~firm)])
     atoms, parents = spanning_tree(pair[link], n_atoms, roots)
-    parent_of, loose = np.empty(n_atoms, np.int64), np.full(n_atoms, -1)
+    parent_of, unheld = np.empty(n_atoms, np.int64), np.full(n_atoms, -1)
     parent_of[atoms] = parents
     i, j = pair[link].T
-    loose[np.where(parent_of[j] == i, j, i)] = np.where(held[link], -1, row[link])
+    unheld[np.where(parent_of[j] == i, j, i)] = np.where(held[link], -1, row[link])
     tied = np.isin(atoms, pair[link])
     atoms, parents = atoms[tied], parents[tied]
     ties = float(np.max(length[link][held[link]], initial=0.0))
-    return Images(atoms, parents, loose[atoms], ties), longest, component
+    return Images(atoms, parents, unheld[atoms], ties), longest, component
 
 
 def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: float, half_width: float) -> None:

@@ -35,10 +35,8 @@ from kcons.errors import (
     KconsError,
     NonFiniteError,
 )
-from kcons.free_energy.scans.grid import Grid, Point
-from kcons.free_energy.scans.model_hessian import Internals
-from kcons.free_energy.scans.relaxation import FIRST, relax
-from kcons.free_energy.scans.scan_result import Attempt, Attempts, Scan
+from kcons.free_energy.scans.relaxation import FIRST, Internals, relax
+from kcons.free_energy.scans.scan_result import Attempt, Attempts, Grid, Point, Scan
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion

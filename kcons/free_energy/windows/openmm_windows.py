@@ -152,7 +152,7 @@ class HeldCoordinatesReporter:
             new = [k for k in range(row.n_rows) if not any(same_rows(item, row, k).any() for item in carried)]
             if new:
                 carried.append(row.select(new))
-        lengths = {frozenset(pair) for row in carried if row.family == "Distance" for pair in row.atoms.tolist()}
+        lengths = {frozenset(pair) for row in carried if row.holds_length for pair in row.atoms.tolist()}
         for item in _beside(system, carried, masses):
             new = [k for k, atoms in enumerate(item.atoms.tolist()) if frozenset(atoms) not in lengths]
             if new:

@@ -19,8 +19,8 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
-from kcons.free_energy.held_coordinates import AT_ONCE, HeldCoordinates, named
-from kcons.free_energy.series import Series
+from kcons.free_energy.held_coordinates import HeldCoordinates, named
+from kcons.free_energy.series import Collector, Series
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.motion import Motion
 
@@ -179,22 +179,12 @@ class Sampler(ABC):
     def _recorded(self, run: Any, window: Window, steps: int, every: int, *, start: bool = False) -> Series:
         """Take steps and record the coordinates, with `start` before the first one, too."""
         held = run.held.measured(window.target)
-        series, taken = Series(held.names, held.periods), list[Any]()
-
-        def keep() -> None:
-            for sample in held.samples(*zip(*taken, strict=True)) if taken else ():
-                series.append(sample)
-            taken.clear()
-
-        def take() -> None:
-            taken.append(run.state())
-            if len(taken) == AT_ONCE:
-                keep()
-
+        series = Series(held.names, held.periods)
+        collector = Collector(held, series)
         if start:
-            take()
-        run.run(steps, every, take)
-        keep()
+            collector.add(*run.state())
+        run.run(steps, every, lambda: collector.add(*run.state()))
+        collector.look()
         series.isokinetic_degrees_of_freedom = run.isokinetic_degrees_of_freedom
         return series
 

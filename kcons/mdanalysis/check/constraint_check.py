@@ -25,7 +25,7 @@ from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.check.deviations import Found, RowTable
 from kcons.mdanalysis.check.endings import broken_by, damage_of, ending_of
 from kcons.mdanalysis.check.precision import by_frame, described, grid_of, precision_of, precision_of_reader
-from kcons.mdanalysis.check.result import Asked, CheckResult, concluded
+from kcons.mdanalysis.check.result import Asked, CheckResult, result_of
 from kcons.mdanalysis.check.targets import AtomNames, TargetFile
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import (
@@ -323,7 +323,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
         masses = self._rows.set.masses
         n_in_file = int(self._trajectory.n_frames)
-        self.results.check = concluded(found, self._rows, self.asked, text, self._rank, masses, n_in_file)
+        self.results.check = result_of(found, self._rows, self.asked, text, self._rank, masses, n_in_file)
 
     @property
     def check(self) -> CheckResult:

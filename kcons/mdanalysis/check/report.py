@@ -79,8 +79,8 @@ def _rows(result: CheckResult) -> Table:
     for row in result.worst:
         largest = Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else "")
         frame = "" if row.frame is None else str(row.frame)
-        cells = [str(row.row), row.name, f"{row.target:.4f} {row.unit}", largest]
-        rows.append([*cells, f"{row.allowed:.2e}", f"{row.mean:.1e}", frame])
+        target, means = f"{row.target:.4f} {row.unit}", (f"{row.allowed:.2e}", f"{row.mean:.1e}")
+        rows.append([str(row.row), row.name, target, largest, *means, frame])
     headers = ["row", "what", "target", "largest", "allowed", "mean", "frame"]
     return _table(headers, rows, title="worst rows", title_justify="left")
 

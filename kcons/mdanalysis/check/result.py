@@ -195,7 +195,7 @@ class Asked:
     gaps: list[str] = field(default_factory=list)
 
 
-def concluded(
+def result_of(
     found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, masses: FloatArray, n_in_file: int
 ) -> CheckResult:
     """All that there is to say of what was found, of a file of `n_in_file` frames and of a `precision` in words."""

@@ -27,7 +27,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, is_jitted
 
-from kcons.constraints.compilation import cfunc, njit
+from kcons.constraints.compilation import cfunc, has_a_file, njit
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.functions.custom import PythonRows
@@ -69,7 +69,7 @@ def call_row(typingctx, numbers, function, r, p, time, out):
 
 @functools.cache
 def _compiled(function: Callable[..., None]) -> Any:
-    return cfunc(ROW, cache=True, fastmath=FAST, error_model="numpy")(function)
+    return cfunc(ROW, cache=has_a_file(function), fastmath=FAST, error_model="numpy")(function)
 
 
 def _with_time(function: Any, timed: bool) -> Any:

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, register_jitable
 
-from kcons.constraints.compilation import cfunc
+from kcons.constraints.compilation import cfunc, has_a_file
 from kcons.solvers.sparse.elimination import FAST
 
 #: The most rows that are taken at once.
@@ -68,4 +68,4 @@ def rows_at_once(function: Callable[..., None]) -> Any:
                 row((r[i], r[BLOCK + i], r[2 * BLOCK + i]), _from(p, stride * i), t, _from(out, 4 * i))
 
     rows.__qualname__ = f"rows_at_once.{function.__qualname__}"  # each family has a file of its own
-    return cfunc(_ROWS, cache=True, fastmath=FAST, error_model="numpy")(rows)
+    return cfunc(_ROWS, cache=has_a_file(function), fastmath=FAST, error_model="numpy")(rows)

@@ -43,7 +43,11 @@ _POINTS, _NUMBERS = numba.float64[:, ::1], numba.float64[::1]
 #: Of functions that programs call, (x, v, forces, time, numbers, tables): 0, or what else than 0 says that nothing has
 #: been done. `numbers` are what a room ends with.
 FUNCTION = numba.int64(_POINTS, _POINTS, _NUMBERS, numba.float64, _NUMBERS, _NUMBERS)
-_call = caller_of(FUNCTION)
+#: Of flights along great circles, which are compiled where there are any: as `fly`, with spheres; 0 for bad forces.
+CIRCLES = numba.int64(
+    *(_POINTS, _NUMBERS, _POINTS, _POINTS, numba.float64, _NUMBERS, _NUMBERS, numba.float64, _POINTS, _NUMBERS)
+)
+_call, _fly_circles = caller_of(FUNCTION), caller_of(CIRCLES)
 _PERFORM = (*(numba.int64, numba.boolean, numba.float64, _POINTS, _POINTS, _POINTS, _POINTS, _NUMBERS, _NUMBERS),)
 
 
@@ -116,7 +120,8 @@ def perform(at, more, dt, x, out, v, forces, room, tables):  # type: ignore[no-u
         if verb in (FLY, CIRCLE):
             there = _place(program[row + THERE], x, out, spare)
             if verb == CIRCLE:
-                sound = fly_circles(here, low, v, push, kick, f, weights, h, there, piece(tables, header, MORE + 3))
+                given = (here, low, v, push, kick, f, weights, h, there, piece(tables, header, MORE + 3))
+                sound = _fly_circles(int(program[row + ADDRESS]), given) != 0
             elif pairs:
                 sound = fly(here, low, v, push, kick, f, weights, h, there)
             else:
@@ -301,7 +306,7 @@ def fly_circles(x, x_low, v, push, kick, f, weights, h, out, spheres):  # type: 
             if r < 0.0:
                 there, a_low[j] = a[j], 0.0
             c[j] = there
-    return sound
+    return 1 if sound else 0
 
 
 @njit(cache=True, nogil=True)

@@ -71,14 +71,12 @@ class Friction:
                 item="friction",
                 atoms=atoms,
             )
-        self._motion = motion
-        moving = inverse_masses[:, 0] > 0
+        self._motion, moving = motion, inverse_masses[:, 0] > 0
         each = np.where(moving, np.broadcast_to(given, (n_atoms,)), 0.0)
         least, self.largest = (float(end(each[moving])) for end in (np.min, np.max)) if moving.any() else (0.0, 0.0)
         self.uniform = least == self.largest
         self._rate = least if self.uniform else 0.5 * (least + self.largest)
-        self._each: FloatArray = each[:, None]
-        self._apart = _within_rows(motion, each, moving)
+        self._each, self._apart = each[:, None], _within_rows(motion, each, moving)
         with np.errstate(invalid="ignore"):  # fixed atoms may have any mass
             self._drag: FloatArray = np.where(moving, each * motion.masses, 0.0)[:, None]
 
@@ -103,11 +101,8 @@ class Friction:
         Where rows tie atoms of different rates, dv/dt = -P gamma v with the projector P of the rows, and `v` is brought
         onto the constraints first; elsewhere each velocity has its own exponential.
         """
-        if self.uniform:
-            v *= math.exp(-self._rate * h)
-            return
-        if self._apart:
-            v *= np.exp(-h * self._each)
+        if self.uniform or self._apart:
+            v *= math.exp(-self._rate * h) if self.uniform else np.exp(-h * self._each)
             return
         motion = self._motion
         motion.project_velocities(x, v, time=time, out=v)

@@ -42,7 +42,7 @@ class PackedSystem:
     found : PackedRows
         From `packed_rows`.
     more : tuple of ndarray
-        What is behind the rows, see `more_tables`.
+        What is behind the rows, see `System`.
     """
 
     def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
@@ -84,25 +84,6 @@ class PackedSystem:
             self.motion.took(int(iterations))
 
 
-def more_tables(
-    weights: FloatArray, held: IntArray, far: float, spheres: FloatArray | None
-) -> tuple[NDArray[Any], ...]:
-    """What is behind the rows in the tables.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (n_atoms, 3)
-        1/m.
-    held : ndarray of int
-        Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
-    far : float
-        The system is far if the first is this many times farther from the origin than from any other.
-    spheres : ndarray, shape (n_atoms, 4), or None
-        From `spheres_of`.
-    """
-    return weights.ravel(), held, np.array([far]), np.zeros(0) if spheres is None else spheres.ravel()
-
-
 def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
     """The tables where all rows are left to the engine."""
     return pack_solver_tables((), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), *more)
@@ -121,7 +102,7 @@ def spheres_of(motion: Motion) -> FloatArray | None:
         if isinstance(item, Sphere):
             held.append(item.atoms[:, 0])
             found[held[-1], :3], found[held[-1], 3] = item.center, item.target_at(0.0)
-        elif item.family == "FixedAtoms":
+        elif item.fixes_atoms:
             resting.append(item.atoms.ravel())
         else:
             return None

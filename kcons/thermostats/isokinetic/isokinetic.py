@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import positive
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import InputError, OverdeterminedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
@@ -25,12 +25,12 @@ from kcons.thermostats.freedom import (
     carried,
     freedom,
     may_be,
-    refuse_friction,
+    refuse_dissipation,
     warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
 from kcons.thermostats.isokinetic import kick as closed_form
-from kcons.thermostats.isokinetic.step import SMALLEST, IsokineticStep, Share, left_for, programs, split
+from kcons.thermostats.isokinetic.step import SMALLEST, IsokineticStep, ThermostattedAtoms, left_for, programs, split
 
 Convention = Literal["exact", "notes"]
 
@@ -135,7 +135,7 @@ class Isokinetic(Splitting):
         self.convention: Convention = convention
         self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum
-        self._shares: tuple[System, Share] | None = None
+        self._shares: tuple[System, ThermostattedAtoms] | None = None
         operations: list[Operation] = []
         for operation in splitting(*SCHEMES[order]):
             # Velocities are on the constraints whenever they turn.
@@ -162,11 +162,7 @@ class Isokinetic(Splitting):
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError(
-                "forces that depend on the velocities have no closed kick; use Langevin for friction, or leave it out"
-            )
+        refuse_dissipation(system, "closed kick; use Langevin for friction, or leave it out")
 
     # -- steps ----------------------------------------------------------------------------------
 
@@ -220,7 +216,7 @@ class Isokinetic(Splitting):
         variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
 
-    def _pushed(self, system: System, share: Share, state: State) -> State:
+    def _pushed(self, system: System, share: ThermostattedAtoms, state: State) -> State:
         """The state with f.M_par^+ f of its forces, which is kept where it is that but for rounding."""
         assert state.thermostat is not None
         variables, square = state.thermostat.copy(), share.push_square(system, state)
@@ -229,7 +225,7 @@ class Isokinetic(Splitting):
         variables[2] = square
         return replace(state, thermostat=variables)
 
-    def _goes_on_from(self, system: System, share: Share, state: State) -> bool:
+    def _goes_on_from(self, system: System, share: ThermostattedAtoms, state: State) -> bool:
         """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
         left = self._left
         same = left is not None and (
@@ -246,7 +242,7 @@ class Isokinetic(Splitting):
                 return False
         return abs(share.square(state.velocities) - twice) <= KEPT * twice
 
-    def _twice_kinetic(self, share: Share, count: float, found: float) -> float:
+    def _twice_kinetic(self, share: ThermostattedAtoms, count: float, found: float) -> float:
         if self.kinetic_energy is not None:
             return 2 * self.kinetic_energy
         if self.thermal_energy is None:
@@ -260,10 +256,10 @@ class Isokinetic(Splitting):
             )
         return (count - 1) * self.thermal_energy
 
-    def _share(self, system: System) -> Share:
+    def _share(self, system: System) -> ThermostattedAtoms:
         known = self._shares
         if known is None or known[0] is not system:
-            known = self._shares = (system, Share(system, self.atoms))
+            known = self._shares = (system, ThermostattedAtoms(system, self.atoms))
         return known[1]
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:

@@ -11,7 +11,6 @@ Everything is divided by e^{ct}, which overflows for ct > 710. Only sums over th
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,31 +31,22 @@ MANY = 1e4
 TWICE, INTEGRAL, SQUARE, COUNT, SIZE = range(5)
 
 
-class Weights(NamedTuple):
-    """What of the velocities becomes of the kick: u' = keep u + push F, and by how much it was scaled."""
-
-    keep: float
-    push: float
-    log_growth: float
-    #: Whether digits were lost, or c^2 is too large a number, so that u' must be found by `turned`.
-    cancels: bool
-
-
-def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
-    """Factors of the kick over a time t.
+@njit(cache=True, nogil=True)
+def weights_of(aligned, square, twice, t):  # type: ignore[no-untyped-def]
+    """What of the velocities becomes of the kick over a time t, which may be negative: u' = keep u + push F.
 
     Parameters
     ----------
     aligned, square, twice : float
         u.f, f.F and 2K.
-    t : float
-        May be negative.
+
+    Returns
+    -------
+    keep, push, log_growth : float
+        The last is how much u was scaled.
+    cancels : bool
+        Whether digits were lost, or c^2 is too large a number, so that u' must be found by `turned`.
     """
-    return Weights(*_weights(aligned, square, twice, t))
-
-
-@njit(cache=True, nogil=True)
-def _weights(aligned, square, twice, t):  # type: ignore[no-untyped-def]
     a = aligned / twice
     c2 = square / twice if square > 0 else 0.0
     if not math.isfinite(c2):
@@ -86,7 +76,7 @@ def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t:
     u, pace, masses : ndarray, shape (n_atoms, 3)
         Velocities, F and masses; masses are 0 for atoms that do not take part.
     twice, t : float
-        As for `weights`.
+        As for `weights_of`.
     """
     inside = np.where(masses > 0, pace, 0.0)
     largest = float(np.abs(inside).max())
@@ -160,7 +150,7 @@ def before_drift(u, f, weights, masses, square, twice, t):  # type: ignore[no-un
     are not thermostatted are pushed.
     """
     aligned, raw = raw_sums(u, f, weights, masses)
-    keep, push, log_growth, cancels = _weights(aligned, square, twice, t)
+    keep, push, log_growth, cancels = weights_of(aligned, square, twice, t)
     if cancels or not push * push * raw <= MANY * twice:
         return 0.0, False
     a, b, w, m = flat(u), flat(f), flat(weights), flat(masses)
@@ -179,7 +169,7 @@ def after_drift(u, pace, masses, twice, t):  # type: ignore[no-untyped-def]
     uu, aligned, square = sums(u, pace, masses)
     factor = math.sqrt(twice / uu) if uu > 0 else math.nan
     aligned *= factor
-    keep, push, log_growth, cancels = _weights(aligned, square, twice, t)
+    keep, push, log_growth, cancels = weights_of(aligned, square, twice, t)
     if cancels:
         return square, factor, -math.log(factor), False
     # What rounding has left to correct.

@@ -61,8 +61,8 @@ def left_for(twice: float, driven: float, step: int) -> float:
     return left
 
 
-class Share:
-    """The thermostatted atoms."""
+class ThermostattedAtoms:
+    """The atoms that a thermostat acts on, and sums over them."""
 
     def __init__(self, system: System, atoms: ArrayLike | None) -> None:
         inside = system.inverse_masses[:, 0] > 0
@@ -90,17 +90,17 @@ class Share:
     def push_square(self, system: System, state: State) -> float:
         """f . M_par^+ f at the state."""
         assert state.forces is not None
-        pace = paced(system, system.near_origin(state)[0], state.forces, state.time)
+        pace = constrained_acceleration(system, system.near_origin(state)[0], state.forces, state.time)
         return float(closed_form.square_sum(pace, self.masses))
 
 
-def paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
+def constrained_acceleration(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
     """M_par^+ f."""
     with np.errstate(over="ignore"):  # velocities are checked
-        return _paced(system, x, forces, time)
+        return _acceleration(system, x, forces, time)
 
 
-def _paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
+def _acceleration(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
     motion = system.motion
     if motion.plan.driven:
         return np.asarray(motion.project_forces(x, forces, time=time) * system.inverse_masses)
@@ -112,7 +112,13 @@ class IsokineticStep(Interpreter):
     """Steps on their way; velocities are drive + v, the drive None where targets rest."""
 
     def __init__(
-        self, system: System, share: Share, start: State, dt: float, made: tuple[Program, Program, Program], steps: int
+        self,
+        system: System,
+        share: ThermostattedAtoms,
+        start: State,
+        dt: float,
+        made: tuple[Program, Program, Program],
+        steps: int,
     ) -> None:
         assert start.thermostat is not None
         driven = system.motion.plan.driven
@@ -163,7 +169,7 @@ class IsokineticStep(Interpreter):
     def _turn_by_projected_forces(self, row: Row, t: float) -> None:
         share = self.share
         check_finite(self.forces, "force", self.number)
-        pace = _paced(self.system, self.place(row.here), self.forces, self.at(row.end))
+        pace = _acceleration(self.system, self.place(row.here), self.forces, self.at(row.end))
         square, factor, growth, done = closed_form.after_drift(self.v, pace, share.masses, self.left, t)
         if not done:
             # The force is strong, and v runs against it.

@@ -22,7 +22,7 @@ from kcons.errors import (
 )
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
 from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
@@ -202,9 +202,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         UnsupportedError
             Rows that move with time, or hold velocities; forces that depend on velocities; friction.
         """
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError("forces that depend on the velocities have no energy to accept or reject by")
+        refuse_dissipation(system, "energy to accept or reject by")
         if system.motion.plan.driven:
             raise UnsupportedError(
                 "rows that move with time, or hold velocities, leave no stationary density to sample: hold positions "

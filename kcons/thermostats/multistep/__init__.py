@@ -7,12 +7,10 @@
 - `sphere_layout`: which velocities share a sphere
 - `sphere_kernels`: what happens on spheres, compiled
 - `spheres`: stochastic isokinetic baths
-- `sample_cost`: evaluations for one independent sample
 """
 
 from kcons.thermostats.multistep.force_groups import ForceGroups
 from kcons.thermostats.multistep.respa import LangevinRespa
-from kcons.thermostats.multistep.sample_cost import autocorrelation_time, evaluations_per_sample
 from kcons.thermostats.multistep.spheres import IsokineticSpheres
 
-__all__ = ["ForceGroups", "IsokineticSpheres", "LangevinRespa", "autocorrelation_time", "evaluations_per_sample"]
+__all__ = ["ForceGroups", "IsokineticSpheres", "LangevinRespa"]

@@ -64,7 +64,7 @@ class GroupedForces:
         size = 3 * system.n_atoms
         stored = len(names) * size + 1 if len(names) > 1 and not middle else 0
         known = carried(state, variables + stored, name, marked=marked)
-        x, _, forces = system.taken(state)
+        x, _, forces = system.kernel_arrays(state)
         found = cls(system, names, {}, middle)
         if forces is not None and not stored and not middle:
             found.now[names[0]] = forces

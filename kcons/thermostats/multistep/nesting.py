@@ -17,6 +17,7 @@ from typing import Literal
 from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
+from kcons.steppers.splitting import SUZUKI_4
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
@@ -71,6 +72,19 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
                 item="steps",
             )
     return tuple(levels)
+
+
+def inner_flight(order: int, substeps: int) -> tuple[float, ...]:
+    """What each drift of the innermost scheme is made of.
+
+    Raises
+    ------
+    InputError
+        An order that there is no scheme of.
+    """
+    if order not in (2, 4):
+        raise InputError(f"order is {order}; choose 2 or 4", item="order")
+    return (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
 
 
 def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
@@ -137,6 +151,52 @@ def nested(
     if not turns:
         done.append(Project())
     return tuple(done)
+
+
+class Nesting:
+    """Steps of all groups of forces, as steppers with several time steps make them.
+
+    Parameters
+    ----------
+    steps : mapping of str to int, optional
+    order : {2, 4}
+    substeps : int
+    slow_kicks : {'ends', 'middle'}
+    turns : bool
+        As for `nested`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Groups from the slowest to the fastest.
+    middle : bool
+        Whether the slowest kicks in the middle.
+    in_flights, on_circles : tuple of Operation
+        A step, and one whose flights are great circles.
+    evaluations : dict of str to int
+        How often a step evaluates each group.
+    words : list of str
+        Steps, and what else is not as by default, as arguments.
+
+    Raises
+    ------
+    InputError
+        As `levels_of`, `inner_flight` and `middle_of`.
+    """
+
+    def __init__(
+        self, steps: Mapping[str, int] | None, order: int, substeps: int, slow_kicks: SlowKicks, turns: bool = False
+    ) -> None:
+        levels = levels_of(steps)
+        flight = inner_flight(order, substeps)
+        self.names = tuple(level.group for level in levels)
+        self.middle = middle_of(levels, slow_kicks)
+        self.in_flights = nested(levels, order, flight, turns=turns, middle=self.middle)
+        self.on_circles = nested(levels, order, (1.0,), turns=turns, exact=True, middle=self.middle)
+        self.evaluations = evaluations(self.in_flights)
+        counts = {level.group: level.steps for level in levels}
+        self.words = ["" if steps is None else f", steps={counts}", "" if order == 2 else f", order={order}"]
+        self.words[1] += ", slow_kicks='middle'" if self.middle else ""
 
 
 def evaluations(operations: tuple[Operation, ...]) -> dict[str, int]:

@@ -6,29 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate
 from kcons.steppers.program import Row
-from kcons.steppers.splitting import SUZUKI_4
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Level, SlowKicks, evaluations, levels_of, middle_of, nested
-
-
-def inner_flight(order: int, substeps: int) -> tuple[float, ...]:
-    """What each drift of the innermost scheme is made of.
-
-    Raises
-    ------
-    InputError
-        An order that there is no scheme of.
-    """
-    if order not in (2, 4):
-        raise InputError(f"order is {order}; choose 2 or 4", item="order")
-    return (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
+from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
 
 
 class LangevinRespa(Langevin):
@@ -89,31 +74,24 @@ class LangevinRespa(Langevin):
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, seed, substeps=substeps, conserve_momentum=conserve_momentum)
-        self.levels: tuple[Level, ...] = levels_of(steps)
-        flight = inner_flight(order, self.substeps)
+        self.nesting = Nesting(steps, order, self.substeps, slow_kicks)
         self.inner_order = order
-        self.middle = middle_of(self.levels, slow_kicks)
-        self.names = tuple(level.group for level in self.levels)
-        self._in_flights = listed_and_made(nested(self.levels, order, flight, middle=self.middle), self.names)
-        circles = nested(self.levels, order, (1.0,), exact=True, middle=self.middle)
-        self._great_circles = listed_and_made(circles, self.names)
-        self.force_evaluations = sum(evaluations(self._in_flights[0]).values())
+        both = self.nesting.in_flights, self.nesting.on_circles
+        self._in_flights, self._great_circles = (listed_and_made(each, self.nesting.names) for each in both)
+        self.force_evaluations = sum(self.nesting.evaluations.values())
 
     def __repr__(self) -> str:
-        steps = {level.group: level.steps for level in self.levels}
-        given = "" if steps == {"": 1} else f", steps={steps}"
-        given += "" if self.inner_order == 2 else f", order={self.inner_order}"
-        given += ", slow_kicks='middle'" if self.middle else ""
+        given = "".join(self.nesting.words)
         return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
         super().check(system)
-        group_names(system.force, self.names)
+        group_names(system.force, self.nesting.names)
 
     def depends_on(self, system: System, state: State) -> Any:
         # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.middle else super().depends_on(system, state)
+        return None if self.nesting.middle else super().depends_on(system, state)
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)
@@ -126,9 +104,9 @@ class RespaStep(LangevinStep):
     simple = False
 
     def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa, steps: int) -> None:
-        names = thermostat.names
-        self.groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa", middle=thermostat.middle)
-        super().__init__(system, start, dt, thermostat, 1 if thermostat.middle else steps)
+        nesting = thermostat.nesting
+        self.groups, _ = GroupedForces.of(system, start, nesting.names, 1, "LangevinRespa", middle=nesting.middle)
+        super().__init__(system, start, dt, thermostat, 1 if nesting.middle else steps)
         self.forces = self.groups.stacked()
 
     def evaluate(self, row: Row, begun: bool) -> None:

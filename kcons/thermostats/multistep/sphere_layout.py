@@ -18,6 +18,7 @@ from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.solvers.rank_revealing import rank
 from kcons.steppers import System
+from kcons.thermostats.bodies import placed_rows
 
 Spheres = Literal["split", "axes", "cluster", "global"]
 KINDS = ("split", "axes", "cluster", "global")
@@ -139,10 +140,7 @@ def _clusters(system: System, moving: BoolArray, positions: FloatArray) -> tuple
     count = int(labels.max(initial=-1)) + 1
     placed = np.zeros(count, dtype=bool)
     placed[labels[rows[~movable]]] = True
-    for item, start in zip(held.constraints, held.starts, strict=False):
-        if not item.translation_invariant:
-            mine = labels[start : start + item.n_rows]
-            placed[mine[mine >= 0]] = True
+    placed[labels[placed_rows(held) & (labels >= 0)]] = True
     alone = np.flatnonzero(moving & (found < 0))
     found[alone] = count + np.arange(len(alone))
     free = 3 * np.bincount(found[found >= 0], minlength=count + len(alone))

@@ -28,8 +28,7 @@ from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Level, SlowKicks, evaluations, levels_of, middle_of, nested
-from kcons.thermostats.multistep.respa import inner_flight
+from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
 from kcons.thermostats.multistep.sphere_layout import KINDS, SphereLayout, Spheres, refuse_driven
 
 logger = logging.getLogger("kcons.thermostats")
@@ -105,26 +104,19 @@ class IsokineticSpheres(SeededBath):
             raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
         if spheres not in KINDS:
             raise InputError(f"spheres is {spheres!r}; choose one of {', '.join(KINDS)}", item="spheres")
-        self.levels: tuple[Level, ...] = levels_of(steps)
         self.spheres: Spheres = spheres
         self.auxiliary = whole_number(auxiliary, "auxiliary", 0)
         self.inner_order = order
-        flight = inner_flight(order, self.substeps)
-        self.middle = middle_of(self.levels, slow_kicks)
-        self.names = tuple(level.group for level in self.levels)
-        in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
-        circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
-        self._in_flights, self._great_circles = (_listed_and_made(each, self.names) for each in (in_flights, circles))
-        self.force_evaluations = sum(evaluations(in_flights).values())
+        self.nesting = Nesting(steps, order, self.substeps, slow_kicks, turns=True)
+        both = self.nesting.in_flights, self.nesting.on_circles
+        self._in_flights, self._great_circles = (_listed_and_made(each, self.nesting.names) for each in both)
+        self.force_evaluations = sum(self.nesting.evaluations.values())
         self._known: tuple[System, SphereLayout, FloatArray, float] | None = None
         self._told = False
 
     def __repr__(self) -> str:
-        steps = {level.group: level.steps for level in self.levels}
-        given = "" if steps == {"": 1} else f", steps={steps}"
-        given += f", spheres={self.spheres!r}, auxiliary={self.auxiliary}"
-        given += "" if self.inner_order == 2 else f", order={self.inner_order}"
-        given += ", slow_kicks='middle'" if self.middle else ""
+        steps, others = self.nesting.words
+        given = f"{steps}, spheres={self.spheres!r}, auxiliary={self.auxiliary}{others}"
         return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
@@ -147,7 +139,7 @@ class IsokineticSpheres(SeededBath):
         super().check(system)
         if self._known is None or self._known[0] is not system:
             refuse_driven(system)
-            group_names(system.force, self.names)
+            group_names(system.force, self.nesting.names)
 
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
@@ -165,7 +157,7 @@ class IsokineticSpheres(SeededBath):
 
     def depends_on(self, system: System, state: State) -> Any:
         # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.middle else super().depends_on(system, state)
+        return None if self.nesting.middle else super().depends_on(system, state)
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)
@@ -173,7 +165,7 @@ class IsokineticSpheres(SeededBath):
         if not self._told:
             self._told = True
             logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
-        return SphereStep(system, state, dt, self, layout, squares, 1 if self.middle else steps)
+        return SphereStep(system, state, dt, self, layout, squares, 1 if self.nesting.middle else steps)
 
     def _found(self, system: System, positions: FloatArray) -> tuple[System, SphereLayout, FloatArray, float]:
         known, kt = self._known, self.thermal_energy
@@ -217,9 +209,9 @@ class SphereStep(Interpreter):
         squares: FloatArray,
         steps: int,
     ) -> None:
-        n, auxiliary = len(squares), bath.auxiliary
+        n, auxiliary, nesting = len(squares), bath.auxiliary, bath.nesting
         self.groups, known = GroupedForces.of(
-            system, start, bath.names, 1 + n * auxiliary, "IsokineticSpheres", marked=True, middle=bath.middle
+            system, start, nesting.names, 1 + n * auxiliary, "IsokineticSpheres", marked=True, middle=nesting.middle
         )
         super().__init__(system, start, dt, bath.listed(system)[1], steps)
         self.bath, self.squares = bath, squares

@@ -1,4 +1,13 @@
-"""Trial cells, and the rule by which they are accepted."""
+"""Barostats: the ways in which a cell may change, trial cells, and the rule by which they are accepted.
+
+A cell h (vectors as rows) becomes h S, S = exp(sum of e_k E_k), with generators E_k of unit trace where the volume
+changes: e_k is then the change of ln V. In orthogonal kinds S is diagonal. 'flexible' keeps a lower triangular cell
+triangular: the generators are those of lower triangular matrices, taken in the frame in which the cell is one.
+
+The measure of the states is V dV for the volume times the invariant measure of shapes, so that volumes are spread alike
+in all kinds. In the coordinates e_k this is V^(N+1) d e for orthogonal kinds. Lower triangular matrices have two
+invariant measures, which differ by (S_11/S_33)^2 in a trial: see docs/constant_pressure.md.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +15,128 @@ import math
 import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import check_pairs, finite_number, positive, seed_number, whole_number
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.langevin import wound
+from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure.cell_system import CellSystem
-from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
-from kcons.thermostats.pressure.strains import Kind, Strains
+from kcons.thermostats.pressure.pieces import (
+    BarostatBodies,
+    Held,
+    find_pieces,
+    lattice_of,
+    require_periodic,
+    work_of_shapes,
+)
 
+Kind = Literal["isotropic", "semi-isotropic", "anisotropic", "flexible", "lateral", "normal"]
+
+_UNIT = np.eye(9).reshape(3, 3, 3, 3)  # _UNIT[i, j] has a one at i, j
+_X, _Y, _Z = (_UNIT[k, k] for k in range(3))
+#: The kinds of a barostat: the generators E_k of each.
+GENERATORS: dict[str, FloatArray] = {
+    "isotropic": np.array([(_X + _Y + _Z) / 3]),
+    "semi-isotropic": np.array([(_X + _Y) / 2, _Z]),
+    "anisotropic": np.array([_X, _Y, _Z]),
+    "flexible": np.array([_X, _Y, _Z, _UNIT[1, 0], _UNIT[2, 0], _UNIT[2, 1]]),
+    "lateral": np.array([(_X + _Y) / 2]),
+    "normal": np.array([_Z]),
+}
+#: Largest change of a length in one trial: from one cell to another within a tenth, the images that rows mean can be
+#: followed. Barostats propose no more, and the acceptance knows that.
+MOST = 0.09
 #: In `State.barostat`: the cell, the work of accepted trials, a number for the class and kind of the barostat, then for
 #: each mode trials, their summed probability of acceptance, and what the barostat adapts.
 WORK = 9
 OWNER = 10
 MODES = 11
+
+
+class Strains:
+    """One of the kinds in which a cell changes.
+
+    Attributes
+    ----------
+    kind : str
+    generators : ndarray, shape (k, 3, 3)
+    diagonals : ndarray, shape (k, 3)
+        Of the generators.
+    traces, sizes : ndarray, shape (k,)
+        Their traces, and sums of squares of their entries.
+    axes : ndarray of bool, shape (3,)
+        Those along which lengths change.
+    most : ndarray, shape (k,)
+        Largest |e_k| of a trial.
+
+    Raises
+    ------
+    InputError
+        An unknown kind.
+    """
+
+    def __init__(self, kind: Kind) -> None:
+        if not isinstance(kind, str) or kind not in GENERATORS:
+            raise InputError(f"kind is {kind!r}; choose {', '.join(map(repr, GENERATORS))}", item="kind")
+        self.kind, self.generators, self.flexible = kind, GENERATORS[kind], kind == "flexible"
+        self.diagonals: FloatArray = np.ascontiguousarray(np.diagonal(self.generators, axis1=1, axis2=2))
+        self.traces: FloatArray = self.diagonals.sum(axis=1)
+        self.sizes: FloatArray = (self.generators**2).sum(axis=(1, 2))
+        self.axes: NDArray[np.bool_] = np.asarray(self.diagonals.sum(axis=0) > 0)
+        self.most: FloatArray = MOST / np.abs(self.generators).max(axis=(1, 2))
+
+    def __len__(self) -> int:
+        return len(self.generators)
+
+    def frame(self, cell: FloatArray) -> FloatArray | None:
+        """Rotation Q with cell = L Q, L lower triangular; None for the unit matrix."""
+        if not self.flexible or not np.triu(cell, 1).any():
+            return None
+        q, r = np.linalg.qr(cell.T)
+        return (q * np.sign(np.diag(r))).T
+
+    def generators_in(self, frame: FloatArray | None) -> FloatArray:
+        return self.generators if frame is None else np.einsum("ji,kjl,lm->kim", frame, self.generators, frame)
+
+    def matrix(self, e: FloatArray, frame: FloatArray | None) -> FloatArray:
+        """S."""
+        if not self.flexible:
+            return np.diag(np.exp(e @ self.diagonals))
+        inner = _exponential(np.tensordot(e, self.generators, 1))
+        return inner if frame is None else frame.T @ inner @ frame
+
+    def log_measure(self, e: FloatArray, moving: IntArray) -> float:
+        """ln of the factor by which the measure of states grows; `moving` pieces follow the cell along each axis."""
+        logs = e @ self.diagonals  # ln S_ii
+        shape = 2 * (logs[0] - logs[2]) if self.flexible else 0.0
+        return float(logs @ moving + logs.sum() + shape)
+
+
+def _exponential(a: FloatArray) -> FloatArray:
+    """exp(a) for entries below 1 by its series, which leaves triangular matrices triangular to the last bit."""
+    term = total = np.eye(3)
+    for k in range(1, 20):
+        term = term @ a / k
+        total = total + term
+    return total
+
+
+#: Probability of acceptance that widths are adapted to, and how fast that fades: the mean change of ln(width) in trial
+#: n is n^-FADING.
+WANTED, FADING = 0.5, 0.6
+
+
+#: Standard deviations of the noise of a trial that fit into the largest change of a length, beside its mean of one.
+_WITHIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -72,13 +181,22 @@ class Place:
         return float(np.linalg.norm(np.cross(self.cell[0], self.cell[1])))
 
 
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """A strain e, and ln of the densities by which it and its reverse are proposed."""
+class Trial(NamedTuple):
+    """A strain e, the mode that it counts for, and ln of the density by which it is proposed."""
 
     e: FloatArray
     mode: int
     forward: float = 0.0
+
+
+class Attempt(NamedTuple):
+    """What a trial is made from."""
+
+    system: CellSystem
+    pieces: BarostatBodies
+    state: State
+    thermal_energy: float
+    dt: float
 
 
 class Barostat:
@@ -140,7 +258,7 @@ class Barostat:
             )
         self.pressure = finite_number(pressure, "pressure")
         self.tension = finite_number(tension, "tension")
-        self.strains = Strains.of(kind)
+        self.strains = Strains(kind)
         if self.tension and kind not in ("semi-isotropic", "lateral", "anisotropic"):
             raise InputError(f"kind={kind!r} has no surface tension; use 'semi-isotropic' or 'lateral'", item="tension")
         if held not in ("refuse", "stay"):
@@ -149,7 +267,7 @@ class Barostat:
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
-        self._pieces: WeakKeyDictionary[CellSystem, Pieces] = WeakKeyDictionary()
+        self._pieces: WeakKeyDictionary[CellSystem, BarostatBodies] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_pieces"}
@@ -164,7 +282,7 @@ class Barostat:
     def operation(self) -> Press:
         return Press(self.every, f"{self.what} ({self.strains.kind})")
 
-    def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> Pieces:
+    def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
         """What moves as one.
 
         Raises
@@ -247,8 +365,9 @@ class Barostat:
                 f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
                 "atoms overlap, or the force field returns what is no energy"
             )
-        numbers = wound((self.seed, 1), state.step)
-        trial, drawn = self._trial(system, pieces, before, state, thermal_energy, dt, numbers), numbers.random()
+        numbers = noise_generator((self.seed, 1), state.step)
+        attempt = Attempt(system, pieces, state, thermal_energy, dt)
+        trial, drawn = self._trial(attempt, before, numbers), numbers.random()
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)
         kept = np.abs(trial.e) <= self.strains.most
@@ -264,7 +383,7 @@ class Barostat:
                 there = replace(state, positions=positions, forces=None, barostat=None)
                 after = self._place(system, system.cell, positions, there)
                 log = self._log_chance(pieces, before, after, trial, thermal_energy)
-                log += self._reverse(system, pieces, after, trial, state, thermal_energy, dt) - trial.forward
+                log += self._reverse(attempt, after, trial) - trial.forward
                 chance = math.exp(min(0.0, log))
             except BaseException:
                 system.set_cell(before.cell, state.positions)
@@ -302,7 +421,9 @@ class Barostat:
             forces = system.with_forces(state).forces
         return Place(cell, positions, system.energy(positions, state.time, state.step), forces, stress)
 
-    def _log_chance(self, pieces: Pieces, before: Place, after: Place, trial: Trial, thermal_energy: float) -> float:
+    def _log_chance(
+        self, pieces: BarostatBodies, before: Place, after: Place, trial: Trial, thermal_energy: float
+    ) -> float:
         """ln of the ratio of the distribution at the two places."""
         rise = after.energy - before.energy + self.pressure * (after.volume - before.volume)
         if self.tension:
@@ -315,28 +436,10 @@ class Barostat:
 
     # -- what the kinds of barostat differ in ---------------------------------------------------
 
-    def _trial(
-        self,
-        system: CellSystem,
-        pieces: Pieces,
-        before: Place,
-        state: State,
-        thermal_energy: float,
-        dt: float,
-        rng: np.random.Generator,
-    ) -> Trial:
+    def _trial(self, attempt: Attempt, before: Place, rng: np.random.Generator) -> Trial:
         raise NotImplementedError
 
-    def _reverse(
-        self,
-        system: CellSystem,
-        pieces: Pieces,
-        after: Place,
-        trial: Trial,
-        state: State,
-        thermal_energy: float,
-        dt: float,
-    ) -> float:
+    def _reverse(self, attempt: Attempt, after: Place, trial: Trial) -> float:
         """ln of the density by which the trial back is proposed."""
         return 0.0
 
@@ -353,6 +456,132 @@ def _added(x: FloatArray, d: FloatArray, remainder: FloatArray | None) -> tuple[
         return y, None
     part = y - x
     return y, remainder + ((x - (y - part)) + (d - part))
+
+
+class MonteCarloBarostat(Barostat):
+    """Trial volumes (and shapes) at random; for any energy, no stress needed.
+
+    One mode of the kind is drawn for each trial, and changed by e^u, u uniform within a width. Widths go to an
+    acceptance of one half by steps that fade as n^-0.6, so that in the long run nothing is adapted any more.
+
+    Parameters
+    ----------
+    pressure, **kwargs
+        As for `Barostat`.
+    width : float
+        Of ln V at the start. A trial changes no length by more than 9 % (ln V by 0.27), whatever is asked for: where an
+        acceptance of one half would take more, as of a few pieces, widths end there, and `acceptance` stays above one
+        half. The distribution is right, and the volume takes longer to change.
+
+    Notes
+    -----
+    A trial takes two energies, and one evaluation of the forces where it is accepted. Calculators that find energy and
+    forces together know the first already, and the last one from the energy of the trial: one evaluation in all.
+
+    References
+    ----------
+    Chow and Ferguson, Comput. Phys. Commun. 91, 283 (1995); Aqvist et al., Chem. Phys. Lett. 384, 288 (2004).
+    """
+
+    what = "scale cell and centres of pieces at random, accept by energy"
+
+    def __init__(self, pressure: float, *, width: float = 0.01, **kwargs: Any) -> None:
+        super().__init__(pressure, **kwargs)
+        self.width = positive(width, "width")
+
+    def begin(self, system: CellSystem) -> FloatArray:
+        variables = super().begin(system)
+        self._modes(variables)[2] = np.log(np.minimum(self.width, self.strains.most))
+        return variables
+
+    def _trial(self, attempt: Attempt, before: Place, rng: np.random.Generator) -> Trial:
+        mode, e = int(rng.integers(len(self.strains))), np.zeros(len(self.strains))
+        e[mode] = math.exp(self._modes(attempt.state.barostat)[2, mode]) * (2 * rng.random() - 1)
+        return Trial(e, mode)
+
+    def _adapt(self, mode: int, chance: float, tried: FloatArray, taken: FloatArray, adapted: FloatArray) -> None:
+        super()._adapt(mode, chance, tried, taken, adapted)
+        grown = float(adapted[mode]) + 2 * (chance - WANTED) / float(tried[mode]) ** FADING
+        adapted[mode] = min(grown, math.log(self.strains.most[mode]))
+
+
+class CellRescaling(Barostat):
+    """Stochastic cell rescaling; needs the stress of the forces.
+
+    d e = (beta_T/tau)(P_int - P) dt + sqrt(2 kT beta_T/(V tau)) dW for e = ln V, and alike for the other modes of the
+    cell, from one trial to the next, P_int being the pressure of pieces as points, N kT/V + virial/(3 V). The step is a
+    proposal that is accepted by the energy as those of `MonteCarloBarostat` are: the distribution has no error of the
+    step, and velocities stay as they are. Trials go in the direction of the pressure: from far away the cell
+    relaxes in `tau`, and the noise is the one that belongs to the compressibility.
+
+    Parameters
+    ----------
+    pressure, **kwargs
+        As for `Barostat`.
+    tau : float
+        Time in which the volume relaxes. Where `every` steps are no longer short against it, fewer trials are accepted.
+        A trial changes no length by more than 9 %: where noise alone would do so, as of a few pieces, it relaxes
+        more slowly.
+    compressibility : float
+        beta_T; of water 4.5e-5/bar. A guess will do, it goes into the time of relaxation only.
+
+    References
+    ----------
+    Bernetti and Bussi, J. Chem. Phys. 153, 114107 (2020); anisotropic: Del Tatto, Raiteri, Bernetti and Bussi, Appl.
+    Sci. 12, 1139 (2022); acceptance: Roberts and Tweedie, Bernoulli 2, 341 (1996).
+    """
+
+    what = "scale cell and centres of pieces by the stress and by noise, accept by energy"
+    needs_stress = True
+
+    def __init__(self, pressure: float, tau: float, compressibility: float, **kwargs: Any) -> None:
+        super().__init__(pressure, **kwargs)
+        self.tau = positive(tau, "tau")
+        self.compressibility = positive(compressibility, "compressibility")
+
+    def _drift(self, attempt: Attempt, place: Place) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation of each mode's change until the next trial."""
+        system, pieces, _, thermal_energy, dt = attempt
+        strains, volume = self.strains, place.volume
+        generators = strains.generators_in(strains.frame(place.cell))
+        rise = energy_by_strain(system, pieces, place)
+        enthalpy = generators.reshape(-1, 9) @ rise.ravel() + self.pressure * volume * strains.traces
+        if self.tension:
+            enthalpy -= self.tension * place.area * strains.diagonals[:, :2].sum(axis=1)
+        # What the measure of the states and the changing width of the noise ask for leaves N, not N + 1.
+        slope = strains.diagonals @ pieces.moving - enthalpy / thermal_energy
+        spread = self.compressibility * thermal_energy / (3 * strains.sizes * volume * self.tau) * self.every * abs(dt)
+        spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)
+        wide = np.sqrt(2 * spread)
+        # Bounded, so that from far away trials can still be taken back, and be accepted.
+        return np.clip(spread * slope, -wide, wide), wide
+
+    def _trial(self, attempt: Attempt, before: Place, rng: np.random.Generator) -> Trial:
+        mean, wide = self._drift(attempt, before)
+        e = mean + wide * rng.standard_normal(len(mean))
+        return Trial(e, 0, _log_normal(e, mean, wide))
+
+    def _reverse(self, attempt: Attempt, after: Place, trial: Trial) -> float:
+        return _log_normal(-trial.e, *self._drift(attempt, after))
+
+    def acceptance(self, state: State) -> FloatArray:
+        """Mean probability of acceptance so far, the same for all modes, which change together; NaN without trials."""
+        return np.full(len(self.strains), super().acceptance(state)[0])
+
+
+def energy_by_strain(system: CellSystem, pieces: BarostatBodies, place: Place) -> FloatArray:
+    """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centres.
+
+    The stress is that of all atoms moving along; what they would move relative to the centre of their piece does work
+    against the forces, and is taken out again.
+    """
+    assert place.forces is not None and place.stress is not None
+    own = pieces.label, pieces.weight, pieces.open, *pieces.tree
+    return place.volume * place.stress + work_of_shapes(place.positions, place.forces, *own, lattice_of(system))
+
+
+def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:
+    return float(-0.5 * (((e - mean) / wide) ** 2).sum() - np.log(wide).sum())
 
 
 def require_barostat(given: object) -> Barostat:

@@ -137,10 +137,10 @@ class CellSystem(System):
         if cell is not None and not (cell == self.cell)[self.periodic].all():
             self.set_cell(cell.copy(), state.positions.copy())  # arrays of a state that is shown cannot be written to
 
-    def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """As `System.taken`, in the cell of the state."""
+    def kernel_arrays(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """As `System.kernel_arrays`, in the cell of the state."""
         self.enter(state)
-        return super().taken(state)
+        return super().kernel_arrays(state)
 
     def total_energy(self, state: State) -> float:
         """As `System.total_energy`, in the cell of the state."""

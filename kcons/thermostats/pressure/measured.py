@@ -13,10 +13,9 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats.pressure.barostat import Place
-from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
+from kcons.thermostats.pressure.barostat import Place, energy_by_strain
 from kcons.thermostats.pressure.cell_system import CellSystem
-from kcons.thermostats.pressure.pieces import Pieces, find_pieces, lattice_of
+from kcons.thermostats.pressure.pieces import BarostatBodies, find_pieces, lattice_of
 
 #: Change of all lengths from which the derivative of the energy is taken.
 STRAIN = 1e-4
@@ -71,7 +70,7 @@ def instantaneous_pressure(
     state: State,
     virial: Virial = "molecular",
     *,
-    pieces: Pieces | None = None,
+    pieces: BarostatBodies | None = None,
     thermal_energy: float | None = None,
 ) -> FloatArray:
     """The instantaneous pressure tensor, shape (3, 3); the mean of its diagonal is the pressure.
@@ -87,7 +86,7 @@ def instantaneous_pressure(
         pieces, from energies in a cell a little larger and smaller (along the axes that pieces of a barostat follow),
         which needs no stress and gives the same in all directions. The means are the same; that of pieces has the least
         noise.
-    pieces : Pieces, optional
+    pieces : BarostatBodies, optional
         As `find_pieces` gives them; by default what constraints tie.
     thermal_energy : float, optional
         kT for the momenta of pieces, N kT/V instead of their present kinetic energy: the same mean, with less noise,
@@ -105,13 +104,13 @@ def instantaneous_pressure(
     refuse_virial(virial, thermal_energy)
     refuse_other(system, CellSystem, "system", "a CellSystem, which knows its cell")
     if pieces is not None:
-        refuse_other(pieces, Pieces, "pieces", "what find_pieces or barostat.pieces gives")
+        refuse_other(pieces, BarostatBodies, "pieces", "what find_pieces or barostat.pieces gives")
         if len(pieces.label) != system.n_atoms:
             raise InputError(
                 f"pieces are those of {len(pieces.label)} atoms, and the system has {system.n_atoms}; find its own",
                 item="pieces",
             )
-    x, v, _ = system.taken(state)
+    x, v, _ = system.kernel_arrays(state)
     cell = system.cell
     volume = system.volume
     if virial == "atomic":
@@ -134,7 +133,7 @@ def instantaneous_pressure(
     return (kinetic - 0.5 * (rise + rise.T)) / volume
 
 
-def _slope(system: CellSystem, state: State, pieces: Pieces, cell: FloatArray) -> float:
+def _slope(system: CellSystem, state: State, pieces: BarostatBodies, cell: FloatArray) -> float:
     """dU/d ln(length) where the cell is scaled along the axes it changes along, and pieces move by their centres."""
     lattice, energies = lattice_of(system), []
     try:
@@ -167,7 +166,7 @@ class PressureObserver:
     system : CellSystem
     virial, thermal_energy
         As for `instantaneous_pressure`.
-    pieces : Pieces, optional
+    pieces : BarostatBodies, optional
         Those of a barostat: `barostat.pieces(system, positions)`.
 
     Attributes
@@ -186,7 +185,7 @@ class PressureObserver:
         system: CellSystem,
         virial: Virial = "molecular",
         *,
-        pieces: Pieces | None = None,
+        pieces: BarostatBodies | None = None,
         thermal_energy: float | None = None,
     ) -> None:
         refuse_virial(virial, thermal_energy)

@@ -10,26 +10,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import check_pairs
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import follow_parents, spanning_tree
 from kcons.constraints.target import FloatArray
-from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.thermostats.bodies import UNCHANGED, placed_rows, row_changes, rows_where, shifts
 from kcons.thermostats.pressure.cell_system import CellSystem
-from kcons.thermostats.pressure.centre_moves import displacements
+from kcons.topology.topology import connected
 
 Held = Literal["refuse", "stay"]
 
-#: How far each atom is moved to see whether a row knows a place in space, relative to the size of the system.
-TURN = 1e-3
 #: Sine squared of the angle between an axis and what is periodic, below which it lies therein.
 FLAT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
-    """Pieces of a system.
+class BarostatBodies:
+    """What moves as one when the cell changes.
 
     Attributes
     ----------
@@ -101,7 +100,7 @@ def find_pieces(
     molecules: ArrayLike | None = None,
     held: Held = "refuse",
     time: float = 0.0,
-) -> Pieces:
+) -> BarostatBodies:
     """Pieces of a system by its constraints, and by bonds if they are given.
 
     Parameters
@@ -136,8 +135,8 @@ def find_pieces(
         bonds = check_pairs(molecules, n_atoms)
         links.append(bonds)
         nearest.append(bonds)
-    wound = any(c.cell_offsets is not None and c.cell_offsets.any() for c in constraint_set.constraints)
-    label = _labels(links, n_atoms)
+    around = any(c.cell_offsets is not None and c.cell_offsets.any() for c in constraint_set.constraints)
+    label = connected(_joined(links), n_atoms)[0]
     rows = rows_open(motion, positions, time)
     opened = np.ones((int(label.max()) + 1, 3), dtype=bool)
     placed = np.zeros(n_atoms, dtype=bool)
@@ -169,11 +168,11 @@ def find_pieces(
     total = np.bincount(label, masses).astype(float)
     order = np.argsort(~placed, kind="stable")
     near = _joined(nearest)
-    pieces = Pieces(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order), axes)
+    pieces = BarostatBodies(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order), axes)
     lattice = lattice_of(system)
     y = pieces.whole(positions, lattice)
     closing = np.flatnonzero(np.round((y[near[:, 1]] - y[near[:, 0]]) @ lattice[1]).any(axis=1))
-    if wound or len(closing):
+    if around or len(closing):
         pair = f" between atoms {near[closing[0], 0]} and {near[closing[0], 1]}" if len(closing) else ""
         raise UnsupportedError(
             f"what is tied together closes upon itself through the cell{pair}: it fixes the cell. Keep the volume "
@@ -185,40 +184,17 @@ def find_pieces(
 def rows_open(motion: Motion, positions: FloatArray, time: float = 0.0) -> NDArray[np.bool_]:
     """Whether all atoms of a row may be shifted along an axis without a change of it, shape (n_rows, 3)."""
     held = motion.constraint_set
-    placed = np.zeros(held.n_rows, dtype=bool)
-    rolling = np.zeros(held.n_rows, dtype=bool)
-    for item, start in zip(held.constraints, held.starts, strict=False):
-        placed[start : start + item.n_rows] = not item.translation_invariant
-        rolling[start : start + item.n_rows] = not item.holonomic
+    placed = placed_rows(held)
     opened = np.repeat(~placed[:, None], 3, axis=1)
-    if not placed.any():
-        return opened
-    # As `open_directions` of the thermostats, for each row and each axis.
-    rng = np.random.default_rng(0)
-    size = extent(positions) or 1.0
-    every = np.tile(np.eye(3), (motion.n_atoms, 1))
-    opened[placed & ~rolling] = True
-    for spread in (0.0, TURN * size, TURN * size):
-        with np.errstate(all="ignore"):
-            rows = held.jacobian(positions + spread * rng.standard_normal(positions.shape), time)
-        change = np.abs(np.asarray(rows @ every))
-        scale = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())[:, None]
-        opened &= ~placed[:, None] | (change <= 1e-9 * scale)  # NaN: a surface not defined nearby has a place
+    if placed.any():
+        opened[placed & rows_where(held, [item.holonomic for item in held.constraints])] = True
+        for change in row_changes(motion, positions, shifts, time):
+            opened &= ~placed[:, None] | (np.abs(change) <= UNCHANGED)  # NaN: a surface not defined nearby has a place
     return opened
 
 
 def _joined(links: Iterable[IntArray]) -> IntArray:
     return np.concatenate([np.zeros((0, 2), np.int64), *links])
-
-
-def _labels(links: Iterable[IntArray], n_atoms: int) -> IntArray:
-    """A number for each atom, the same for those that links join."""
-    import scipy.sparse as sp
-    from scipy.sparse.csgraph import connected_components  # slow to import
-
-    pairs = _joined(links)
-    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def lattice_of(system: CellSystem) -> FloatArray:
@@ -241,3 +217,73 @@ def require_periodic(system: CellSystem, axes: NDArray[np.bool_], kind: str) -> 
             f"{slab}make the cell periodic there",
             item="kind",
         )
+
+
+# -- compiled, since every trial of a barostat asks for both ----------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):  # type: ignore[no-untyped-def]
+    """By how much atoms move where the cell becomes cell (1 + `change`), each in the image that it is stored in.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_atoms, 3)
+    label, weight, opened, atoms, parents
+        Of `BarostatBodies`; the last two are its tree.
+    lattice : ndarray, shape (2, 3, 3)
+    change : ndarray, shape (3, 3)
+    d : ndarray, shape (n_atoms, 3)
+        Written to.
+
+    Returns
+    -------
+    int
+        An atom that stays in its place along an axis in which its image moves; -1 without one.
+    """
+    y = x.copy()
+    follow_parents(y, atoms, parents, lattice)
+    moved = np.zeros((len(opened), 3))
+    for i in range(len(x)):
+        for k in range(3):
+            moved[label[i], k] += weight[i] * y[i, k]
+    for p in range(len(opened)):
+        a, b, c = moved[p, 0], moved[p, 1], moved[p, 2]
+        for k in range(3):
+            moved[p, k] = a * change[0, k] + b * change[1, k] + c * change[2, k] if opened[p, k] else 0.0
+    cell, inverse, torn = lattice[0], lattice[1], -1
+    for i in range(len(x)):
+        p = label[i]
+        for k in range(3):
+            d[i, k] = moved[p, k]
+        u, v, w = y[i, 0] - x[i, 0], y[i, 1] - x[i, 1], y[i, 2] - x[i, 2]
+        if u == 0.0 and v == 0.0 and w == 0.0:
+            continue
+        for m in range(3):
+            cells = np.rint(u * inverse[0, m] + v * inverse[1, m] + w * inverse[2, m])
+            if cells == 0.0:
+                continue
+            for k in range(3):
+                image = cells * (cell[m, 0] * change[0, k] + cell[m, 1] * change[1, k] + cell[m, 2] * change[2, k])
+                if image != 0.0 and not opened[p, k] and torn < 0:
+                    torn = i
+                d[i, k] -= image
+    return torn
+
+
+@njit(cache=True, nogil=True)
+def work_of_shapes(x, f, label, weight, opened, atoms, parents, lattice):  # type: ignore[no-untyped-def]
+    """Sum of (r_i - R) (x) f_i over atoms, R the centre of their piece or zero where it stays, shape (3, 3)."""
+    y = x.copy()
+    follow_parents(y, atoms, parents, lattice)
+    centres = np.zeros((len(opened), 3))
+    for i in range(len(x)):
+        for k in range(3):
+            centres[label[i], k] += weight[i] * y[i, k]
+    work = np.zeros((3, 3))
+    for i in range(len(x)):
+        p = label[i]
+        for j in range(3):
+            for k in range(3):
+                work[j, k] += (y[i, j] - centres[p, j] if opened[p, k] else y[i, j]) * f[i, k]
+    return work

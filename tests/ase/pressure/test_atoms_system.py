@@ -27,7 +27,7 @@ from kcons.ase import (
 )
 from kcons.constraints import Distance, FixedAtoms
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.thermostats.multistep import autocorrelation_time
+from kcons.thermostats import autocorrelation_time
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
 
 KT = units.kB * TEMPERATURE

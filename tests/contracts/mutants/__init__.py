@@ -1,18 +1,37 @@
 """Single lines of the package made wrong, and the tests that must notice.
 
-An entry is (file in kcons/, its text, the wrong text, tests that must fail). The text occurs once in the file. Names of
-tests are those that pytest takes, several parted by blanks; parameters in brackets are left out where any will do.
+By file in kcons/: its text, with what is made wrong of it as «right→wrong», and the tests that must fail. The text
+occurs once in the file. Tests are named as pytest takes them, by the name of their file where no other has it, several
+parted by blanks; parameters in brackets are left out where any will do.
 """
+
+from pathlib import Path
 
 from mutants import ase_dynamics, files, free_energies, models, openmm_programs, solvers, steppers, studies
 
+TESTS = Path(__file__).resolve().parents[2]
+MODULES = (solvers, openmm_programs, models, steppers, files, studies, free_energies, ase_dynamics)
+
+
+def both(text: str) -> tuple[str, str]:
+    """The text as it is, and made wrong."""
+    head, _, rest = text.partition("«")
+    right, _, rest = rest.partition("→")
+    wrong, _, tail = rest.partition("»")
+    return head + right + tail, head + wrong + tail
+
+
+def found(test: str) -> str:
+    """The test with the path of its file, from the folder that `tests` is in."""
+    file, sign, name = test.partition("::")
+    (path,) = [TESTS / file] if "/" in file else TESTS.rglob(file)
+    return path.relative_to(TESTS.parent).as_posix() + sign + name
+
+
+#: (file in kcons/, its text, the wrong text, tests that must fail).
 MUTANTS = [
-    *solvers.MUTANTS,
-    *openmm_programs.MUTANTS,
-    *models.MUTANTS,
-    *steppers.MUTANTS,
-    *files.MUTANTS,
-    *studies.MUTANTS,
-    *free_energies.MUTANTS,
-    *ase_dynamics.MUTANTS,
+    (file, *both(text), " ".join(map(found, tests.split())))
+    for module in MODULES
+    for file, rows in module.MUTANTS.items()
+    for text, tests in rows
 ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons.constraints import Dihedral, Distance, Formula
-from kcons.free_energy.scans.grid import Grid
+from kcons.free_energy.scans.scan_result import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
 

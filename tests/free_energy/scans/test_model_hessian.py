@@ -10,7 +10,7 @@ from ase import Atoms
 from ase.build import molecule
 
 from kcons.constraints.periodic.one_piece import lattice_of
-from kcons.free_energy.scans.model_hessian import Internals
+from kcons.free_energy.scans.relaxation import Internals
 
 
 @pytest.mark.parametrize("name", ["CH3CH2OH", "C2H2", "CH3SiH3", "2-butyne", "H2O"])

@@ -11,8 +11,7 @@ from kcons import ConstraintSet, Motion
 from kcons.constraints import Dihedral, Distance, FixedAtoms
 from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
-from kcons.free_energy.scans.model_hessian import Internals
-from kcons.free_energy.scans.relaxation import relax
+from kcons.free_energy.scans.relaxation import Internals, relax
 from kcons.motion import minimize
 
 

@@ -16,8 +16,7 @@ from kcons.cli.terminal import rendered
 from kcons.constraints import Custom, Dihedral, Distance
 from kcons.errors import InputError, OccupiedError, UnreadableError
 from kcons.free_energy import scan
-from kcons.free_energy.scans.grid import Grid
-from kcons.free_energy.scans.scan_result import KJ, PLACE, PLAN, Attempt, Attempts
+from kcons.free_energy.scans.scan_result import KJ, PLACE, Attempt, Attempts, Grid
 
 TURN = Dihedral([[0, 1, 2, 3]])
 
@@ -124,20 +123,6 @@ def test_an_attempt_of_another_scan_is_refused(tmp_path):
     made(tmp_path).keep(Attempt(0, (0,), None))
     with pytest.raises(UnreadableError, match="of another scan"):
         made(tmp_path).kept(0, (1,), None)
-
-
-def test_the_plan_has_to_be_the_same(tmp_path):
-    made(tmp_path)
-    with pytest.raises(OccupiedError, match=r"has a scan of other settings; give another folder \(--out\)"):
-        made(tmp_path, {"fmax": 0.02})
-    plan = json.loads((tmp_path / PLAN).read_text())
-    (tmp_path / PLAN).write_text(json.dumps({**plan, "colour": 1}))
-    with pytest.raises(OccupiedError, match="a scan of other colour"):
-        made(tmp_path)
-    for content in ("{", "[]"):
-        (tmp_path / PLAN).write_text(content)
-        with pytest.raises(OccupiedError, match=r"other files called plan\.json"):
-            made(tmp_path)
 
 
 def test_without_a_folder_nothing_is_kept():

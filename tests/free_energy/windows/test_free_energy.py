@@ -11,7 +11,7 @@ from window_samplers import Fake
 from kcons.cli.terminal import rendered
 from kcons.errors import InputError
 from kcons.free_energy import FreeEnergy, MeanForce, Settings, WindowResult, Windows, pull_free_energy
-from kcons.free_energy.windows.free_energy import combine_sides
+from kcons.free_energy.windows.driver import combine_sides
 
 PERIOD = 2 * np.pi
 

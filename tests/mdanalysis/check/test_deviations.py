@@ -366,10 +366,13 @@ def test_rows_that_were_made_for_a_part_are_refused(water):
 # -- backends ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ["multiprocessing", "dask"])
 @pytest.mark.parametrize(
-    ("ending", "rows", "targets"),
-    [("xtc", [ROWS, Angle([[1, 0, 2]])], "given"), ("dcd", ROWS, "mean"), ("trr", ROWS, "first")],
+    ("backend", "ending", "rows", "targets"),
+    [
+        ("multiprocessing", "xtc", [ROWS, Angle([[1, 0, 2]])], "given"),
+        ("dask", "dcd", ROWS, "mean"),
+        ("multiprocessing", "trr", ROWS, "first"),
+    ],
 )
 def test_backends_agree(water, backend, ending, rows, targets):
     if backend == "dask":

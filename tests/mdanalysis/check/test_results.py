@@ -9,7 +9,7 @@ import water_files as files
 
 from kcons.constraints import CenterOfMass, Distance
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError, OccupiedError
+from kcons.errors import InputError
 from kcons.mdanalysis import ConstraintCheck, check_trajectory, to_ase
 from kcons.mdanalysis.check import report
 from kcons.mdanalysis.check.result import fitted
@@ -154,20 +154,6 @@ def looked(path, **options):
     return check_trajectory(path, path.parent / "t.gro", "none", rank=False, **options)
 
 
-def test_writing_refuses_others_and_follows_no_links(folder, tmp_path):
-    one, other = looked(folder / "good.xtc"), looked(folder / "good.trr")
-    report.write(one, tmp_path / "out")
-    with pytest.raises(OccupiedError, match=r"of other file \(.*good\.xtc\); give another folder"):
-        report.write(other, tmp_path / "out")
-    for name in ("check.json.unfinished", ".kcons.lock"):  # links that somebody has put there
-        (tmp_path / "out" / name).symlink_to(tmp_path / "victim")
-    with pytest.raises(OccupiedError, match=r"\.kcons\.lock is a link"):
-        report.write(one, tmp_path / "out")
-    (tmp_path / "out" / ".kcons.lock").unlink()
-    report.write(one, tmp_path / "out")
-    assert not (tmp_path / "victim").exists()
-
-
 def drawn(monkeypatch, result):
     """Lines of the first panel by label, and its scale."""
     from matplotlib.figure import Figure
@@ -206,22 +192,3 @@ def test_the_picture_has_no_stroke_to_the_zero_of_the_first_frame(folder, monkey
         y = np.asarray(lines[label].get_ydata(), dtype=float)
         assert np.isnan(y[0]) and np.isfinite(y[1:]).all()
     assert axes.get_ylim()[0] > 1e-5
-
-
-def test_a_full_disk_leaves_nothing_that_blocks_the_folder(folder, tmp_path):
-    """Files may grow to some bytes only, as on a disk that is full; a check of any trajectory can be written later."""
-    resource = pytest.importorskip("resource")
-    result = looked(folder / "good.xtc", frames="2:3")
-    assert max(result.series["largest Å"]) < 1e-12 and result.status == "incomplete"
-    report.plot(result, tmp_path / "drawn.png")  # of one frame, with all that has to be imported or kept
-    assert (tmp_path / "drawn.png").stat().st_size > 5000
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for write in (report.write, lambda _, out: report.write_failure(folder / "good.xtc", "no" * 200, out)):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
-        try:
-            with pytest.raises(OSError):
-                write(result, tmp_path / "out")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        assert not list((tmp_path / "out").iterdir())
-    assert len(report.write(looked(folder / "good.trr"), tmp_path / "out")) == 2

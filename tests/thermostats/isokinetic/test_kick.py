@@ -16,10 +16,10 @@ MASSES = np.repeat(RNG.uniform(0.5, 3.0, (4, 1)), 3, axis=1)
 
 def kicked(u, pace, t, masses=MASSES):
     uu, up, pp = kick.sums(u, pace, masses)
-    w = kick.weights(up, pp, uu, t)
-    if w.cancels:
+    keep, push, log_growth, cancels = kick.weights_of(up, pp, uu, t)
+    if cancels:
         return kick.turned(u, pace, masses, uu, t)
-    return w.keep * u + w.push * pace, w.log_growth
+    return keep * u + push * pace, log_growth
 
 
 def by_angle(u, pace, t):

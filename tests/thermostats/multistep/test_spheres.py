@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import math
 
 import numpy as np
 import pytest
 from thermostat_systems import dumbbells, molecules, quartic, quartic_potential, springs, system, waves
 
 from kcons.constraints import Distance, Plane, Sphere
-from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.errors import InputError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
     ForceGroups,
@@ -169,34 +168,6 @@ def test_it_says_once_that_dynamics_are_lost(caplog):
     ]
 
 
-def test_words():
-    stepper = IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes", order=4)
-    assert repr(stepper) == (
-        "IsokineticSpheres(0.5, 1.0, seed=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1, order=4)"
-    )
-    assert "at constant kinetic energy: slow" in stepper.listing()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"friction": 0.0}, "friction is 0.0; spheres need a bath"),
-        ({"friction": -1.0}, "friction is -1.0"),
-        ({"friction": math.nan}, "friction is nan"),
-        ({"thermal_energy": 0.0}, "thermal_energy is 0.0"),
-        ({"spheres": "ball"}, "spheres is 'ball'; choose one of split, axes, cluster, global"),
-        ({"auxiliary": -1}, "auxiliary is -1"),
-        ({"auxiliary": 1.5}, "auxiliary is 1.5"),
-        ({"order": 6}, "order is 6"),
-        ({"substeps": 0}, "substeps is 0"),
-        ({"steps": {"slow": 1, "fast": -4}}, "takes -4 steps"),
-    ],
-)
-def test_bad_input(options, words):
-    with pytest.raises(InputError, match=words):
-        IsokineticSpheres(**{"thermal_energy": 0.5, "friction": 1.0, "seed": 3, **options})
-
-
 def test_spheres_of_radius_zero():
     held, state = molecules("bent", 2)
     with pytest.raises(InputError, match="have the radius 0"):
@@ -224,25 +195,6 @@ def test_as_many_variables_of_another_thermostat(atoms, auxiliary, other):
     assert state.thermostat.shape == (1 + atoms * auxiliary,)
     with pytest.raises(InputError, match="variables of another thermostat, not of IsokineticSpheres"):
         spheres.step(held, state, 0.01)
-
-
-def test_what_has_no_spheres():
-    held, state = molecules("bent", 2)
-    stepper = IsokineticSpheres(0.5, 1.0, 3)
-    with pytest.raises(InputError, match="variables of another thermostat, not of IsokineticSpheres"):
-        stepper.step(held, Isokinetic().start(held, state), 0.1)
-    with pytest.raises(UnsupportedError, match="depend on the velocities"):
-        stepper.check(System(held.motion, lambda x, v, t: -v, velocity_dependent=True))
-    with pytest.raises(UnsupportedError, match="System with friction"):
-        stepper.check(System(held.motion, springs, friction=1.0))
-    x = state.positions
-    moving = system([Distance([[0, 1]], lambda t: 1 + 0.1 * t)], x, held.masses, springs)
-    with pytest.raises(UnsupportedError, match="Distance has a target that moves"):
-        stepper.check(moving)
-    with pytest.raises(InputError, match="noise cannot be taken back"):
-        stepper.step(held, state, -0.1)
-    with pytest.raises(NonFiniteError, match="non-finite force at step 1"):
-        stepper.step(System(held.motion, lambda x, t: x * (1.0 if t == 0 else np.nan)), state, 0.1)
 
 
 def test_a_cluster_on_a_plane():

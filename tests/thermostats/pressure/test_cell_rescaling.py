@@ -11,12 +11,10 @@ from scipy import stats
 
 from kcons.errors import InputError
 from kcons.thermostats import mean
-from kcons.thermostats.langevin import wound
+from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
-from kcons.thermostats.pressure.barostat import Place
-from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
+from kcons.thermostats.pressure.barostat import Place, Strains, energy_by_strain
 from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
-from kcons.thermostats.pressure.strains import Strains
 
 
 @pytest.mark.parametrize("tau", [2.0, 30.0])
@@ -62,7 +60,7 @@ def test_energy_by_strain_is_the_derivative(turned):
     system.set_cell(cell, x)
     place = Place(cell, x, 0.0, system.forces(x, x, 0.0, 0), system.stress(x, 0.0))
     found = energy_by_strain(system, pieces, place)
-    strains = Strains.of("flexible")
+    strains = Strains("flexible")
     frame = strains.frame(cell)
     for k, generator in enumerate(strains.generators_in(frame)):
         energies = []
@@ -104,8 +102,8 @@ def test_no_axis_is_another_than_the_others(barostat, order, monkeypatch):
         system, x = gas(METHANE, 6, **waves())
         x = np.ascontiguousarray(x[:, taken])
         again = copy.deepcopy(barostat)
-        turned = lambda *key, taken=taken: Turned(wound(*key), taken)  # noqa: E731
-        monkeypatch.setattr("kcons.thermostats.pressure.barostat.wound", turned)
+        turned = lambda *key, taken=taken: Turned(noise_generator(*key), taken)  # noqa: E731
+        monkeypatch.setattr("kcons.thermostats.pressure.barostat.noise_generator", turned)
         cells.append(cells_of(system, started(system, x, again), again, 40))
     first, second = (np.diagonal(found, axis1=1, axis2=2) for found in cells)
     assert second == pytest.approx(first[:, order], rel=1e-9)

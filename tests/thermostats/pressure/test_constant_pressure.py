@@ -12,8 +12,7 @@ from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import ProjectedVerlet, Rattle, State, Suzuki4, interpreter, run
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
-from kcons.thermostats.multistep import autocorrelation_time
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, autocorrelation_time, thermal_velocities
 from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
 
 N, SIDE = 40, 12.0

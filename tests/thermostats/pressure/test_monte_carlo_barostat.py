@@ -17,8 +17,7 @@ from pressure_systems import (
 )
 from scipy import stats
 
-from kcons.thermostats import mean
-from kcons.thermostats.multistep import autocorrelation_time
+from kcons.thermostats import autocorrelation_time, mean
 from kcons.thermostats.pressure import MonteCarloBarostat
 
 

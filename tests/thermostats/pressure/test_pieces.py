@@ -53,6 +53,17 @@ def test_images_shift_with_the_cell():
     assert cells == pytest.approx(np.round(cells), abs=1e-12)
 
 
+def test_what_stays_is_not_stored_across_a_face_that_moves():
+    """Its image would move, and with it what the row means."""
+    x = METHANE + 3.0
+    system = system_of([FixedAtoms([0]), Distance([[0, 1]])], x)
+    x[1] += [0.0, 12.0, 0.0]
+    pieces = find_pieces(system, x, ALL, held="stay")
+    with pytest.raises(UnsupportedError, match="atom 1 is held in its place across a face of the cell"):
+        pieces.moved(x, 0.1 * np.eye(3), lattice_of(system))
+    assert not pieces.moved(x, np.diag([0.1, 0.0, 0.1]), lattice_of(system))[:2].any()
+
+
 def test_bonds_tie_what_constraints_do_not():
     x = placed(METHANE, 2, 12.0, 3)
     system = system_of(Distance([[0, 1]]), x)

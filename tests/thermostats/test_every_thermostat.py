@@ -1,0 +1,196 @@
+"""What all thermostats have in common: constraints, restarts, marches, refusals, words."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from thermostat_systems import distance, molecules, quartic, quartic_potential, waves, waves_potential
+
+from kcons.constraints import Distance
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import State, System, run
+from kcons.thermostats import (
+    ForceGroups,
+    HamiltonianMonteCarlo,
+    Isokinetic,
+    IsokineticSpheres,
+    Langevin,
+    LangevinRespa,
+    NoseHooverChain,
+)
+
+TWO = {"slow": 1, "fast": 4}
+FIELDS = ("positions", "velocities", "forces", "thermostat", "time")
+BATHS = {
+    "Langevin": lambda seed: Langevin(0.5, 1.0, seed),
+    "LangevinRespa": lambda seed: LangevinRespa(0.5, 1.0, seed, steps=TWO),
+    "LangevinRespa, middle": lambda seed: LangevinRespa(0.5, 1.0, seed, steps=TWO, slow_kicks="middle"),
+    "IsokineticSpheres": lambda seed: IsokineticSpheres(0.5, 1.0, seed, steps=TWO),
+    "IsokineticSpheres, middle": lambda seed: IsokineticSpheres(0.5, 1.0, seed, steps=TWO, slow_kicks="middle"),
+    "HamiltonianMonteCarlo": lambda seed: HamiltonianMonteCarlo(0.5, (1, 4), seed, keep=0.3),
+    "NoseHooverChain": lambda seed: NoseHooverChain(0.5, 1.0),
+    "Isokinetic": lambda seed: Isokinetic(0.5),
+    "Isokinetic of order 4": lambda seed: Isokinetic(0.5, order=4),
+}
+NOISY = [name for name in BATHS if not name.startswith(("Nose", "Isokinetic of")) and name != "Isokinetic"]
+EVERY = pytest.mark.parametrize("name", BATHS)
+
+
+def begun(name="bent"):
+    """Molecules and an ion under forces of two groups."""
+    held, state = molecules(name, 3, ions=1)
+    forces = ForceGroups({"fast": waves, "slow": lambda x, t: 0.3 * quartic(x)})
+    potential = lambda x, t: waves_potential(x) + 0.3 * quartic_potential(x)  # noqa: E731
+    return System(held.motion, forces, potential=potential), state
+
+
+def same(a, b):
+    return all(
+        np.array_equal(getattr(a, field), getattr(b, field)) for field in FIELDS if getattr(a, field) is not None
+    )
+
+
+@EVERY
+def test_everything_stays_on_the_constraints(name):
+    held, state = begun("triangles")
+    end = run(held, state, 0.05, 30, stepper=BATHS[name](3))
+    rows = held.motion.constraint_set
+    assert distance(end, state) > 0.05
+    assert np.abs(rows.value(end.positions)).max() <= 1e-13
+    assert np.abs(rows.jacobian(end.positions) @ end.velocities.ravel()).max() <= 1e-13
+
+
+@EVERY
+def test_a_run_goes_on_to_the_last_bit(name):
+    """From a state in memory and from a file; noise is a function of the seed and of the number of the step."""
+    held, state = begun()
+    half = run(held, state, 0.05, 12, stepper=BATHS[name](3))
+    whole = run(held, half, 0.05, 12, stepper=BATHS[name](3))
+    file = io.BytesIO()
+    half.save(file)
+    file.seek(0)
+    assert same(run(begun()[0], State.load(file), 0.05, 12, stepper=BATHS[name](3)), whole)
+    if name in NOISY:
+        for other, seed in ((half, 4), (replace(half, step=0), 3)):
+            assert distance(run(held, other, 0.05, 12, stepper=BATHS[name](seed)), whole) > 1e-3
+
+
+@EVERY
+def test_a_run_is_its_steps_one_by_one_and_changes_no_array(name):
+    held, state = begun()
+    stepper = BATHS[name](3)
+    state = one = stepper.step(held, state, 0.05)
+    arrays = [getattr(state, field) for field in FIELDS if isinstance(getattr(state, field), np.ndarray)]
+    before = [array.copy() for array in arrays]
+    for array in arrays:
+        array.flags.writeable = False
+    for _ in range(7):
+        one = stepper.step(held, one, 0.05)
+    assert same(run(held, state, 0.05, 7, stepper=BATHS[name](3)), one)
+    assert all(np.array_equal(a, b) for a, b in zip(arrays, before, strict=True))
+
+
+@EVERY
+def test_steps_and_systems_that_cannot_be(name):
+    held, state = begun()
+    stepper = BATHS[name](3)
+    with pytest.raises(UnsupportedError):
+        stepper.step(System(held.motion, lambda x, v, t: -v, velocity_dependent=True), state, 0.1)
+    with pytest.raises(UnsupportedError, match="System with friction"):
+        stepper.step(System(held.motion, held.force, potential=held.potential, friction=0.1), state, 0.1)
+    broken = {key: lambda x, t: np.nan * x for key in ("fast", "slow")}
+    if name != "HamiltonianMonteCarlo":
+        with pytest.raises(NonFiniteError, match=r"non-finite force at step [01]"):
+            stepper.step(System(held.motion, ForceGroups(broken)), state, 0.1)
+        with pytest.raises((ConvergenceError, InputError), match="step 1: "):
+            stepper.step(held, state, 900.0)
+    if name in NOISY:
+        with pytest.raises(InputError, match="noise cannot be taken back"):
+            stepper.step(held, state, -0.1)
+    with pytest.raises(InputError, match="variables of another thermostat"):
+        stepper.step(held, replace(state, thermostat=np.zeros(77)), 0.1)
+    after = stepper.step(held, state, 0.1)
+    still = stepper.step(held, after, 0.0)
+    assert np.array_equal(still.positions, after.positions) and np.array_equal(still.velocities, after.velocities)
+
+
+def test_targets_that_move_are_refused_where_they_have_no_place():
+    _, state = begun()
+    moving = molecules("bent", 3, ions=1)[0].motion
+    rows = [Distance([[0, 1]], lambda t: 1 + 0.1 * t)]
+    driven = System(
+        type(moving)(type(moving.constraint_set)(rows, state.positions, np.ones(10)), state.positions), waves
+    )
+    for stepper, words in (
+        (NoseHooverChain(0.5, 1.0), "targets move"),
+        (IsokineticSpheres(0.5, 1.0, 3), "Distance has a target that moves"),
+    ):
+        with pytest.raises(UnsupportedError, match=words):
+            stepper.check(driven)
+
+
+NOISE = {"thermal_energy": 0.5, "friction": 1.0, "seed": 3}
+CHAIN = {"thermal_energy": 0.5, "period": 1.0}
+SAMPLER = {"thermal_energy": 0.5, "steps": 3, "seed": 1}
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "words"),
+    [
+        (Langevin, NOISE | {"thermal_energy": 0.0}, "thermal_energy is 0.0; give a positive number"),
+        (Langevin, NOISE | {"thermal_energy": math.nan}, "thermal_energy is nan"),
+        (Langevin, NOISE | {"friction": -1.0}, "friction is -1.0; give one number >= 0"),
+        (Langevin, NOISE | {"friction": [1.0, 2.0]}, "friction is"),
+        (Langevin, NOISE | {"friction": math.inf}, "friction is inf"),
+        (Langevin, NOISE | {"substeps": 0}, "substeps is 0"),
+        (Langevin, NOISE | {"substeps": 1.5}, "substeps is 1.5"),
+        (Langevin, NOISE | {"seed": -1}, "seed is -1"),
+        (Langevin, NOISE | {"seed": 2**64}, "from 0 to 18446744073709551615"),
+        (Langevin, NOISE | {"seed": 0.5}, "seed is 0.5"),
+        (LangevinRespa, NOISE | {"order": 3}, "order is 3; choose 2 or 4"),
+        (LangevinRespa, NOISE | {"steps": {"slow": 1, "fast": 0}}, "takes 0 steps"),
+        (IsokineticSpheres, NOISE | {"friction": 0.0}, "friction is 0.0; spheres need a bath"),
+        (IsokineticSpheres, NOISE | {"friction": math.nan}, "friction is nan"),
+        (IsokineticSpheres, NOISE | {"spheres": "ball"}, "'ball'; choose one of split, axes, cluster, global"),
+        (IsokineticSpheres, NOISE | {"auxiliary": -1}, "auxiliary is -1"),
+        (IsokineticSpheres, NOISE | {"auxiliary": 1.5}, "auxiliary is 1.5"),
+        (IsokineticSpheres, NOISE | {"order": 6}, "order is 6"),
+        (IsokineticSpheres, NOISE | {"steps": {"slow": 1, "fast": -4}}, "takes -4 steps"),
+        (NoseHooverChain, CHAIN | {"period": -1.0}, "period is -1.0; give a positive number"),
+        (NoseHooverChain, CHAIN | {"period": math.nan}, "period is nan"),
+        (NoseHooverChain, CHAIN | {"length": 0}, "length is 0"),
+        (NoseHooverChain, CHAIN | {"length": 1.5}, "length is 1.5"),
+        (NoseHooverChain, CHAIN | {"chain_order": 3}, "chain_order is 3; give 2, 4 or 6"),
+        (NoseHooverChain, CHAIN | {"repeats": 0}, "repeats is 0"),
+        (HamiltonianMonteCarlo, SAMPLER | {"steps": 0}, "steps is 0"),
+        (HamiltonianMonteCarlo, SAMPLER | {"steps": 2.5}, "steps is 2.5"),
+        (HamiltonianMonteCarlo, SAMPLER | {"steps": (4, 2)}, r"steps is \(4, 2\)"),
+        (HamiltonianMonteCarlo, SAMPLER | {"keep": 1.0}, "keep is 1.0; give a number from 0"),
+        (HamiltonianMonteCarlo, SAMPLER | {"keep": math.nan}, "keep is nan"),
+        (HamiltonianMonteCarlo, SAMPLER | {"tolerance": 0.0}, "tolerance is 0.0"),
+    ],
+)
+def test_bad_parameters(kind, given, words):
+    with pytest.raises(InputError, match=words):
+        kind(**given)
+
+
+@pytest.mark.parametrize(
+    ("stepper", "words"),
+    [
+        (LangevinRespa(0.5, 1.0, 3), "LangevinRespa(0.5, 1.0, seed=3)"),
+        (LangevinRespa(0.5, 1.0, 3, steps=TWO, slow_kicks="middle"), "slow_kicks='middle')"),
+        (
+            IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes", order=4),
+            "IsokineticSpheres(0.5, 1.0, seed=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1, order=4)",
+        ),
+        (HamiltonianMonteCarlo(0.5, (2, 4), 7), "HamiltonianMonteCarlo(0.5, (2, 4), seed=7, stepper=Rattle())"),
+        (Isokinetic(0.5, order=4, convention="notes"), "Isokinetic(0.5, order=4, convention='notes')"),
+    ],
+)
+def test_words(stepper, words):
+    assert repr(stepper).endswith(words)
