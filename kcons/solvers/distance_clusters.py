@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,8 +47,8 @@ class SimdClusterSolver:
 
     name: str
     #: ``(tangent, points, references, velocities, inv_dt, given, lattice, kind, multipliers, tables)``; `tangent` is
-    #: None for positions, to be brought to the lengths `given`, and True for vectors to be brought to these rates.
-    #: A kernel is compiled for each of the two.
+    #: None for positions, to be brought to the lengths `given`, and () for vectors to be brought to these rates: a
+    #: kernel is compiled for each of the two. (For a True in a kernel and one from Python it would be compiled twice.)
     _kernel: Any
     #: What the kernel knows of the rows, in one array.
     tables: FloatArray
@@ -69,10 +69,10 @@ class SimdClusterSolver:
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Project velocities, or forces per mass, so that u.(y_i - y_j) is the wanted rate of each length."""
         rates = NO_NUMBERS if request.wanted is None else request.wanted[self.rows]
-        return self._project(True, request, rates, multipliers)
+        return self._project((), request, rates, multipliers)
 
     def _project(
-        self, tangent: Literal[True] | None, request: Request, given: FloatArray, multipliers: FloatArray | None
+        self, tangent: tuple[()] | None, request: Request, given: FloatArray, multipliers: FloatArray | None
     ) -> Outcome:
         points, references, _, lattice, _, _, velocities, inv_dt, _, _ = request
         if lattice is not self._lattice:

@@ -229,7 +229,7 @@ def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, table
 @njit(cache=True, nogil=True)
 def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):
     none = none_of(tables)
-    return project_triangles(True, y, x, none.reshape(0, 3), 0.0, wanted, lattice, kind, none, tables)
+    return project_triangles((), y, x, none.reshape(0, 3), 0.0, wanted, lattice, kind, none, tables)
 
 
 @njit(cache=True, nogil=True)
