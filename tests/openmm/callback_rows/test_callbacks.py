@@ -353,5 +353,3 @@ def test_the_program_says_what_it_does():
     listing = peptide()[1].listing()
     for words in ("solve for positions", "solve for velocities", "positions whose gradients are taken"):
         assert f"carried rows: {words}" in listing
-
-
