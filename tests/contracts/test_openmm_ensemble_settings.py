@@ -119,19 +119,3 @@ def test_copies_files_and_temperatures(ensemble):
         assert abs(k / (66 * GAS_CONSTANT * 350) - 1) <= 1e-13
     with pytest.raises(UnsupportedError, match="ensemble"):
         ProjectedIntegrator(1e-3).setTemperature(300)
-
-
-def test_checkpoints_continue_bit_for_bit():
-    system, x, v = alanine()
-    for ensemble in (
-        Isokinetic(300.0), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0), NoseHooverMiddle(300.0, 20.0),
-    ):  # fmt: skip
-        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
-        integrator.setRandomNumberSeed(3)
-        context = run(system, integrator, x, v, 10)
-        kept = context.createCheckpoint()
-        integrator.step(10)
-        after = state_of(context)
-        context.loadCheckpoint(kept)
-        integrator.step(10)
-        assert np.array_equal(state_of(context), after)

@@ -26,8 +26,6 @@ class Integrator(openmm.CustomIntegrator):
     row_groups: frozenset[int]
     spare: bool
     check_every: int
-    ensemble: Ensemble
-    context: openmm.Context
     _guard: Any
     _watch: Callable[..., Any]
     take_precision: Callable[..., None]
@@ -37,6 +35,14 @@ class Integrator(openmm.CustomIntegrator):
     independent_momenta: Callable[..., int]
     degrees_of_freedom: Callable[..., int]
     kinetic_energy: Callable[..., Any]
+
+    @property
+    def ensemble(self) -> Ensemble:
+        raise NotImplementedError
+
+    @property
+    def context(self) -> openmm.Context:
+        raise NotImplementedError
 
 
 class Ensemble:
