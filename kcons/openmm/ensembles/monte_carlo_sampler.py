@@ -21,10 +21,9 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
-from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Step
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.steps import Step
 from kcons.openmm.integrator.system_checks import forces_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.openmm.states import box_of, energy_of, positions_of, velocities_of

@@ -16,9 +16,10 @@ from openmm import unit
 
 from kcons.constraints.arguments import whole_number
 from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.ensemble import Step, use
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
-from kcons.openmm.integrator.steps import Step, single_step, use
+from kcons.openmm.integrator.steps import single_step
 
 #: What one execution of the program of `Ends` does.
 _STEP, _BEGIN, _END = 0.0, 1.0, 2.0
