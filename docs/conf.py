@@ -9,7 +9,7 @@ from docutils import nodes
 from docutils.parsers.rst import Directive
 
 from kcons import __version__
-from kcons.cli.main import commands
+from kcons.cli.main import parser_of_all
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
@@ -54,7 +54,7 @@ class CommandHelp(Directive):
 
     def run(self) -> list[nodes.Node]:
         found: list[nodes.Node] = []
-        for name, parser in commands().items():
+        for name, parser in parser_of_all().commands.items():
             section = nodes.section(ids=[nodes.make_id(f"kcons-{name}")])
             section += nodes.title(text=f"kcons {name}")
             section += nodes.literal_block(text=parser.format_help(), language="text")

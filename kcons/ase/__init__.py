@@ -6,10 +6,10 @@ the object with ASE, which makes files that contain it readable.
 
 - `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
-- `pressure`: the stress of the constraint forces, cells that change
-- `calculator`, `named_calculators`: forces along the constraints, for optimisers; calculators by name
+- `pressure`, `pressure_reporter`: the stress of the constraint forces, cells that change
+- `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
 - `logger`: ASE's log, with multipliers and the right temperature
-- `dynamics`, `thermostat_dynamics`, `multiple_time_steps`, `monte_carlo`: dynamics with any stepper
+- `dynamics`, `thermostat_dynamics`: dynamics with any stepper, thermostat and barostat
 """
 
 from kcons.errors import with_extra
@@ -25,14 +25,14 @@ try:
     )
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.logger import ConstraintLogger
-    from kcons.ase.monte_carlo import ConstrainedMonteCarlo
-    from kcons.ase.multiple_time_steps import MultipleTimeSteps
-    from kcons.ase.pressure.reporter import PressureReporter
+    from kcons.ase.pressure_reporter import PressureReporter
     from kcons.ase.rigid_water import rigid_water
     from kcons.ase.thermostat_dynamics import (
         ConstrainedLangevin,
+        ConstrainedMonteCarlo,
         ConstrainedNoseHoover,
         IsokineticDynamics,
+        MultipleTimeSteps,
         draw_velocities,
     )
     from kcons.ase.topology import constraints_of, mend_elements, repartition_hydrogen_mass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,9 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from numpy.typing import NDArray
 
-from kcons.ase.binding import same_settings, settings_of
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure.virial import VOIGT, refuse_filters
+from kcons.ase.pressure import VOIGT
+from kcons.ase.respect import refuse_taken_along
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
@@ -70,9 +71,12 @@ class ConstrainedCalculator(Calculator):
         self.project = project
         #: What the results belong to, beside the atoms.
         self._known = self._asked()
+        #: Positions and cell at which stress was asked for last.
+        self._stressed: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def _asked(self) -> tuple[Any, ...]:
-        return (self.inner, self.constraints, self.project, *settings_of(self.inner))
+        """What gives the results, and where the inner calculator keeps what it found: another object after a reset."""
+        return self.inner, self.constraints, self.project, getattr(self.inner, "results", None)
 
     @property
     def implemented_properties(self) -> list[str]:  # type: ignore[override]
@@ -84,7 +88,7 @@ class ConstrainedCalculator(Calculator):
         changes = list(super().check_state(atoms, tol))
         if self.atoms is not None and not np.array_equal(self.atoms.get_masses(), atoms.get_masses()):
             changes.append("masses")
-        if not same_settings(self._asked(), self._known):
+        if not all(map(is_, self._asked(), self._known)):
             changes.append("inner")
         return changes
 
@@ -97,13 +101,15 @@ class ConstrainedCalculator(Calculator):
         """Fill `results`; called by ASE where its cache does not hold the properties."""
         super().calculate(atoms, list(properties), list(system_changes))
         assert self.atoms is not None
-        if not same_settings(self._asked(), self._known) and hasattr(self.inner, "reset"):
-            self.inner.reset()  # some calculators do not look whether their settings were changed
         work = self.atoms.copy()
         work.set_constraint()
         motion = self.constraints.engine(work)
         held = motion.constraint_set
         x = work.arrays["positions"]
+        if "stress" in properties:
+            before, self._stressed = self._stressed, (x.copy(), work.cell.array.copy())
+            if before is not None:
+                refuse_taken_along(motion, *before, *self._stressed)
         if self.project and held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
             motion.project_positions(x, x.copy(), out=x)
         wanted = set(properties)
@@ -123,7 +129,6 @@ class ConstrainedCalculator(Calculator):
                 stress = np.array(numbers(results["stress"], "stress of the calculator"))
                 if stress.shape == (3, 3):
                     stress = stress[VOIGT]
-                refuse_filters(motion, x)
                 virial = constraint_virial(motion, x, np.zeros_like(x), forces)
                 results["stress"] = stress - virial[VOIGT] / work.get_volume()
         if any(value is None for value in results.values()):

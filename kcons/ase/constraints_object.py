@@ -13,17 +13,26 @@ from ase import Atoms
 from ase.constraints import FixAtoms, FixConstraint
 
 import kcons.constraints as families
-from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind, check_company, shared, touched_atoms
-from kcons.ase.pressure.virial import VOIGT, virial_of
+from kcons.ase.binding import (
+    FORCES_ONLY,
+    Binding,
+    applied_forces,
+    bind,
+    check_company,
+    refuse_not_finite,
+    shared,
+    touched_atoms,
+)
+from kcons.ase.pressure import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import Watch, fulfilled, moves_far
+from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, Watch, fulfilled
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, ConvergenceError, InputError, UnsupportedError
+from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.certificate import CHECK_EVERY
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
@@ -86,7 +95,7 @@ class Constraints(FixConstraint):
         self._binding: Binding | None = None
         #: The atoms that the positions known of belong to; one object may be on several.
         self._last: ref[Atoms] | None = None
-        self._forget()
+        self._watch = UNKNOWN
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
@@ -115,33 +124,38 @@ class Constraints(FixConstraint):
 
     def _bound(self, atoms: Atoms) -> Binding:
         if self._last is None or self._last() is not atoms:
-            self._forget()
             self._last = ref(atoms)
+            self._forget(atoms)
         bound = self._binding
-        known = bound is not None and bound.given is self.__dict__["constraints"]  # which can be given anew
-        if bound is None or not (known and bound.fits(atoms) and bound.serves(self, atoms.cell.array)):
+        # Rows can be given anew.
+        if bound is None or bound.given is not self.__dict__["constraints"] or not bound.fits(atoms):
             bound = self._bind(atoms)
-        else:
-            bound.follow_cell(atoms, atoms.cell.array)
+        elif bound.periodic:
+            if bound.serves(self, atoms.cell.array):
+                bound.follow_cell(atoms, atoms.cell.array)
+            else:
+                bound = self._bind(atoms)
         if len(atoms.constraints) > 1:
             check_company(atoms.constraints, self, bound)
         return bound
 
-    def _bind(self, atoms: Atoms, *, alone: bool = False) -> Binding:
-        """An engine for these atoms; `alone` one that no other object has."""
+    def _bind(self, atoms: Atoms, make: Callable[..., Binding] = shared) -> Binding:
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
-        bound = (bind if alone else shared)(given, atoms, self.degenerate)
+        bound = make(given, atoms, self.degenerate)
         if bound.owner() is None:
             bound.owner = ref(self)
+        if make is bind:  # for another cell alone: rows, and what knows them, stay
+            bound.given = self.constraints
+        else:
+            self._forget(atoms)
         self.constraints = bound.given
         self._repeated, self._binding = None, bound
-        self._forget()
         return bound
 
-    def _forget(self) -> None:
+    def _forget(self, atoms: Atoms) -> None:
         """What is known of the positions is void."""
-        self._watch = Watch()
+        self._watch = Watch(len(atoms))
         #: Calls of each hook until its result is certified.
         self._positions_due = self._momenta_due = 0
 
@@ -150,36 +164,47 @@ class Constraints(FixConstraint):
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
 
-        A frame that fulfils the constraints already, and to which these gradients need not lead, is taken as it is, but
-        for what the digits of its file leave.
+        A frame that fulfills the constraints already, and to which these gradients need not lead, is taken as it is,
+        but for what the digits of its file leave.
 
         Raises
         ------
         InputError
             The atoms were moved past the constraints before; see `restore`.
+        UnsupportedError
+            They were moved along with the cell, where a row holds them in space.
         """
-        bound = self._bound(atoms)
-        bound.check(new, "position")
-        old, cell, held = atoms.arrays["positions"], atoms.cell.array, bound.motion.constraint_set
-        asked = self._watch.ask(new)
-        frame = moves_far(old, new) and fulfilled(held, new, bound.touched)
+        bound, watch = self._bound(atoms), self._watch
+        x = bound.taken(new, "position")
+        motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
+        if watch.in_another(cell):
+            watch.refuse_taken_along(motion, old, cell)
+        found = watch.ask(motion.constraint_set, old, x)
+        frame = found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)
         if not frame:
             try:
-                self._watch.look(held, old, cell)
-                _in_place(bound.motion.project_positions, new, new, old)
+                watch.look(motion, old, cell, elsewhere=bool(found & ELSEWHERE))
+                motion.project_positions(x, old, out=x)
             except (ConvergenceError, InputError, UnsupportedError) as error:
-                frame = fulfilled(held, new, bound.touched)
+                refuse_not_finite(x, "position")
+                frame = fulfilled(motion.constraint_set, x, bound.touched)
                 if not frame:
                     if isinstance(error, ConvergenceError):
                         error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
                     raise
         if frame:
-            _in_place(bound.motion.project_positions, new, new, asked)
+            motion.project_positions(x, watch.asked, out=x)
         if self._positions_due <= 0:
-            _certify_positions(bound.motion, new, asked)
+            try:
+                motion.certify(x)
+            except CertificateError:
+                x[...] = watch.asked
+                raise
             self._positions_due = CHECK_EVERY
         self._positions_due -= 1
-        self._watch.accept(asked, new, cell, atoms)
+        watch.accept(x, cell)
+        if x is not new:
+            new[...] = x
 
     def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
         """Leave forces of dynamics, and noise, as they are; put atoms right that were scaled together with the cell.
@@ -192,11 +217,11 @@ class Constraints(FixConstraint):
         InputError
             The atoms were moved past the constraints in another way; see `restore`.
         """
-        x, cell = atoms.arrays["positions"], atoms.cell.array
-        if rand or not self._watch.in_another(cell):
+        if rand or not self._watch.in_another(atoms.cell.array):
             return  # other edits are seen where positions are set
-        bound = self._bound(atoms)
-        if not self._watch.look(bound.motion.constraint_set, x, cell):
+        bound, watch = self._bound(atoms), self._watch
+        x = atoms.arrays["positions"]
+        if not watch.look(bound.motion, x, atoms.cell.array):
             try:
                 self._move(atoms, bound.motion, bound.motion.project_positions(x, x))
             except ConvergenceError as error:
@@ -213,32 +238,15 @@ class Constraints(FixConstraint):
         UnsupportedError
             They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
         """
-        bound = self._bound(atoms)
-        bound.check(momenta, "momentum")
-        if momenta.shape == (bound.n_atoms, 3):  # otherwise the engine complains
-            held, x = bound.motion.constraint_set, atoms.arrays["positions"]
-            self._watch.look(held, x, atoms.cell.array)
-            self._watch.check_momenta(held, x)
-        try:
-            if bound.weights is None or momenta.shape != bound.weights[0].shape:
-                # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
-                self._project_covector(atoms, momenta)
-                return
-            masses, inverse_masses, velocities = bound.weights
-            np.multiply(momenta, inverse_masses, velocities)
-            due = self._momenta_due <= 0
-            # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
-            still = KICK_ROUNDING * float(np.abs(velocities).max(initial=0.0)) if due else 0.0
-            bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
-            if due:  # positions may be as a file gave them, off by less than START_TOLERANCE
-                bound.motion.certify(atoms.arrays["positions"], velocities, still=still, moved=False)
-                self._momenta_due = CHECK_EVERY
-            self._momenta_due -= 1
-            np.multiply(velocities, masses, momenta, casting="unsafe")  # integers are all 0
-        except InputError as error:
-            if not np.isfinite(momenta).all():
-                error.add_note("In dynamics, momenta come from forces: look at what the calculator returned")
-            raise
+        bound, watch = self._bound(atoms), self._watch
+        p = bound.taken(momenta, "momentum")
+        watch.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
+        watch.note_momenta()
+        due = self._momenta_due <= 0
+        _project(bound, atoms.arrays["positions"], p, "momentum", certified=due)
+        self._momenta_due = CHECK_EVERY - 1 if due else self._momenta_due - 1
+        if p is not momenta:
+            np.copyto(momenta, p, casting="unsafe")  # integers are all 0
 
     def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
         """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
@@ -257,17 +265,16 @@ class Constraints(FixConstraint):
         bound = self._binding
         if bound is not None and bound.fits(atoms):
             new = numbers(cell, "cell")
-            mine = bound if bound.serves(self, atoms.cell.array, new) else self._bind(atoms, alone=True)
-            mine.follow_cell(atoms, new)
+            (bound if bound.serves(self, new) else self._bind(atoms, bind)).follow_cell(atoms, new)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
-        self._bound(atoms).check(forces, "force")
-        self._project_covector(atoms, forces)
-        self._watch.between_steps = True
-
-    def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:
-        _in_place(self._bound(atoms).motion.project_forces, values, atoms.arrays["positions"], values)
+        bound, watch = self._bound(atoms), self._watch
+        f = bound.taken(forces, "force")
+        _project(bound, atoms.arrays["positions"], f, "force")
+        if f is not forces:
+            np.copyto(forces, f, casting="unsafe")
+        watch.between_steps = True
 
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""
@@ -324,15 +331,14 @@ class Constraints(FixConstraint):
         # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
         twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__)
-        twin._forget()
+        twin.__dict__.update(self.__dict__, _last=None, _watch=UNKNOWN)
         return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None, "_last": None, "_watch": Watch()}
+        return {**self.__dict__, "_binding": None, "_last": None, "_watch": UNKNOWN}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
@@ -371,10 +377,10 @@ class Constraints(FixConstraint):
             If there is no way to fulfil the constraints from here with other bonds and angles as they are; nothing is
             changed.
         """
-        motion = self._bound(atoms).motion
-        x = motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
-        self._move(atoms, motion, x)
-        self._watch.between_steps = True
+        bound, watch = self._bound(atoms), self._watch
+        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
+        self._move(atoms, bound.motion, x)
+        watch.between_steps = True
 
     def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
         """Put atoms where they are on the constraints, and project momenta that they have."""
@@ -476,20 +482,23 @@ def _refuse_moving(given: Iterable[Constraint]) -> None:
             )
 
 
-def _certify_positions(motion: Motion, new: FloatArray, asked: FloatArray) -> None:
+def _project(bound: Binding, x: FloatArray, values: FloatArray, what: str, *, certified: bool = False) -> None:
+    """Take out of momenta, or forces, what leaves the constraints, in place: p - A^T (A M^-1 A^T)^-1 A M^-1 p."""
+    if bound.weights is None:
+        bound.motion.project_forces(x, values, out=values)
+        return
+    masses, inverse_masses, velocities = bound.weights
+    np.multiply(values, inverse_masses, velocities)
+    # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
+    still = KICK_ROUNDING * float(np.abs(velocities).max(initial=0.0)) if certified else 0.0
     try:
-        motion.certify(new)
-    except CertificateError:
-        new[...] = asked
+        bound.motion.project_velocities(x, velocities, out=velocities)
+    except KconsError:
+        refuse_not_finite(values, what)
         raise
-
-
-def _in_place(project: Callable[..., FloatArray], values: FloatArray, *arguments: FloatArray) -> None:
-    """Write what `project` gives into `values`, by its own way where it can."""
-    if values.flags.c_contiguous and values.dtype == np.float64:
-        project(*arguments, out=values)
-    else:
-        values[...] = project(*arguments)
+    if certified:  # positions may be as a file gave them, off by less than START_TOLERANCE
+        bound.motion.certify(x, velocities, still=still, moved=False)
+    np.multiply(velocities, masses, values)
 
 
 def constrain(
@@ -539,9 +548,9 @@ def constrain(
     try:
         if project:
             held.restore(atoms)
-        bound = held._bound(atoms)
-        held._watch.look(bound.motion.constraint_set, atoms.arrays["positions"], atoms.cell.array)
-        held._watch.between_steps = True
+        bound, watch = held._bound(atoms), held._watch
+        watch.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
+        watch.between_steps = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
     except BaseException:

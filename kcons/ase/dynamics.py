@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from operator import is_
 from typing import Any, Literal
 
 import numpy as np
@@ -14,28 +15,14 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
-from kcons.ase.binding import (
-    FORCES_ONLY,
-    Answers,
-    Binding,
-    Company,
-    applied_energy,
-    applied_forces,
-    bind,
-    company,
-    in_step,
-    name_step,
-    refuse_fewer,
-    same_company,
-    surroundings,
-)
+from kcons.ase.binding import FORCES_ONLY, Binding, Company, applied_forces, bind, company, same_company
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import finite_number, numbers, refuse_other
+from kcons.constraints.arguments import finite_array, finite_number, refuse_other
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
@@ -43,6 +30,8 @@ from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed, require_stepper
+from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, NoseHooverChain
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL
 from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: Steps longer than this are asked about: 20 fs, above which no motion of molecules at room temperature is followed.
@@ -51,7 +40,8 @@ LONGEST = 20.0 * units.fs * (1 + 1e-12)
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 FAR = 128.0
 
-_FLOAT = np.dtype(np.float64)
+#: Arrays of atoms that calculators read.
+_READ = ("numbers", "initial_charges", "initial_magmoms")
 
 
 class ConstrainedDynamics(MolecularDynamics):
@@ -139,12 +129,11 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell: tuple[bytes, ...] = ()
-        self._answers = Answers(atoms, self._calculators)
+        self._asked: tuple[Any, ...] = ()  # calculators, and where each keeps what it found
         self._size = len(atoms)
-        self._momenta = np.zeros((0, 3))  # as written last
-        self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
-        self._forces = None if forces is None else _array(forces, len(atoms), "forces")
-        with _changed_only_if_all_is_well(atoms):
+        self._momenta = self._masses = np.zeros((0, 3))  # momenta as written last; masses, 0 for fixed atoms
+        self._forces = None if forces is None else finite_array(forces, len(atoms), "forces")
+        with changed_only_if_all_is_well(atoms):
             self._prepare(atoms, timestep, state)
             # Files last: to open one for writing ends what an older run left there.
             steps, logfile = self.nsteps, kwargs.pop("logfile", None)
@@ -162,7 +151,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if state is not None:
             refuse_other(state, State, "state", "a kcons.State, such as State.load(file) or the state of another run")
             self._resume(state)
-        self._answers.note()
+        self._asked = self._calculators_now()
         self._start(self._systems())
         self._begin()
 
@@ -262,23 +251,25 @@ class ConstrainedDynamics(MolecularDynamics):
         system = self._systems()
         state = self._start(system)
         try:
-            after = self._mover.step(system, state, self.dt)
-            if self._check_every and self.dt and getattr(self.stepper, "holds", True):
-                system.schedule.made(1, self._check_every, after, self.dt, spare=self._spare)
+            with in_step(self.nsteps + 1):
+                after = self._mover.step(system, state, self.dt)
+                if self._check_every and self.dt and getattr(self.stepper, "holds", True):
+                    system.schedule.made(1, self._check_every, after, self.dt, spare=self._spare)
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
             self.atoms.cell[...] = np.frombuffer(self._cell[0]).reshape(3, 3)  # which barostats change
             self._bound.cell = b""  # type: ignore[union-attr]  # the engine takes it again
-            name_step(error, self.nsteps + 1)
-            _tell_temperature(error, self.atoms)
+            if not isinstance(error, KconsError) and self.atoms.get_number_of_degrees_of_freedom():
+                # A calculator can do nothing with what too long steps have made.
+                error.add_note(f"the kinetic temperature was {self.atoms.get_temperature():.0f} K there")
             raise
-        self._momenta, v = put(self.atoms, self._weights, after.positions, after.velocities)
+        v = self._put(after.positions, after.velocities)
         self.time = after.time
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
         system.follow(after, self._state)
-        self._answers.note()
+        self._asked = self._calculators_now()
         if after.barostat is not None:
             self._cell = surroundings(self.atoms)
 
@@ -288,25 +279,30 @@ class ConstrainedDynamics(MolecularDynamics):
             state = self._start(self._systems())
             with in_step(self.nsteps):
                 self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
-            self._answers.note()
+            self._asked = self._calculators_now()
 
     def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        if last is not None and self._answers.changed(last, self._force, self.nsteps + 1):
-            last = self._state = replace(last, forces=None, thermostat=self._thermostat_after_change(last))
+        asked = self._calculators_now()
+        if last is not None and not all(map(is_, asked, self._asked)):
+            # Another calculator, or one that was reset or asked elsewhere since: it is asked again.
+            last = replace(last, forces=None)
+            if asked[0] is not self._asked[0] or isinstance(self.stepper, HamiltonianMonteCarlo):
+                last = replace(last, thermostat=self._thermostat_after_change(last))
+            self._state, self._asked = last, asked
         cell = surroundings(atoms)
         same = last is not None and cell == self._cell
         if last is not None and same:
-            if _same(x, last.positions, p, self._momenta):
+            if equal_pairs(x, last.positions, p, self._momenta):
                 if last.step == self.nsteps and last.time == self.time:
                     return last
                 remainder = last.time_remainder if last.time == self.time else 0.0
                 return replace(last, time=self.time, step=self.nsteps, time_remainder=remainder)
             same = bool((last.positions == x).all())
-        v = p / self._weights[1]
+        v = np.divide(p, self._masses, out=np.zeros_like(p), where=self._masses != 0.0)
         require_on_surface(system.motion.constraint_set, x, self.time)
         state = system.initial_state(x, v, time=self.time, project=True)
         forces = last.forces if last is not None and same and not system.velocity_dependent else self._forces
@@ -318,33 +314,52 @@ class ConstrainedDynamics(MolecularDynamics):
             self._momenta = p.copy()
             x[...] = state.positions
         else:
-            self._momenta, v = put(self.atoms, self._weights, state.positions, state.velocities)
+            v = self._put(state.positions, state.velocities)
         carried = state.remainder, 0.0, thermostat, None if last is None else in_cell(last.barostat, atoms.cell.array)
         self._state = State(state.positions, v, self.time, forces, self.nsteps, *carried)
         self._cell = cell
         return self._state
 
+    def _put(self, positions: FloatArray, velocities: FloatArray) -> FloatArray:
+        """Give the atoms positions and momenta; the velocities that belong to these, as after a restart from a file."""
+        arrays = self.atoms.arrays
+        self._momenta, v = np.empty_like(velocities), np.empty_like(velocities)
+        write_back(positions, velocities, self._masses, arrays["positions"], arrays["momenta"], self._momenta, v)
+        return v
+
     def _resume(self, state: State) -> None:
-        """Go on from `state` exactly, in the cell that a barostat left; the atoms are changed only if it fits them."""
-        with _in_cell(self.atoms, state.cell):
-            system = self._systems()
-            n = len(self.atoms)
-            x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
-            require_on_surface(system.motion.constraint_set, x, state.time)
-            away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
-            if away > START_TOLERANCE * np.abs(v).max(initial=0.0) and away > system.rest(x, v, state.time):
-                message = f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?"
-                raise InputError(message, item="state")
-            self.time, self.nsteps = float(state.time), int(state.step)
-            self._momenta, _ = put(self.atoms, self._weights, x, v)
-            # Forces are asked for anew: nobody knows which calculator those of a file are of.
-            kept = replace(state.copied(), forces=None, origin=None)
-            self._state = replace(kept, positions=x, velocities=v, time=self.time, step=self.nsteps)
-            self._cell = surroundings(self.atoms)
+        """Go on from `state` exactly, in the cell that a barostat left."""
+        if state.cell is not None:
+            self.atoms.cell[...] = state.cell
+        system, n = self._systems(), len(self.atoms)
+        x, v = finite_array(state.positions, n, "positions"), finite_array(state.velocities, n, "velocities")
+        require_on_surface(system.motion.constraint_set, x, state.time)
+        away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
+        if away > START_TOLERANCE * np.abs(v).max(initial=0.0) and away > system.rest(x, v, state.time):
+            message = f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?"
+            raise InputError(message, item="state")
+        self.time, self.nsteps = float(state.time), int(state.step)
+        self._put(x, v)
+        # Forces are asked for anew: nobody knows which calculator those of a file are of.
+        kept = replace(state.copied(), forces=None, origin=None)
+        self._state = replace(kept, positions=x, velocities=v, time=self.time, step=self.nsteps)
+        self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        """What a thermostat goes on with where somebody moved the atoms."""
-        return None
+        """What a thermostat goes on with where somebody moved the atoms: the isokinetic one begins anew."""
+        if last is None or last.thermostat is None or isinstance(self.stepper, Isokinetic):
+            return None
+        if not isinstance(self.stepper, NoseHooverChain | HamiltonianMonteCarlo):
+            return last.thermostat
+        held = last.thermostat.copy()  # at which the chain sees that momenta may be new
+        if isinstance(self.stepper, HamiltonianMonteCarlo):
+            held[POTENTIAL] = math.nan  # to be asked for again
+        return held
+
+    def _calculators_now(self) -> tuple[Any, ...]:
+        """The calculators, and where each keeps what it found last: another object after other questions."""
+        calculators = (self.atoms.calc, *self._calculators)
+        return (*calculators, *(getattr(each, "results", None) for each in calculators))
 
     # -- the system -----------------------------------------------------------------------------
 
@@ -356,7 +371,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if known is None or not same_company(present, known):
             bound = None
         if bound is None or not bound.fits(atoms):
-            self._size = refuse_fewer(self._size, len(atoms), self._more, self._friction, self.stepper)
+            self._refuse_fewer(len(atoms))
             rows = [*_rows(atoms, present), *self._more]
             bound = bind(rows, atoms, self._degenerate, self.time, all_masses=True)
             # Targets that were left open stay as found, also when the engine is built again.
@@ -366,11 +381,22 @@ class ConstrainedDynamics(MolecularDynamics):
             self._system = self._made(bound.motion)
             self._system.time_unit = ("fs", units.fs)
             self._mover.check(self._system)
-            self._weights = _weights(self._system)
+            moving = self._system.inverse_masses > 0
+            self._masses = np.where(moving, self._system.masses[:, None], np.zeros(3))
         else:
             bound.follow_cell(atoms, atoms.cell.array)
         assert self._system is not None
         return self._system
+
+    def _refuse_fewer(self, now: int) -> None:
+        """Refuse fewer atoms than before where something was given by their numbers."""
+        before, self._size = self._size, now
+        if now < before and (self._more or np.ndim(self._friction) or getattr(self.stepper, "atoms", None) is not None):
+            raise InputError(
+                f"{before - now} of {before} atoms were removed, and constraints, friction or indices that the "
+                "dynamics was given name atoms by their numbers, which are others now; make a new one",
+                item="atoms",
+            )
 
     def _made(self, motion: Motion) -> System:
         return System(motion, self._force, potential=self._energy, friction=self._friction, far=FAR)
@@ -387,46 +413,12 @@ class ConstrainedDynamics(MolecularDynamics):
         return self.atoms.get_forces(apply_constraint=False)
 
 
-def _weights(system: System) -> tuple[FloatArray, FloatArray]:
-    """Masses to multiply by and to divide by, shape (n_atoms, 3): 0 and infinity for fixed atoms."""
-    masses = np.repeat(system.masses[:, None], 3, axis=1)
-    moving = system.inverse_masses > 0
-    return np.where(moving, masses, 0.0), np.where(moving, masses, np.inf)
-
-
-@contextmanager
-def _in_cell(atoms: Atoms, cell: FloatArray | None) -> Iterator[None]:
-    """Atoms in this cell, if any; in their own again where what follows fails."""
-    before = atoms.cell.array.copy()
-    if cell is not None:
-        atoms.cell[...] = cell
-    try:
-        yield
-    except BaseException:
-        atoms.cell[...] = before
-        raise
-
-
 def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:
-    rows: list[Constraint] = []
-    for item in present:
-        if isinstance(item, FORCES_ONLY):
-            continue
+    holding = [item for item in present if not isinstance(item, FORCES_ONLY)]
+    for item in holding:
         if isinstance(item, Constraints):
             item.engine(atoms)  # settles targets that are open
-        rows.extend(translated(atoms, [item]))
-    return rows
-
-
-def _same(x: FloatArray, y: FloatArray, p: FloatArray, q: FloatArray) -> bool:
-    """Whether x is y and p is q, to the last bit."""
-    if _plain(x) and _plain(p):
-        return bool(equal_pairs(x, y, p, q))
-    return bool((x == y).all() and (p == q).all())
-
-
-def _plain(values: Any) -> bool:
-    return values.dtype is _FLOAT and values.flags.c_contiguous
+    return translated(atoms, holding)
 
 
 @njit(cache=True, nogil=True)
@@ -440,43 +432,23 @@ def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def write_back(positions, velocities, masses, divisors, x, p, momenta, v):  # type: ignore[no-untyped-def]
-    """Put positions and momenta into `x` and `p`, the momenta also into `momenta`, and p/divisors into `v`.
+def write_back(positions, velocities, masses, x, p, momenta, v):  # type: ignore[no-untyped-def]
+    """Put positions and momenta into `x` and `p`, the momenta also into `momenta`, and p/m into `v`.
 
     Of fixed atoms, which have no momenta, the velocities stay: those of targets that move.
     """
-    a, b, m, d = positions.ravel(), velocities.ravel(), masses.ravel(), divisors.ravel()
+    a, b, m = positions.ravel(), velocities.ravel(), masses.ravel()
     c, e, f, g = x.ravel(), p.ravel(), momenta.ravel(), v.ravel()
     for i in range(a.size):
         momentum = m[i] * b[i]
         c[i] = a[i]
         e[i] = momentum
         f[i] = momentum
-        g[i] = momentum / d[i] if m[i] != 0.0 else b[i]
-
-
-def put(
-    atoms: Atoms, weights: tuple[FloatArray, FloatArray], positions: FloatArray, velocities: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Give the atoms positions and momenta; returns the momenta, and the velocities that belong to them.
-
-    Velocities always come from the momenta, as after a restart from a file. `weights` are the masses to multiply with
-    and to divide by.
-    """
-    x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
-    masses, divisors = weights
-    momenta, v = np.empty_like(velocities), np.empty_like(velocities)
-    if _plain(x) and _plain(p):
-        write_back(positions, velocities, masses, divisors, x, p, momenta, v)
-    else:
-        np.multiply(velocities, masses, out=momenta)
-        v[...] = np.where(masses != 0.0, momenta / divisors, velocities)
-        x[...], p[...] = positions, momenta
-    return momenta, v
+        g[i] = momentum / m[i] if m[i] != 0.0 else b[i]
 
 
 @contextmanager
-def _changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
+def changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
     """Put the atoms back where something is refused."""
     before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
     try:
@@ -488,14 +460,33 @@ def _changed_only_if_all_is_well(atoms: Atoms) -> Iterator[None]:
         raise
 
 
-def _tell_temperature(error: BaseException, atoms: Atoms) -> None:
-    """Note how warm the atoms were when a calculator failed: it can do nothing with what too long steps have made."""
-    if not isinstance(error, KconsError) and atoms.get_number_of_degrees_of_freedom():
-        error.add_note(f"the kinetic temperature was {atoms.get_temperature():.0f} K there")
+def applied_energy(atoms: Atoms, only_forces: bool) -> float:
+    """The energy of which forces and stress are derivatives; with that of ASE objects where these add forces."""
+    energy = float(atoms.get_potential_energy(apply_constraint=only_forces))
+    found = getattr(atoms.calc, "results", {})
+    free = found.get("free_energy")
+    # Where electrons have a temperature, "energy" is extrapolated to zero; both may be infinite.
+    if free is not None and "energy" in found and free != found["energy"]:
+        energy += float(free - found["energy"])
+    return energy
 
 
-def _array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
-    array = np.array(numbers(values, item))
-    if array.shape != (n_atoms, 3) or not np.isfinite(array).all():
-        raise InputError(f"{item} must be finite, of shape ({n_atoms}, 3), not {array.shape}", item=item)
-    return array
+@contextmanager
+def in_step(number: int) -> Iterator[None]:
+    """Note in an error which step it belongs to."""
+    try:
+        yield
+    except BaseException as error:
+        if getattr(error, "step", None) is None:
+            with suppress(AttributeError):
+                error.step = number  # type: ignore[attr-defined]
+            error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
+        raise
+
+
+def surroundings(atoms: Atoms) -> tuple[bytes, ...]:
+    """The cell, first, what calculators read of atoms beside their positions, and what ASE objects add to forces."""
+    parts = [atoms.cell.array.tobytes(), atoms.pbc.tobytes()]
+    parts += [atoms.arrays[name].tobytes() for name in _READ if name in atoms.arrays]
+    parts += [repr(item.todict()).encode() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+    return tuple(parts)

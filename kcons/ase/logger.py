@@ -12,7 +12,7 @@ from ase.stress import full_3x3_to_voigt_6_stress
 
 from kcons.ase.binding import applied_forces
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure.virial import VOIGT, virial_of
+from kcons.ase.pressure import VOIGT, virial_of
 from kcons.ase.topology import kinetic_energy_of, velocities_of
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import refuse_other

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from ase import Atoms
 from ase.cell import Cell
 
 from kcons.constraints.arguments import finite_array
@@ -12,6 +11,8 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.thermostats.pressure.pieces import rows_open
 
 #: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
 #: most files leave. Farther off they are refused.
@@ -26,58 +27,64 @@ ABSURD_STEPS = 3
 #: Farther (in Angstrom) time steps move no atom, but frames do.
 FRAME = 0.3
 #: A correction (in Angstrom) below which the residual is not even looked at.
-_SMALL = 0.1
+SMALL = 0.1
 
-_FLOAT = np.dtype(np.float64)
+#: What `compared` finds: atoms are elsewhere than accepted, other positions are asked for than before, far from the
+#: present ones, and the last correction was large.
+ELSEWHERE, NEW, FAR, LARGE = 1, 2, 4, 8
 
 ADVICE = (
     "use kcons.ase.ConstrainedDynamics for constant energy, ConstrainedLangevin, ConstrainedNoseHoover or "
     "IsokineticDynamics of kcons.ase for constant temperature, and these with barostat= for constant pressure; of "
     "ASE's own classes VelocityVerlet, Langevin(fixcm=False) and Bussi are right"
 )
+_OFF_AT_START = (
+    "moving them from there would turn the correction into velocity. Use constrain(..., project=True) or "
+    "Constraints.restore(atoms) first"
+)
+_EDITED = (
+    "they were moved past the constraints since the last step, as atoms.positions[...] = ..., set_distance, "
+    "rotate_dihedral and set_positions(..., apply_constraint=False) do; going on from there would turn the correction "
+    "into velocity. Call Constraints.restore(atoms) first, or make new constraints that hold what they are at now"
+)
+_MOVED_WITHIN_A_STEP = (
+    "they were moved past the constraints since momenta were last set. If you moved them, call "
+    f"Constraints.restore(atoms). If not, this dynamics class does so (LangevinBAOAB does); instead, {ADVICE}"
+)
 
 
 class Watch:
     """The positions that the constraints last accepted: what differs from them was moved past the constraints.
 
-    Also what an MD engine last asked for, which shows whether it respects the constraints: only dynamics set momenta,
-    and an MD engine that goes on from its own copy of the positions asks for uncorrected ones again.
+    Also what was last asked for, before it was corrected: an MD engine that goes on from its own copy of the positions
+    asks for uncorrected ones again.
 
     Attributes
     ----------
+    asked : ndarray, shape (n_atoms, 3)
+        Positions as they were asked for last.
     between_steps : bool
         Whether forces were asked for last: all dynamics and optimizers of ASE end their steps so. Who moves atoms then
         is a person, and otherwise most often the dynamics class.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, n_atoms: int) -> None:
         self.between_steps = True
-        self._accepted: FloatArray | None = None
-        self._cell = b""
-        self._before: FloatArray | None = None  # what was accepted before these positions were asked for first
-        self._asked: FloatArray | None = None
-        self._momenta_since = False
-        self._counted = False
-        self._repeats = 0
-        self._absurd = 0
-        self._looked = True
-
-    # -- the positions that atoms have ----------------------------------------------------------
-
-    def knows(self, x: FloatArray, cell: FloatArray) -> bool:
-        """Whether these are the positions that were accepted last, in the same cell."""
-        known = self._accepted
-        return known is not None and _same(known, x) and cell.tobytes() == self._cell
+        self._cell: bytes | None = None  # of the accepted positions
+        #: Positions as they were accepted, as they were accepted before, and as they were asked for.
+        self._accepted, self._before, self.asked = np.full((3, n_atoms, 3), np.nan)
+        self._momenta_since = self._again = False
+        self._repeats = self._absurd = 0
 
     def in_another(self, cell: FloatArray) -> bool:
         """Whether positions were accepted in another cell than this."""
-        return self._accepted is not None and cell.tobytes() != self._cell
+        return self._cell is not None and cell.tobytes() != self._cell
 
     def know(self, x: FloatArray, cell: FloatArray) -> None:
         """Accept positions that are on the constraints."""
-        self._accepted, self._cell = x.copy(), cell.tobytes()
+        self._accepted[...], self._cell = x, cell.tobytes()
 
-    def look(self, held: ConstraintSet, x: FloatArray, cell: FloatArray) -> bool:
+    def look(self, motion: Motion, x: FloatArray, cell: FloatArray, *, elsewhere: bool | None = None) -> bool:
         """Whether positions before a step, or where momenta are set, may stay: near enough to the constraints.
 
         What they are off by less than START_TOLERANCE the next step puts right, along the rows, which momenta then
@@ -89,80 +96,67 @@ class Watch:
         InputError
             They are off otherwise.
         UnsupportedError
-            They are, and were moved within a step.
+            They are, and were moved within a step; or they were scaled, and a row holds them in space.
         """
-        good = self.knows(x, cell)
+        changed = self.in_another(cell)
+        good = not (changed or (differ(self._accepted, x) if elsewhere is None else elsewhere))
         if not good:
-            worst = _worst_row(held, x)
+            scaled = changed and self._scaled(motion, x, cell)
+            worst = _worst_row(motion.constraint_set, x)
             good = worst is None
-            if worst is None:
+            if good:
                 self.know(x, cell)
-            elif not self._scaled(x, cell):
-                self._refuse(held, x, *worst)
+            elif not scaled and self._cell is None:
+                require_on_surface(motion.constraint_set, x)
+            elif not scaled and self.between_steps:
+                require_on_surface(motion.constraint_set, x, why=_EDITED)
+            elif not scaled:
+                require_on_surface(motion.constraint_set, x, why=_MOVED_WITHIN_A_STEP, by_class=True)
         self.between_steps = False
         return good
 
-    def _scaled(self, x: FloatArray, cell: FloatArray) -> bool:
+    def _scaled(self, motion: Motion, x: FloatArray, cell: FloatArray) -> bool:
         """Whether positions are those accepted last but for a change of the cell that took them along."""
-        known = self._accepted
-        if known is None or known.shape != x.shape or not self.in_another(cell):
-            return False
-        before = Cell(np.frombuffer(self._cell).reshape(3, 3)).complete()
-        moved = known @ np.linalg.solve(before, Cell(cell).complete())
+        self.refuse_taken_along(motion, x, cell)
+        moved = self._accepted @ deformation(np.frombuffer(self._cell or b"").reshape(3, 3), cell)
         return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
 
-    def _refuse(self, held: ConstraintSet, x: FloatArray, row: int, miss: float) -> None:
-        if self._accepted is None:
-            require_on_surface(held, x)
-        finite_array(x, held.n_atoms, "position")
-        off = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target()[row]:.6g})"
-        if self.between_steps:
-            raise InputError(
-                f"{off}: they were moved past the constraints since the last step, as atoms.positions[...] = ..., "
-                "set_distance, rotate_dihedral and set_positions(..., apply_constraint=False) do; going on from there "
-                "would turn the correction into velocity. Call Constraints.restore(atoms) first, or make new "
-                "constraints that hold what they are at now",
-                item="positions",
-                atoms=held.row_atoms(row),
-            )
-        raise UnsupportedError(
-            f"{off}: they were moved past the constraints since momenta were last set. If you moved them, call "
-            "Constraints.restore(atoms). If not, this dynamics class does so (LangevinBAOAB does); instead, "
-            f"{ADVICE}"
-        )
+    def refuse_taken_along(self, motion: Motion, x: FloatArray, cell: FloatArray) -> None:
+        """As the function of this name, from the positions and the cell that were accepted last."""
+        refuse_taken_along(motion, self._accepted, np.frombuffer(self._cell or b"").reshape(3, 3), x, cell)
 
-    # -- what a dynamics class asks for ---------------------------------------------------------
+    def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
+        """Remember positions before they are corrected; what `compared` finds of them.
 
-    def ask(self, new: FloatArray) -> FloatArray:
-        """Remember positions before they are corrected."""
-        asked = self._asked
-        if asked is not None and _same(asked, new):
-            if self._momenta_since and not self._counted:
-                self._counted = True
-                self._repeats += 1
-        else:
-            if not self._counted:
-                self._repeats = 0
-            self._counted = False
-            asked = new.copy()
-            self._looked = False
+        Raises
+        ------
+        UnsupportedError
+            The last correction, and those before it, were larger than any usable time step makes them.
+        """
+        found = compared(old, self._accepted, new, self.asked)
+        if self._momenta_since:
+            if found & LARGE and np.isfinite(self.asked).all():
+                self._refuse_absurd(held)
+            else:
+                self._absurd = 0
+        if found & NEW:
+            self._repeats, self._again = self._repeats + 1 if self._again else 0, False
+            np.copyto(self._before, self._accepted)
+            np.copyto(self.asked, new)
+        elif self._momenta_since:
+            self._again = True
         self._momenta_since = False
-        return asked
+        return int(found)
 
-    def accept(self, asked: FloatArray, new: FloatArray, cell: FloatArray, atoms: Atoms) -> None:
+    def accept(self, new: FloatArray, cell: FloatArray) -> None:
         """Remember the corrected positions."""
-        if not self._counted:
-            self._before = self._accepted
-        own = new.base is None and new is not atoms.arrays["positions"] and new.dtype == np.float64
-        self._accepted = new if own else np.array(new, dtype=np.float64)
-        self._cell = cell.tobytes()
-        self._asked = asked
-        if self._counted and (_near(asked, new) or _near(self._before, new)):
+        self.know(new, cell)
+        if self._again and (_near(self.asked, new) or _near(self._before, new)):
             # Positions that need no correction may be set as often as one likes; atoms at rest ask for the same.
-            self._repeats = 0
+            self._repeats, self._again = 0, False
 
-    def check_momenta(self, held: ConstraintSet, x: FloatArray) -> None:
-        """Momenta are about to be set at `x`, which was looked at.
+    def note_momenta(self) -> None:
+        """Momenta are about to be set at positions that were looked at.
 
         Raises
         ------
@@ -170,22 +164,15 @@ class Watch:
             The MD engine keeps asking for its own uncorrected positions.
         """
         self._momenta_since = True
-        if self._repeats >= 2:
-            self._repeats = 0
+        if self._again and self._repeats:
+            self._repeats, self._again = 0, False
             raise UnsupportedError(
                 "this dynamics class asks again for positions that were corrected: it continues from its own copy "
                 f"(NoseHooverChainNVT does), so that the constraints have no effect on it. Instead, {ADVICE}"
             )
-        if not self._looked:
-            self._looked = True
-            self._check_correction(held, x)
 
-    def _check_correction(self, held: ConstraintSet, x: FloatArray) -> None:
-        asked = self._asked
-        if asked is None or not _differ(asked, x, _SMALL):
-            self._absurd = 0
-            return
-        miss = np.abs(held.value(asked)) / held.scale
+    def _refuse_absurd(self, held: ConstraintSet) -> None:
+        miss = np.abs(held.value(self.asked)) / held.scale
         self._absurd = self._absurd + 1 if miss.max(initial=0.0) > ABSURD else 0
         if self._absurd >= ABSURD_STEPS:
             self._absurd = 0
@@ -195,6 +182,10 @@ class Watch:
                 f"{miss[row]:.0%}: it goes on from its own copy of the positions (MelchionnaNPT does), or the time "
                 f"step is far too large. Instead, {ADVICE}"
             )
+
+
+#: Of atoms that are not known yet.
+UNKNOWN = Watch(0)
 
 
 def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[int, float] | None:
@@ -207,36 +198,63 @@ def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[i
     return row, float(miss[row])
 
 
-def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> None:
-    """Refuse positions that are off the constraints, or not finite there.
+def require_on_surface(
+    held: ConstraintSet, x: FloatArray, time: float = 0.0, *, why: str = _OFF_AT_START, by_class: bool = False
+) -> None:
+    """Refuse positions that are off the constraints, or not finite there, and say `why`.
 
     Raises
     ------
     InputError
+    UnsupportedError
+        They are off, and were moved there by a dynamics class.
     """
     worst = _worst_row(held, x, time)
     if worst is not None:
         row, miss = worst
         finite_array(x, held.n_atoms, "position")
-        target = held.target(time)[row]
-        raise InputError(
-            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {target:.6g}); moving "
-            "them from there would turn the correction into velocity. Use constrain(..., project=True) or "
-            "Constraints.restore(atoms) first",
-            item="positions",
-            atoms=held.row_atoms(row),
-        )
+        said = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}): {why}"
+        raise UnsupportedError(said) if by_class else InputError(said, item="positions", atoms=held.row_atoms(row))
 
 
-def moves_far(old: FloatArray, new: FloatArray) -> bool:
-    """Whether an atom is asked to go farther than a time step takes it."""
-    return old.shape == new.shape and _differ(old, new, FRAME)
+def deformation(before: FloatArray, after: FloatArray) -> FloatArray:
+    """The matrix that takes positions along from one cell to another, as ``atoms.set_cell(..., scale_atoms=True)``."""
+    return np.asarray(np.linalg.solve(Cell(before).complete(), Cell(after).complete()))
+
+
+def refuse_taken_along(
+    motion: Motion, before: FloatArray, cell_before: FloatArray, x: FloatArray, cell: FloatArray
+) -> None:
+    """Refuse atoms that a change of the cell took along an axis along which a row holds them in space.
+
+    So do the cell filters of ASE, while the row puts the atoms back: forces of the filter would not be the derivative
+    of its energy.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    held = motion.constraint_set
+    if all(item.translation_invariant for item in held.constraints) or before.shape != x.shape:
+        return
+    strain = deformation(cell_before, cell)
+    taken = before @ strain
+    changed = np.abs(strain - np.eye(3)) > 1e-12
+    shut = ~rows_open(motion, before) & (changed.any(axis=0) | changed.any(axis=1))
+    for row, axis in np.argwhere(shut):
+        atoms = held.row_atoms(int(row))
+        along, stayed = (np.abs(there[atoms, axis] - x[atoms, axis]).max() for there in (taken, before))
+        if along < stayed:
+            raise UnsupportedError(
+                f"row {held.row_name(int(row))} holds atoms in space along {'xyz'[axis]}, and they were moved along "
+                "with the cell, as cell filters (FrechetCellFilter) and barostats of ASE do: relax at this cell, leave "
+                "the axis out of the mask, or hold these atoms relative to others; after an edit call "
+                "Constraints.restore(atoms)"
+            )
 
 
 def fulfilled(held: ConstraintSet, x: FloatArray, touched: IntArray) -> bool:
-    """Whether positions fulfil the rows, those of the atoms `touched`: to rounding, or to the digits they come with."""
-    if not np.isfinite(x[touched]).all():
-        return False
+    """Whether positions fulfill the rows, of the atoms `touched`: to rounding, or to the digits that they come with."""
     if _worst_row(held, x) is None:
         return True
     for digits in DIGITS:
@@ -247,26 +265,28 @@ def fulfilled(held: ConstraintSet, x: FloatArray, touched: IntArray) -> bool:
     return False
 
 
-def _same(a: FloatArray, b: FloatArray) -> bool:
-    return a.shape == b.shape and not _differ(a, b, 0.0)
-
-
-def _differ(a: FloatArray, b: FloatArray, much: float) -> bool:
-    """Whether a coordinate differs by more than `much`, or is not finite; of arrays of one shape."""
-    if a.dtype is b.dtype is _FLOAT and a.flags.c_contiguous and b.flags.c_contiguous:
-        return bool(differ(a, b, much))
-    return not bool((np.abs(a - b) <= much).all())
-
-
 @njit(cache=True, nogil=True)
-def differ(a, b, much):  # type: ignore[no-untyped-def]
-    """Whether numbers of contiguous arrays differ by more than `much`; NaN does."""
+def differ(a, b):  # type: ignore[no-untyped-def]
+    """Whether numbers of two arrays differ; NaN does."""
     p, q = a.ravel(), b.ravel()
     other = 0
     for i in range(p.size):
-        other |= not abs(p[i] - q[i]) <= much
+        other |= p[i] != q[i]
     return other != 0
 
 
-def _near(a: FloatArray | None, b: FloatArray) -> bool:
-    return a is not None and a.shape == b.shape and float(np.abs(a - b).max(initial=0.0)) <= START_TOLERANCE
+@njit(cache=True, nogil=True)
+def compared(old, accepted, new, asked):  # type: ignore[no-untyped-def]
+    """The sum of what is found of ELSEWHERE, NEW, FAR and LARGE."""
+    x, known, y, last = old.ravel(), accepted.ravel(), new.ravel(), asked.ravel()
+    elsewhere, other, far, large = 0, 0, 0, 0
+    for i in range(x.size):
+        elsewhere |= x[i] != known[i]
+        other |= y[i] != last[i]
+        far |= not abs(x[i] - y[i]) <= FRAME
+        large |= not abs(known[i] - last[i]) <= SMALL
+    return elsewhere * ELSEWHERE + other * NEW + far * FAR + large * LARGE
+
+
+def _near(a: FloatArray, b: FloatArray) -> bool:
+    return float(np.abs(a - b).max(initial=0.0)) <= START_TOLERANCE

@@ -1,66 +1,94 @@
-"""Constant temperature with constraints in ASE: isokinetic, Langevin, Nose-Hoover, and velocities to start from."""
+"""Constant temperature with constraints in ASE, each class a thermostat of the core, and velocities to start from."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
+from inspect import signature
 from os import PathLike
-from typing import Any, cast
+from typing import Any, Literal, NoReturn, cast
 
 import numpy as np
 from ase import Atoms, units
+from ase.calculators.mixing import SumCalculator
 from numpy.typing import ArrayLike
 
-from kcons.ase.dynamics import FAR, ConstrainedDynamics, put
-from kcons.ase.pressure.atoms_system import AtomsSystem
-from kcons.ase.topology import require_atoms
+from kcons.ase.binding import FORCES_ONLY
+from kcons.ase.dynamics import FAR, ConstrainedDynamics, changed_only_if_all_is_well, in_step
+from kcons.ase.pressure import AtomsSystem
+from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import generator_of, positive, seed_from
+from kcons.constraints.arguments import generator_of, numbers, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, Stepper, System
-from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats import (
+    Counts,
+    ForceGroups,
+    HamiltonianMonteCarlo,
+    Isokinetic,
+    IsokineticSpheres,
+    Langevin,
+    LangevinRespa,
+    NoseHooverChain,
+    Tuned,
+    thermal_velocities,
+    tune,
+)
 from kcons.thermostats.freedom import Momentum, open_directions
 from kcons.thermostats.isokinetic.isokinetic import Convention
 from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
-    """What the thermostats share: `save` and `restart`, and the temperature by the degrees of freedom they act on.
+    """What the thermostats share: temperature, barostat, `save` and `restart`.
 
     Parameters
     ----------
     atoms, timestep
         As for `ConstrainedDynamics`.
-    stepper : Isokinetic, Langevin, NoseHooverChain or HamiltonianMonteCarlo
+    temperature_K : float, optional
+        None where the thermostat can do without.
+    make : callable
+        Of kT in eV: a stepper that keeps this temperature.
     restart : path, optional
         File written by `save`.
+    barostat : Barostat, optional
+        Of `kcons.thermostats`; atoms need a periodic cell.
     **kwargs
         As for `ConstrainedDynamics`.
     """
-
-    #: Of the thermostat, beside the temperature.
-    _options: dict[str, Any]
 
     def __init__(
         self,
         atoms: Atoms,
         timestep: float,
-        stepper: Isokinetic | Langevin | NoseHooverChain | HamiltonianMonteCarlo,
+        temperature_K: float | None,
+        make: Callable[[Any], Stepper],
         *,
         restart: str | PathLike[str] | None = None,
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
         require_atoms(atoms)
+        self._make = make
         self.barostat = None if barostat is None else require_barostat(barostat)
+        stepper = make(None if temperature_K is None else _thermal(temperature_K))
         if restart is not None:
             if "state" in kwargs:
                 raise InputError("give restart or state, not both", item="restart")
             kwargs["state"] = _read(restart, len(atoms))
         super().__init__(atoms, timestep, stepper, **kwargs)
+
+    def set_temperature(self, temperature_K: float) -> None:
+        """Use another temperature from now on; what a thermostat knows beside it goes on.
+
+        The isokinetic thermostat scales the momenta.
+        """
+        self.stepper = self._make(_thermal(temperature_K))
 
     def _begin(self) -> None:
         """Start the thermostat, so that atoms have the kinetic energy it keeps before the first step is logged."""
@@ -76,9 +104,10 @@ class ThermostattedDynamics(ConstrainedDynamics):
         finally:  # forces were asked for elsewhere too
             arrays["positions"][...], arrays["momenta"][...] = state.positions, momenta
         if begun.velocities is not state.velocities:
-            momenta, v = put(self.atoms, self._weights, state.positions, begun.velocities)
-            begun = replace(begun, velocities=v)
-        self._momenta, self._state = momenta, begun
+            begun = replace(begun, velocities=self._put(state.positions, begun.velocities))
+        else:
+            self._momenta = momenta
+        self._state = begun
 
     @property
     def _mover(self) -> Stepper:
@@ -100,9 +129,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         with another seed, a Nose-Hoover chain from rest.
         """
         self.state.save(file)
-
-    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        return None if last is None else last.thermostat
 
     @property
     def thermostat_degrees_of_freedom(self) -> int:
@@ -143,10 +169,8 @@ class IsokineticDynamics(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator and with momenta; draw them with `draw_velocities(..., zero_momentum=True)`.
-    timestep : float
-        In ASE's unit of time.
+    atoms, timestep, **kwargs
+        As for `ConstrainedLangevin`; atoms with momenta (`draw_velocities(..., zero_momentum=True)`).
     temperature_K : float, optional
         None keeps the kinetic energy that the atoms have.
     order : {2, 4, 6}
@@ -159,8 +183,6 @@ class IsokineticDynamics(ThermostattedDynamics):
         Whether total momentum is conserved, and takes degrees of freedom. 'auto' asks the calculator for forces at
         one to three shifted places at the start; with forces that add up to nothing only roughly (plane waves, particle
         mesh), say which.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -184,21 +206,13 @@ class IsokineticDynamics(ThermostattedDynamics):
         momentum: Momentum = "auto",
         **kwargs: Any,
     ) -> None:
-        self._options = {"order": order, "convention": convention, "atoms": indices, "momentum": momentum}
-        super().__init__(atoms, timestep, self._stepper(temperature_K), **kwargs)
-
-    def _stepper(self, temperature_K: float | None) -> Isokinetic:
-        thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
-        return Isokinetic(thermal, **self._options)
+        make = partial(Isokinetic, order=order, convention=convention, atoms=indices, momentum=momentum)
+        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:
-        """Keep another temperature from now on; momenta are scaled."""
-        self.stepper = self._stepper(positive(temperature_K, "temperature_K"))
+        super().set_temperature(temperature_K)
         self._state = replace(self._start(self._systems()), thermostat=None)
         self._begin()
-
-    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        return None
 
     def get_temperature(self) -> float:
         """Temperature in K of the configurations, 2K/((g - 1) k)."""
@@ -216,11 +230,8 @@ class ConstrainedLangevin(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator.
-    timestep : float
-        In ASE's unit of time.
-    temperature_K : float
+    atoms, timestep, temperature_K, **kwargs
+        As for `ConstrainedDynamics`, and `restart` and `barostat`, see `ThermostattedDynamics`.
     friction : float
         In inverse units of ASE's time, for example 0.01/units.fs.
     rng : int or numpy.random.Generator, optional
@@ -230,8 +241,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
         Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -253,16 +262,8 @@ class ConstrainedLangevin(ThermostattedDynamics):
     ) -> None:
         #: Seed of the noise.
         self.seed = seed_from(rng)
-        self._options = {"substeps": substeps, "conserve_momentum": fixcm}
-        stepper = self._stepper(temperature_K, friction)
-        super().__init__(atoms, timestep, stepper, **kwargs)
-
-    def _stepper(self, temperature_K: float, friction: float) -> Langevin:
-        return Langevin(units.kB * positive(temperature_K, "temperature_K"), friction, self.seed, **self._options)
-
-    def set_temperature(self, temperature_K: float) -> None:
-        """Use another temperature from now on."""
-        self.stepper = self._stepper(temperature_K, cast(Langevin, self.stepper).friction)
+        make = partial(Langevin, friction=friction, seed=self.seed, substeps=substeps, conserve_momentum=fixcm)
+        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
 
 class ConstrainedNoseHoover(ThermostattedDynamics):
@@ -272,11 +273,9 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms : ase.Atoms
-        With a calculator and with momenta (`draw_velocities(..., zero_momentum=True)`).
-    timestep : float
-        In ASE's unit of time; may be negative.
-    temperature_K : float
+    atoms, timestep, temperature_K, **kwargs
+        As for `ConstrainedLangevin`; atoms with momenta (`draw_velocities(..., zero_momentum=True)`). The time step may
+        be negative.
     tdamp : float
         Time constant of the chain in ASE's unit of time, as for `ase.md.nose_hoover_chain`: masses are kT tdamp^2.
         About a hundred time steps.
@@ -284,8 +283,6 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         Links of the chain.
     momentum : {'auto', 'conserved', 'free'}
         As for `IsokineticDynamics`.
-    **kwargs
-        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -306,19 +303,281 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         momentum: Momentum = "auto",
         **kwargs: Any,
     ) -> None:
-        self._options = {"period": 2 * math.pi * positive(tdamp, "tdamp"), "length": tchain, "momentum": momentum}
-        super().__init__(atoms, timestep, self._stepper(temperature_K), **kwargs)
+        make = partial(NoseHooverChain, period=2 * math.pi * positive(tdamp, "tdamp"), length=tchain, momentum=momentum)
+        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
-    def _stepper(self, temperature_K: float) -> NoseHooverChain:
-        return NoseHooverChain(units.kB * positive(temperature_K, "temperature_K"), **self._options)
 
-    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        # A copy, at which the chain sees that momenta may be new.
-        return None if last is None or last.thermostat is None else last.thermostat.copy()
+class ConstrainedMonteCarlo(ThermostattedDynamics):
+    """Hamiltonian Monte Carlo on the constraints, whatever they are.
 
-    def set_temperature(self, temperature_K: float) -> None:
-        """Use another temperature from now on; the chain goes on."""
-        self.stepper = self._stepper(temperature_K)
+    Each step of this object is a proposal: `steps` time steps of a reversible stepper from new velocities, accepted or
+    rejected by the change of energy, with each time step taken back to see that it can be. Averages over the steps have
+    no error of the time step. See `kcons.thermostats.HamiltonianMonteCarlo`. The time is that of all trajectories,
+    rejected ones too.
+
+    After a rejection the atoms are where they were before, with opposite momenta; a log or trajectory then asks the
+    calculator for their energy again.
+
+    Parameters
+    ----------
+    atoms, timestep, temperature_K, rng, fixcm, **kwargs
+        As for `ConstrainedLangevin`; forces of the calculator are the gradient of its energy, and `tune` finds a time
+        step.
+    steps : int or (int, int)
+        Time steps of a proposal; with two numbers drawn between them.
+    stepper : Stepper, optional
+        A reversible and symplectic one: `Rattle` by default; for many atoms `BlanesMoan4`.
+    keep : float
+        The part of the velocities that a proposal keeps, from 0 to less than 1.
+    tolerance : float
+        Largest difference of a time step taken back.
+
+    Raises
+    ------
+    InputError
+        Temperature not positive, fewer than one step, `keep` out of range, a negative time step.
+    UnsupportedError
+        A stepper that is not reversible and symplectic; targets that move, rows that hold velocities, friction.
+    """
+
+    def __init__(
+        self,
+        atoms: Atoms,
+        timestep: float,
+        temperature_K: float,
+        steps: int | tuple[int, int],
+        *,
+        stepper: Stepper | None = None,
+        keep: float = 0.0,
+        rng: int | np.random.Generator | None = None,
+        fixcm: bool = False,
+        tolerance: float = 1e-9,
+        **kwargs: Any,
+    ) -> None:
+        #: Seed of the random numbers.
+        self.seed = seed_from(rng)
+        make = partial(
+            HamiltonianMonteCarlo,
+            steps=steps,
+            seed=self.seed,
+            stepper=stepper,
+            keep=keep,
+            conserve_momentum=fixcm,
+            tolerance=tolerance,
+        )
+        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+
+    @property
+    def counts(self) -> Counts:
+        """What became of the proposals."""
+        return Counts.of(self._start(self._systems()))
+
+    def tune(self, wanted: float | None = None, proposals: int = 80) -> Tuned:
+        """Find the time step for a wanted share of accepted proposals, and use it from now on.
+
+        The proposals that it takes are no sample, and are not counted; see `kcons.thermostats.tune`.
+
+        Parameters
+        ----------
+        wanted : float, optional
+            Between 0 and 1; by default what costs least for the order of the stepper.
+        proposals : int
+        """
+        system = self._systems()
+        state = self._start(system)
+        sampler = cast(HamiltonianMonteCarlo, self.stepper)
+        with changed_only_if_all_is_well(self.atoms):
+            found = tune(system, state, self.dt, sampler, wanted=wanted, proposals=proposals)
+        self.dt = found.dt
+        self._resume(found.state)
+        return found
+
+    def get_conserved_energy(self) -> NoReturn:
+        """Nothing is conserved.
+
+        Raises
+        ------
+        UnsupportedError
+            Always.
+        """
+        raise UnsupportedError(
+            "Monte Carlo conserves no energy; look at counts.mean_square, that of its change over kT"
+        )
+
+
+class MultipleTimeSteps(ThermostattedDynamics):
+    """Constant temperature with the forces of a cheap calculator in small steps, of an expensive one in large ones.
+
+    See `kcons.thermostats.LangevinRespa` and `kcons.thermostats.IsokineticSpheres`. With spheres dynamics are lost: a
+    trajectory has the right configurations, and no diffusion, relaxation times or spectra.
+
+    The atoms get the calculator of the whole energy, for logs and trajectories: `slow` with `difference`, otherwise the
+    sum of both. Where the atoms are at the end of a step both have been called, so that it costs nothing.
+
+    Parameters
+    ----------
+    atoms, timestep, temperature_K, rng, **kwargs
+        As for `ConstrainedLangevin`; the time step is the large one.
+    fast, slow : ASE calculator
+    fast_steps : int
+        Small steps in a large one, 2 or more.
+    friction : float
+        In inverse units of ASE's time, for example 0.005/units.fs; above 0 with spheres.
+    bath : {'langevin', 'spheres'}
+    difference : bool
+        `slow` is the calculator of the whole energy, and the slow forces are what it gives more than `fast`.
+    spheres : {'split', 'axes', 'cluster', 'global'}
+    auxiliary : int
+        For spheres, see `IsokineticSpheres`.
+    order : {2, 4}
+        Of the small steps, with 1 or 6 calls of `fast` in each.
+    substeps : int
+        Flights along the constraints in each half of a small step, for order 2.
+    slow_kicks : {'ends', 'middle'}
+        With 'middle' the atoms are halfway between two slow kicks at the end of a step, where averages are better; what
+        is logged there costs a call of `slow`.
+
+    Raises
+    ------
+    InputError
+        One calculator given twice; calculators of other atoms; bad numbers of steps, friction or
+        temperature; options of the other bath. The atoms are then as they were. While it runs: the atoms got another
+        calculator.
+    UnsupportedError
+        Spheres with constraints that move or that hold velocities.
+    """
+
+    def __init__(
+        self,
+        atoms: Atoms,
+        timestep: float,
+        *,
+        fast: Any,
+        slow: Any,
+        temperature_K: float,
+        friction: float,
+        fast_steps: int,
+        bath: Literal["langevin", "spheres"] = "langevin",
+        rng: int | np.random.Generator | None = None,
+        difference: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        kinds: dict[str, Callable[..., Any]] = {"langevin": LangevinRespa, "spheres": IsokineticSpheres}
+        if bath not in kinds:
+            raise InputError(f"bath is {bath!r}; choose 'langevin' or 'spheres'", item="bath")
+        kind = kinds.pop(bath)
+        options = {name: kwargs.pop(name) for name in signature(kind).parameters if name in kwargs}
+        for name in set(signature(*kinds.values()).parameters) & set(kwargs):
+            raise InputError(f"{name} is no option with bath={bath!r}; leave it out", item=name)
+        #: Seed of the noise.
+        self.seed = seed_from(rng)
+        steps = {"slow": 1, "fast": fast_steps}
+        make = partial(kind, friction=friction, seed=self.seed, steps=steps, **options)
+        make(_thermal(temperature_K))  # what it refuses comes before calculators are called
+        self._parts = fast_steps
+        if fast is slow:
+            raise InputError(
+                "fast and slow are the same calculator: its forces would count twice. Give two, or use "
+                "ConstrainedLangevin",
+                item="slow",
+            )
+        for name, calculator in (("fast", fast), ("slow", slow)):
+            _check_calculator(name, calculator, atoms)
+        self._calculators = fast, slow
+        cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
+        if difference:
+            self.groups = ForceGroups.difference(cheap, expensive)
+        else:
+            self.groups = ForceGroups({"fast": cheap, "slow": expensive})
+        self._force = self.groups  # type: ignore[method-assign, assignment]
+        before = atoms.calc
+        atoms.calc = self._whole = slow if difference else SumCalculator([fast, slow])
+        try:
+            super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+        except BaseException:
+            atoms.calc = before
+            raise
+
+    def _forces_of(self, calculator: Any, others: bool) -> Callable[[FloatArray, float], FloatArray]:
+        """Forces of one calculator, with those of ASE objects that only add forces where asked for."""
+
+        def force(x: FloatArray, time: float) -> FloatArray:
+            atoms = self.atoms
+            atoms.arrays["positions"][...] = x
+            found = np.array(numbers(calculator.get_forces(atoms), "forces of the calculator"))
+            if others and found.shape == (len(atoms), 3):
+                for item in atoms.constraints:
+                    if isinstance(item, FORCES_ONLY):
+                        item.adjust_forces(atoms, found)
+            return found
+
+        return force
+
+    def _start(self, system: System) -> State:
+        if self.atoms.calc is not self._whole:
+            raise InputError(
+                f"the atoms got another calculator, {self.atoms.calc!r:.80}, while forces are those of fast and slow; "
+                "make another MultipleTimeSteps with it",
+                item="calculator",
+            )
+        return super()._start(system)
+
+    def _begin(self) -> None:
+        """Find the spheres, so that what cannot be is refused before the first step."""
+        super()._begin()
+        if isinstance(self.stepper, IsokineticSpheres):
+            self.stepper.radii(self._systems(), self.atoms.positions)
+
+    # -- what can be read -----------------------------------------------------------------------
+
+    @property
+    def evaluations(self) -> dict[str, int]:
+        """Calls of the fast and of the slow forces so far."""
+        return dict(self.groups.evaluations)
+
+    def get_temperature(self) -> float:
+        """Kinetic temperature in K; on spheres by the kinetic energy that is expected there, which says little."""
+        stepper = self.stepper
+        if not isinstance(stepper, IsokineticSpheres):
+            return super().get_temperature()
+        expected = stepper.kinetic_energy(self._systems(), self.atoms.positions)
+        return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
+
+    def get_conserved_energy(self) -> float:
+        """Total energy less the heat in eV, for Langevin dynamics.
+
+        Raises
+        ------
+        UnsupportedError
+            On spheres, where forces of the bath do work.
+        """
+        if isinstance(self.stepper, IsokineticSpheres):
+            raise UnsupportedError("nothing like an energy is conserved on spheres; look at averages instead")
+        return super().get_conserved_energy()
+
+    def _refresh_properties(self) -> None:
+        """A step ends with both forces where the atoms are, which are added up for someone who looks."""
+        if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
+            with in_step(self.nsteps):
+                self.atoms.get_potential_energy(apply_constraint=False)
+                self.atoms.get_forces(apply_constraint=False)
+            self._asked = self._calculators_now()
+
+
+def _check_calculator(name: str, calculator: Any, atoms: Atoms) -> None:
+    """Refuse what is no calculator of these atoms; it is called once where they are."""
+    if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
+        raise InputError(f"{name} is {calculator!r}; give an ASE calculator", item=name)
+    forces = numbers(calculator.get_forces(atoms), f"forces of {name}")
+    known = getattr(calculator, "atoms", None)
+    other = isinstance(known, Atoms) and not np.array_equal(known.numbers, atoms.numbers)
+    if forces.shape != (len(atoms), 3) or other:
+        found = f"{len(known)} atoms ({known.get_chemical_formula()})" if isinstance(known, Atoms) else "other atoms"
+        raise InputError(
+            f"{name} computes forces of shape {forces.shape} of {found}, not of these {len(atoms)} "
+            f"({atoms.get_chemical_formula()}); fast and slow must be of the same atoms",
+            item=name,
+        )
 
 
 def draw_velocities(
@@ -357,7 +616,7 @@ def draw_velocities(
         `zero_momentum` where atoms are held in space.
     """
     require_atoms(atoms)
-    thermal = units.kB * positive(temperature_K, "temperature_K")
+    thermal = _thermal(temperature_K)
     momenta = atoms.get_momenta()
     try:
         atoms.set_momenta(np.zeros_like(momenta), apply_constraint=False)
@@ -370,16 +629,16 @@ def draw_velocities(
                 count -= len(open_directions(system.motion, atoms.positions))
             wanted = 0.5 * count * thermal or None
         v = thermal_velocities(
-            system,
-            atoms.positions,
-            thermal,
-            generator_of(rng),
-            zero_momentum=zero_momentum,
-            kinetic_energy=wanted,
+            system, atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum, kinetic_energy=wanted
         )
-        momenta = v * held._weights[0]
+        momenta = v * held._masses
     finally:
         atoms.set_momenta(momenta, apply_constraint=False)
+
+
+def _thermal(temperature_K: float) -> float:
+    """kT in eV."""
+    return units.kB * positive(temperature_K, "temperature_K")
 
 
 def _read(file: str | PathLike[str], n_atoms: int) -> State:

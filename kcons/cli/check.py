@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kcons.cli.parser import Command, Option
-from kcons.cli.terminal import console, rendered, say_written
+from kcons.cli.terminal import rendered, say_written, show
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
 
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 
 #: The exit status of each result; 2 is wrong use.
 EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
+#: Options that are arguments of `check_trajectory`, by the same names.
+AS_GIVEN = (
+    *("constrain", "select", "rigid_residues", "rigid_bodies", "targets", "tolerance", "precision", "frames"),
+    *("format", "topology_format", "workers", "worst"),
+)
 
 
 def _check(chosen: argparse.Namespace) -> int:
@@ -42,7 +47,13 @@ def _check(chosen: argparse.Namespace) -> int:
             raise InputError("--temperature needs --forces, from which temperatures are found", item="temperature")
         positive(chosen.temperature, "temperature")
     try:
-        result = _result(chosen, check_trajectory)
+        result = check_trajectory(
+            chosen.trajectory,
+            chosen.topology,
+            rigid_water=not chosen.no_rigid_water,
+            rank=not chosen.no_rank,
+            **{name: getattr(chosen, name) for name in AS_GIVEN},
+        )
     except UnreadableError as error:
         reason = str(error)
         print(f"kcons: {reason}", file=sys.stderr)
@@ -58,11 +69,7 @@ def _check(chosen: argparse.Namespace) -> int:
             result.remarks.append(f"no temperatures of the configurations: {reason}")
             print(f"kcons: {reason}", file=sys.stderr)
     summary, units, rows, verdict = report.page(result)
-    terminal = console()
-    terminal.print(summary, highlight=False, markup=False)
-    terminal.print(units)
-    terminal.print(rows)
-    terminal.print(verdict, soft_wrap=True)
+    show(summary, units, rows, verdict)
     text = "\n".join([summary, rendered(units), rendered(rows), result.verdict])
     say_written(_put(chosen, lambda folder: report.write(result, folder, text=text)))
     return 2 if failed else EXIT[result.status]
@@ -88,27 +95,6 @@ def _put(chosen: argparse.Namespace, write: Callable[[Path], list[Path]]) -> lis
             with suppress(OccupiedError):
                 return write(folder)
     raise AssertionError
-
-
-def _result(chosen: argparse.Namespace, check_trajectory: Callable[..., CheckResult]) -> CheckResult:
-    return check_trajectory(
-        chosen.trajectory,
-        chosen.topology,
-        chosen.constrain,
-        select=chosen.select,
-        rigid_water=not chosen.no_rigid_water,
-        rigid_residues=chosen.rigid_residues,
-        rigid_bodies=chosen.rigid_bodies,
-        targets=chosen.targets,
-        tolerance=chosen.tolerance,
-        precision=chosen.precision,
-        frames=chosen.frames,
-        format=chosen.format,
-        topology_format=chosen.topology_format,
-        workers=chosen.workers,
-        worst=chosen.worst,
-        rank=not chosen.no_rank,
-    )
 
 
 COMMAND = Command(

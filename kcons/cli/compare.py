@@ -9,17 +9,13 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from kcons.cli import listing
 from kcons.cli.parser import Command, Option
-from kcons.cli.systems import SYSTEM, check_name, molecules, owner, test_system
-from kcons.cli.terminal import console, names, numbers
+from kcons.cli.systems import SYSTEM, check_name, list_everything, molecules, test_system
+from kcons.cli.terminal import names, numbers, show
 from kcons.errors import InputError
 
-#: Options that go with expensive and cheap forces.
-WITH_CHEAP_FORCES = frozenset(
-    {"seed", "dt", "methods", "out", "quick", "budget", "resume", "criterion", "slow", "fast", "coordinates"}
-    | {"constrain", "select", "rigid_residues", "platform"}
-)
+#: Options that say nothing beside expensive and cheap forces.
+NOT_WITH_CHEAP_FORCES = ("size", "forces", "forcefield", "add_hydrogens")
 #: Options that results depend on, beside the system, the budget and what is said about molecules.
 SETTINGS = ("size", "seed", "quick", "dt")
 #: Steps of a production run that are looked at, in fs.
@@ -28,7 +24,7 @@ PRODUCTION_STEPS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 def run(chosen: argparse.Namespace) -> int:
     if chosen.list:
-        return listing.of_everything()
+        return list_everything()
     from kcons.cli.progress import Bars
     from kcons.comparison import report
     from kcons.steppers.files import ResultFolder, in_one_piece
@@ -64,7 +60,7 @@ def run(chosen: argparse.Namespace) -> int:
             file.write(f"{words}\n".encode())
         with in_one_piece(folder / "compare.png") as file:
             report.figure(table).savefig(file, dpi=150, format="png")
-    console().print(words + "\n", highlight=False, markup=False, soft_wrap=True)
+    show(words + "\n")
     print(f"wrote compare.csv, .png and .txt into {folder}; the whole table is in {path}")
     return 0
 
@@ -96,13 +92,13 @@ def _asks_for_averages(chosen: argparse.Namespace) -> bool:
 
     choose_samplers(chosen.methods, any(forces))
     if any(forces):
-        chosen.of.take_only(chosen, WITH_CHEAP_FORCES, "does not go with --slow and --fast; leave it out")
-        if chosen.criterion in ("error", "drift"):
-            raise InputError("--criterion does not go with --slow and --fast; leave it out", item="criterion")
-        for name in ("slow", "fast"):
+        wrong = [name for name in NOT_WITH_CHEAP_FORCES if getattr(chosen, name)]
+        wrong += ["criterion"] if chosen.criterion in ("error", "drift") else []
+        for name in wrong:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} does not go with --slow and --fast; leave it out", item=name)
+        for name, other, what in (("slow", "fast", "expensive"), ("fast", "slow", "cheap")):
             if getattr(chosen, name) is None:
-                other = {"slow": "fast", "fast": "slow"}[name]
-                what = {"slow": "expensive", "fast": "cheap"}[name]
                 raise InputError(f"--{other} needs --{name}: give the {what} forces, too", item=name)
         if chosen.slow == chosen.fast:
             raise InputError(f"--slow and --fast are both {chosen.fast}: give cheaper forces to --fast", item="fast")
@@ -157,7 +153,9 @@ def _asked(chosen: argparse.Namespace, budget: float, averages: bool) -> dict[st
     """What the rows of a table depend on."""
     settings = {name: getattr(chosen, name) for name in SETTINGS}
     settings |= {"averages": True, "slow": chosen.slow, "fast": chosen.fast} if averages else {}
-    return {"system": owner(chosen.system), **settings, "budget": budget, **molecules(chosen)}
+    file = Path(chosen.system)
+    system = str(file.resolve()) if file.is_file() else chosen.system
+    return {"system": system, **settings, "budget": budget, **molecules(chosen)}
 
 
 def _earlier(path: Path, asked: dict[str, Any]) -> Any:

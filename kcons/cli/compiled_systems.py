@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
@@ -24,15 +23,13 @@ from kcons.constraints import (
     Torus,
 )
 from kcons.constraints.constraint import Constraint
+from kcons.constraints.target import FloatArray
 from kcons.steppers import BlanesMoan6, Rattle, Stepper
 from kcons.thermostats import CellRescaling, CellSystem, ConstantPressure, Isokinetic, Langevin, NoseHooverChain
 
-FloatArray = NDArray[np.float64]
-
-#: As many molecules of a kind as are held eight at a time, and some that are left over.
-MANY = 19
-#: So many that nothing is left to Python.
-LARGE = 400
+#: As many molecules of a kind as are held eight at a time, and some that are left over; so many that nothing is left to
+#: Python.
+MANY, LARGE = 19, 400
 STEPPERS: tuple[Stepper, ...] = (Rattle(), BlanesMoan6())
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.96, 0.0, 0.0], [-0.24, 0.93, 0.0]])
@@ -56,17 +53,15 @@ def bonds() -> None:
         _use(ZIGZAG, Distance(branches), copies=copies)
 
 
-ROWS = Distance([[k, k + 1] for k in range(5)]), Angle([[0, 1, 2], [1, 2, 3]]), Dihedral([[0, 1, 2, 3]])
-
-
-def molecules() -> None:
+def molecules(copies: int = 1) -> None:
     """small molecules with angles, dihedrals and other rows"""
-    _use(ZIGZAG[:8], *ROWS)
+    rows = Distance([[k, k + 1] for k in range(5)]), Angle([[0, 1, 2], [1, 2, 3]]), Dihedral([[0, 1, 2, 3]])
+    _use(ZIGZAG[:8], *rows, copies=copies)
 
 
 def proteins() -> None:
     """the same for many rows"""
-    _use(ZIGZAG[:8], *ROWS, copies=LARGE)
+    molecules(LARGE)
 
 
 def surfaces() -> None:
@@ -109,12 +104,10 @@ def check() -> None:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what a made-up molecule lacks
         n = 8
-        names = ["OW", "HW1", "HW2"] * n
         universe = MDAnalysis.Universe.empty(3 * n, n, atom_resindex=np.repeat(np.arange(n), 3), trajectory=True)
-        universe.add_TopologyAttr("names", names)
-        universe.add_TopologyAttr("elements", [name[0] for name in names])
-        universe.add_TopologyAttr("resids", np.arange(1, n + 1))
-        universe.add_TopologyAttr("resnames", ["SOL"] * n)
+        attributes = {"names": ["OW", "HW1", "HW2"] * n, "elements": ["O", "H", "H"] * n, "resnames": ["SOL"] * n}
+        for name, values in {**attributes, "resids": np.arange(1, n + 1)}.items():
+            universe.add_TopologyAttr(name, values)
         universe.atoms.positions = _copies(TRIANGLE, n)
         universe.dimensions = [40.0, 40.0, 40.0, 90.0, 90.0, 90.0]
         universe.atoms.write(f"{folder}/water.pdb")

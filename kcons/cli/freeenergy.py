@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from kcons.cli.parser import Command, Option
 from kcons.cli.scan import INCOMPLETE
-from kcons.cli.terminal import console, say_written, show
+from kcons.cli.terminal import say_written, show
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,9 +58,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
             written.append(folder / "pulls.json")
             with in_one_piece(written[-1]) as opened:
                 opened.write(text(numbers).encode())
-    show(found.table(), found.summary(), console())
-    if said:
-        print(said)
+    show(found.table(), "\n".join([found.summary(), *([said] if said else [])]))
     say_written(written)
     return INCOMPLETE if found.failed else 0
 

@@ -6,10 +6,20 @@ import sys
 from collections.abc import Sequence
 
 from kcons import __version__
-from kcons.cli import check, compare, doctor, freeenergy, plan, scan, warmup
+from kcons.cli import check, compare, doctor, freeenergy, scan, systems, warmup
 from kcons.cli.parser import Parser
-from kcons.cli.terminal import Terminated, ended_in_order, patient_streams, warnings_in_a_line
+from kcons.cli.terminal import Terminated, ended_in_order, forgiving_streams, warnings_in_a_line
 from kcons.errors import KconsError, with_extra
+
+COMMANDS = (
+    compare.COMMAND,
+    systems.PLAN,
+    check.COMMAND,
+    doctor.COMMAND,
+    freeenergy.COMMAND,
+    scan.COMMAND,
+    warmup.COMMAND,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     143 when terminated.
     """
     try:
-        with patient_streams():
+        with forgiving_streams():
             return _main(arguments)
     except OSError as error:
         print(f"kcons: the output cannot be written: {error}", file=sys.stderr)
@@ -28,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    parser = _parser()
+    parser = parser_of_all()
     chosen = parser.parse_fully(arguments)
     if chosen.version:
         print(f"kcons {__version__}")
@@ -36,6 +46,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     if chosen.command is None:
         parser.print_help()
         return 0
+    status = 2
     try:
         with ended_in_order(), warnings_in_a_line():
             return int(chosen.run(chosen))
@@ -43,45 +54,26 @@ def _main(arguments: Sequence[str] | None) -> int:
         explained = with_extra(error, f"kcons {chosen.command}")
         if not isinstance(explained, KconsError):
             raise
-        print(f"kcons: {explained}", file=sys.stderr)
-        return 2
+        said = str(explained)
     except (FileExistsError, NotADirectoryError) as error:
-        print(
-            f"kcons: {error.filename}: there is a file where a folder has to be; give another folder (--out)",
-            file=sys.stderr,
-        )
-        return 2
+        said = f"{error.filename}: there is a file where a folder has to be; give another folder (--out)"
     except (KconsError, OSError) as error:
-        print(f"kcons: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        said = " ".join(str(error).split())
     except MemoryError as error:
-        print(f"kcons: there is not enough memory: {error}", file=sys.stderr)
-        return 2
+        said = f"there is not enough memory: {error}"
     except KeyboardInterrupt as stop:
-        ended, status = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
-        kept = getattr(chosen, "kept", None)
-        more = f"; finished {kept} are kept: run again to resume" if kept else ""
-        print(f"kcons: {ended}{more}", file=sys.stderr)
-        return status
+        said, status = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
+        said += f"; finished {chosen.kept} are kept: run again to resume" if chosen.kept else ""
+    print(f"kcons: {said}", file=sys.stderr)
+    return status
 
 
-def commands() -> dict[str, Parser]:
-    """The parser of each command."""
-    return _parser().commands()
-
-
-def _parser() -> Parser:
+def parser_of_all() -> Parser:
+    """The parser of the command line; `commands` has that of each command."""
     parser = Parser(prog="kcons", description="Constraints in molecular dynamics.")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
-    for command in (
-        compare.COMMAND,
-        plan.COMMAND,
-        check.COMMAND,
-        doctor.COMMAND,
-        freeenergy.COMMAND,
-        scan.COMMAND,
-        warmup.COMMAND,
-    ):
+    for command in COMMANDS:
         command.add(commands)
+    parser.commands = dict(commands.choices)
     return parser

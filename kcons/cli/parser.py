@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import did_you_mean
 
 
 class Option:
@@ -54,38 +54,20 @@ class Command(NamedTuple):
             if option.group not in groups:
                 groups[option.group] = parser.add_argument_group(option.group)
             groups[option.group].add_argument(option.name, **option.how)
-        parser.set_defaults(run=self.run, of=parser, kept=self.kept)
+        parser.set_defaults(run=self.run, kept=self.kept)
 
 
 class Parser(argparse.ArgumentParser):
     """An `ArgumentParser` whose complaints name what is nearest; parsers of commands are of this kind, too."""
 
-    def commands(self) -> dict[str, Parser]:
-        """The parser of each command; none for that of a command."""
-        found = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
-        return dict(found[0].choices) if found else {}
-
-    def given(self, chosen: argparse.Namespace) -> dict[str, str]:
-        """Options that are not what they are by default: where they are kept, and how they are written."""
-        options = [action for action in self._actions if action.option_strings and hasattr(chosen, action.dest)]
-        return {a.dest: a.option_strings[0] for a in options if getattr(chosen, a.dest) != a.default}
-
-    def take_only(self, chosen: argparse.Namespace, known: Collection[str], why: str) -> None:
-        """Complain of an option that would say nothing.
-
-        Raises
-        ------
-        InputError
-        """
-        for name, option in self.given(chosen).items():
-            if name not in known:
-                raise InputError(f"{option} {why}", item=name)
+    #: The parser of each command.
+    commands: dict[str, Parser]
 
     def parse_fully(self, arguments: Sequence[str] | None = None) -> argparse.Namespace:
         """As `parse_args`."""
         chosen, rest = self.parse_known_args(arguments)
         if rest:
-            of = self.commands().get(getattr(chosen, "command", None) or "", self)
+            of = self.commands.get(chosen.command or "", self)
             options = [option for action in of._actions for option in action.option_strings]
             of.error(f"unrecognized arguments: {' '.join(rest)}{did_you_mean(rest[0].partition('=')[0], options)}")
         return chosen

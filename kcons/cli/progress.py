@@ -15,9 +15,8 @@ class Bars(Watcher):
     """A bar on the terminal for the piece of work in hand; a line for each piece where there is no terminal."""
 
     def __init__(self) -> None:
-        self._console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        self._bars = Progress(*columns, console=self._console, transient=True)
+        self._bars = Progress(*columns, console=Console(stderr=True), transient=True)
         self._task: TaskID | None = None
         self._whole: TaskID | None = None
 
@@ -28,19 +27,21 @@ class Bars(Watcher):
     def __exit__(self, *_: object) -> None:
         self._bars.stop()
 
+    def _bar(self, task: TaskID | None, text: str, done: float, total: float) -> TaskID:
+        if not self._bars.console.is_terminal:
+            print(text, file=sys.stderr, flush=True)
+        if task is None:
+            task = self._bars.add_task(text, total=total)
+        self._bars.update(task, description=text, completed=done, total=total)
+        return task
+
     def overall(self, what: str, done: float, total: float) -> None:
         left = max(total - done, 0.0)
         text = f"{what}; {'the last of it' if left == 0 else 'about ' + duration(left) + ' left'}"
-        if not self._console.is_terminal:
-            print(text, file=sys.stderr, flush=True)
-        if self._whole is None:
-            self._whole = self._bars.add_task(text, total=total)
-        self._bars.update(self._whole, description=text, completed=done, total=total)
+        self._whole = self._bar(self._whole, text, done, total)
 
     def begin(self, what: str, total: float) -> None:
-        if not self._console.is_terminal:
-            print(what, file=sys.stderr, flush=True)
-        self._task = self._bars.add_task(what, total=total)
+        self._task = self._bar(None, what, 0.0, total)
 
     def advance(self, done: float) -> None:
         if self._task is not None:

@@ -5,17 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.cli.parser import Command, Option
-from kcons.cli.terminal import console, say_written, show
-from kcons.errors import InputError, UnsupportedError
+from kcons.cli.terminal import say_written, show
+from kcons.errors import InputError
 
 if TYPE_CHECKING:
-    from ase import Atoms
-
     from kcons.constraints import Constraint
 
 #: Option -> atoms it takes.
@@ -33,52 +30,40 @@ class _Coordinate(argparse.Action):
 
 
 def _scan(chosen: argparse.Namespace) -> int:
+    from kcons.constraints import FixedAtoms
+    from kcons.free_energy.windows.input_file import counted, read_structure
+
     coordinates, values = _grid(chosen)
-    atoms = _structure(chosen.structure)
-    held = _held(chosen)
+    atoms = read_structure(chosen.structure)
+    held: list[Constraint] = [FixedAtoms(counted(chosen.fix, chosen.count_from))] if chosen.fix else []
+    held += [_made(f, numbers, chosen) for f in FAMILIES for numbers in getattr(chosen, f"hold_{f}") or ()]
     if chosen.constrain is not None:
         from kcons.ase import constraints_of
 
         held += constraints_of(atoms, chosen.constrain, guess_bonds=True)
-    atoms.calc = _calculator(chosen.calculator, _settings(chosen.settings))
+    atoms.calc = _calculator(chosen.calculator, chosen.settings)
     held += getattr(atoms.calc, "held", [])
 
     from kcons.cli.progress import Bars
     from kcons.free_energy import scan
 
+    how = {"held": held, "fmax": chosen.fmax, "both_ways": not chosen.one_way}
     folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
-    with Bars() as watcher:
-        watcher.begin("relaxed scan", 1.0)
-        found = scan(
-            atoms,
-            coordinates,
-            values,
-            held=held,
-            folder=folder,
-            fmax=chosen.fmax,
-            both_ways=not chosen.one_way,
-            progress=lambda done, points, line: watcher.advance(done / points),
-        )
-        watcher.end()
-    show(found.table(), found.summary(), console())
+    with Bars() as watcher, watcher.piece("relaxed scan", 1.0):
+
+        def progress(done: int, points: int, line: str) -> None:
+            watcher.advance(done / points)
+
+        found = scan(atoms, coordinates, values, folder=folder, progress=progress, **how)
+    show(found.table(), found.summary())
     say_written(found.write(folder))
     return INCOMPLETE if found.failed else 0
 
 
 def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Constraint:
-    from kcons import constraints
-    from kcons.free_energy.windows.input_file import counted
+    from kcons.free_energy.windows.input_file import FAMILIES, counted
 
-    kind: Any = getattr(constraints, family.capitalize())
-    return kind([counted(atoms, chosen.count_from)])
-
-
-def _held(chosen: argparse.Namespace) -> list[Constraint]:
-    from kcons.constraints import FixedAtoms
-    from kcons.free_energy.windows.input_file import counted
-
-    held: list[Constraint] = [FixedAtoms(counted(chosen.fix, chosen.count_from))] if chosen.fix else []
-    return held + [_made(f, atoms, chosen) for f in FAMILIES for atoms in getattr(chosen, f"hold_{f}") or ()]
+    return FAMILIES[family]([counted(atoms, chosen.count_from)])
 
 
 def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
@@ -113,46 +98,24 @@ def _for_each(option: str, given: Sequence[float], count: int) -> list[float]:
     return list(given) * (count if len(given) == 1 else 1)
 
 
-def _structure(path: Path) -> Atoms:
-    import ase.io
-
-    if not path.is_file():
-        raise InputError(f"there is no file {path}", item="structure")
+def _calculator(name: str, given: str) -> Any:
     try:
-        found: Any = ase.io.read(path)
-    except Exception as error:
-        raise InputError(f"ASE cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
-    return found
-
-
-def _settings(given: str) -> dict[str, Any]:
-    try:
-        found = json.loads(given)
+        settings = json.loads(given)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"--settings is no JSON: {error}; give such as '{{\"charge\": 1}}'", item="settings"
         ) from error
-    if not isinstance(found, dict):
+    if not isinstance(settings, dict):
         raise InputError("--settings are names and values, such as '{\"charge\": 1}'", item="settings")
-    return found
+    if not name.endswith(".xml"):
+        from kcons.ase.named_calculators import named_calculator
 
-
-def _calculator(name: str, settings: dict[str, Any]) -> Any:
-    if name.endswith(".xml"):
-        return _of_system(Path(name), settings)
-    from kcons.ase.named_calculators import named_calculator
-
-    return named_calculator(name, settings)
-
-
-def _of_system(path: Path, settings: dict[str, Any]) -> Any:
-    if find_spec("openmm") is None:
-        raise UnsupportedError("a System needs OpenMM: python -m pip install openmm")
+        return named_calculator(name, settings)
     import openmm
 
     from kcons.free_energy.scans.system_calculator import SystemCalculator, read_system
 
-    system = read_system(path, "calculator")
+    system = read_system(Path(name), "calculator")
     try:
         return SystemCalculator(system, **settings)
     except (TypeError, openmm.OpenMMException) as error:

@@ -1,4 +1,4 @@
-"""The test system or file that a command is asked for, and what is said about its molecules."""
+"""The test system or file that a command is asked for, what is said about its molecules, and `kcons plan`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kcons.cli.parser import Option
+from kcons.cli.parser import Command, Option
 from kcons.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
@@ -77,11 +77,6 @@ def check_name(chosen: argparse.Namespace) -> None:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
-def owner(system: str) -> str:
-    """What results belong to: a test system by name, or a file by its path."""
-    return str(Path(system).resolve()) if Path(system).is_file() else system
-
-
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
     """What was said about molecules in OpenMM."""
     said = {
@@ -114,3 +109,62 @@ def test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSyste
     for name in sorted(test_systems.FILE_OPTIONS & set(molecules(chosen))):
         raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in test systems", item=name)
     return test_systems.build(chosen.system, chosen.size, chosen.seed, quick=quick, **molecules(chosen))
+
+
+def list_everything() -> int:
+    """Print the names of test systems and methods."""
+    from kcons.comparison import averages, methods, test_systems
+
+    def when(method: methods.Method) -> str:
+        if not method.usual:
+            return " (only when named)"
+        everywhere = method.engine != "OpenMM" or method.name in methods.GUESTS
+        return "" if everywhere else " (in OpenMM's test systems, or when named)"
+
+    print("test systems")
+    for name, entry in test_systems.SYSTEMS.items():
+        print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
+    print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
+    print(f"  {'FILE':<16} any topology that MDAnalysis reads; --coordinates, --constrain, --select, --forces")
+    print("methods")
+    for name, method in methods.METHODS.items():
+        print(f"  {name:<27} {method.title}{when(method)}")
+    print("thermostats (--criterion temperature)")
+    for name, sampler in averages.SAMPLERS.items():
+        print(f"  {name:<21} {sampler.title}{' (--slow, --fast)' if sampler.several else ''}")
+    return 0
+
+
+def _plan(chosen: argparse.Namespace) -> int:
+    if chosen.list:
+        return list_everything()
+    from kcons.comparison import test_systems
+
+    check_name(chosen)
+    given = molecules(chosen)
+    if not (test_systems.is_other_file(chosen.system) and test_systems.by_mdanalysis(chosen.system, given)):
+        system = test_system(chosen)
+        print(system.title)
+        print(system.motion.report(system.positions, system.velocities))
+        return 0
+    from kcons.comparison.test_systems import any_file
+
+    for name in ("forces", "force_field", "platform", "add_hydrogens"):
+        if name in given:
+            option = name.replace("_", "-") if name == "add_hydrogens" else name.replace("_", "")
+            raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
+    found = any_file.plan(chosen.system, **given)
+    print("\n".join([found.title, *found.notes]))
+    if sites := len(found.rows.virtual_sites):
+        print(f"{sites:,} virtual sites, placed by their molecules")
+    print(found.motion.report(found.positions))
+    return 0
+
+
+PLAN = Command(
+    "plan",
+    "clusters, rank, degrees of freedom and the solver picked for each kind of cluster",
+    "What the engine will do for a system, before any run.",
+    SYSTEM,
+    _plan,
+)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import codecs
 import io
 import os
 import signal
 import sys
 import threading
-import unicodedata
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,13 +19,6 @@ if TYPE_CHECKING:
 
 #: Columns of a page that is no terminal.
 WIDE = 150
-#: What stands for characters that an encoding lacks and that no decomposition leads to.
-_PLAIN = {
-    "–": "-", "—": "-", "\N{MINUS SIGN}": "-",
-    "±": "+/-", "×": "x", "·": "*", "√": "sqrt", "→": "->", "≤": "<=", "≥": ">=",
-    "≈": "~", "°": " deg", "━": "-", "─": "-", "│": "|", "█": "#", "σ": "sigma", "Σ": "sum", "∂": "d",
-}  # fmt: skip
-_PLAIN_ERRORS = "kcons.plain"
 
 
 def numbers(text: str) -> list[float]:
@@ -41,12 +32,31 @@ def names(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def show(table: RenderableType, explained: str, console: Console) -> None:
-    console.print(table)
-    console.print(explained, highlight=False, markup=False)
+def console() -> Console:
+    from rich.console import Console
+
+    found = Console()
+    # Into a file or a pipe there is no width to fit into.
+    return found if found.is_terminal else Console(width=WIDE)
 
 
-def say_written(paths: list[Path]) -> None:
+def show(*parts: RenderableType) -> None:
+    """Tables, and sentences as they are."""
+    terminal = console()
+    for part in parts:
+        terminal.print(part, highlight=False, markup=False, soft_wrap=not hasattr(part, "columns"))
+
+
+def rendered(table: RenderableType) -> str:
+    """The table as plain text, wide enough for all columns."""
+    from rich.console import Console
+
+    page = io.StringIO()
+    Console(file=page, width=WIDE, color_system=None).print(table)
+    return page.getvalue().rstrip()
+
+
+def say_written(paths: Iterable[Path]) -> None:
     for path in paths:
         print(f"wrote {path}")
 
@@ -88,65 +98,43 @@ def warnings_in_a_line() -> Iterator[None]:
         yield
 
 
-# -- streams ----------------------------------------------------------------------------------------
-
-
-def _plain(error: UnicodeError) -> tuple[str, int]:
-    """Something like the characters that cannot be encoded, in ASCII."""
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
-    shown = []
-    for character in error.object[error.start : error.end]:
-        simple = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
-        shown.append(_PLAIN.get(character) or simple or "?")
-    return "".join(shown), error.end
-
-
-class _Forgiving(io.FileIO):
+class _Pipe(io.FileIO):
     """A pipe that may be closed at its other end: what is written from then on is dropped."""
 
     gone = False
 
     def write(self, data: Any, /) -> int:
-        if self.gone:
-            return len(data)
         try:
-            return super().write(data)
+            return len(data) if self.gone else super().write(data)
         except BrokenPipeError:
             self.gone = True
             return len(data)
 
 
-def _patient(stream: Any) -> Any:
+def _forgiving(stream: Any) -> Any:
     if stream is None:  # closed by whoever started the command
         return open(os.devnull, "w", encoding="utf-8")
     buffer = getattr(stream, "buffer", None)
     if not isinstance(getattr(buffer, "raw", buffer), io.FileIO):
         return stream  # of a program that calls the command
     stream.flush()
-    raw = _Forgiving(stream.fileno(), "w", closefd=False)
-    return io.TextIOWrapper(
-        # python -u has no buffer.
-        raw if isinstance(buffer, io.FileIO) else io.BufferedWriter(raw),  # type: ignore[arg-type]
-        encoding=stream.encoding,
-        errors=_PLAIN_ERRORS,
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
-    )
+    raw = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
+    at_once = stream.line_buffering or stream.write_through
+    return io.TextIOWrapper(raw, encoding=stream.encoding, errors="replace", line_buffering=at_once)
 
 
 @contextmanager
-def patient_streams() -> Iterator[None]:
-    """Standard output and errors that take any character, and a reader that goes away, such as `head`.
+def forgiving_streams() -> Iterator[None]:
+    """Standard output and errors that take any character, '?' for those that their encoding lacks, and a reader that
+    goes away, such as `head`.
 
     Raises
     ------
     OSError
         What was written cannot be brought to its file, at the end.
     """
-    codecs.register_error(_PLAIN_ERRORS, _plain)
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(_patient, before)
+    sys.stdout, sys.stderr = map(_forgiving, before)
     streams = [new for new, old in zip((sys.stdout, sys.stderr), before, strict=True) if new is not old]
     try:
         yield
@@ -156,28 +144,5 @@ def patient_streams() -> Iterator[None]:
             try:
                 stream.flush()
             except OSError:
-                # Closing would try again.
-                getattr(stream.buffer, "raw", stream.buffer).gone = True
+                getattr(stream.buffer, "raw", stream.buffer).gone = True  # closing would try again
                 raise
-
-
-# -- tables -----------------------------------------------------------------------------------------
-
-
-def rendered(table: RenderableType) -> str:
-    """The table as plain text, wide enough for all columns."""
-    from io import StringIO
-
-    from rich.console import Console
-
-    page = StringIO()
-    Console(file=page, width=WIDE, color_system=None).print(table)
-    return page.getvalue().rstrip()
-
-
-def console() -> Console:
-    from rich.console import Console
-
-    console = Console()
-    # Into a file or a pipe there is no width to fit into.
-    return console if console.is_terminal else Console(width=WIDE)

@@ -19,7 +19,7 @@ def _warmup(chosen: argparse.Namespace) -> int:
         for name, use in KINDS.items():
             print(f"{name:12} {use.__doc__}")
         return 0
-    wanted = [name for given in chosen.what or () for name in names(given)] or list(KINDS)
+    wanted = [name for given in chosen.what for name in names(given)] or list(KINDS)
     if unknown := sorted(set(wanted) - set(KINDS)):
         raise InputError(
             f"nothing here is called {unknown[0]!r}{did_you_mean(unknown[0], KINDS)}; choose of {', '.join(KINDS)}",

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from kcons.comparison.measure import COLUMNS, described, first_line, processor_clock, table_of
+from kcons.comparison.measure import COLUMNS, described, first_line, processor_clock, run_pending, table_of
+from kcons.comparison.methods import lines_on_arrays
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.constraints.arguments import positive
@@ -285,18 +286,16 @@ def compare_averages(
         "budget": budget,
         "margin": COST_SCATTER,
     }
-    rows: list[dict[str, Any]] = [] if done is None else done.to_dict("records")
-    there = {row["method"] for row in rows}
-    for sampler in chosen:
-        if sampler.name in there:
-            continue
+
+    def runs(sampler: Sampler) -> list[dict[str, Any]]:
+        options: dict[str, Any] = {"cheap": cheap, "budget": budget / len(planned[sampler.name]), "seed": seed}
+        found = []
         for step, rate in planned[sampler.name]:
-            share = budget / len(planned[sampler.name])
             with watching.piece(f"{sampler.title}, {step / unit:.3g} {system.units.time}", 1):
-                rows.append(sample(system, sampler, step, rate, cheap=cheap, budget=share, seed=seed, watcher=watching))
-        if keep is not None:
-            keep(table_of(rows, about, ALL_COLUMNS))
-    return table_of(rows, about, ALL_COLUMNS)
+                found.append(sample(system, sampler, step, rate, watcher=watching, **options))
+        return found
+
+    return table_of(run_pending(chosen, runs, about, done, keep, ALL_COLUMNS), about, ALL_COLUMNS)
 
 
 def _same_atoms(expensive: TestSystem, cheap: TestSystem) -> None:
@@ -465,29 +464,13 @@ def code(system: TestSystem, name: str, setting: float, friction: float, made_by
     made_by : str
         The expression that makes the test system after ``from kcons.comparison import test_systems``.
     """
-    unit = system.units.time_unit
-    stepper = SAMPLERS[name].make(
-        Setting(
-            system.thermal_energy,
-            setting * unit,
-            (friction or 1.0) / system.units.long_time_unit,
-            inner_step(system),
-            1,
-        )
-    )
     if SAMPLERS[name].several:
         return ""
-    lines = [
-        "from kcons import Motion, State, System, run",
-        "from kcons.comparison import test_systems",
-        *(["from kcons.steppers import BlanesMoan4"] if "BlanesMoan4" in repr(stepper) else []),
-        f"from kcons.thermostats import {type(stepper).__name__}",
-        "",
-        f"test_system = {made_by}",
-        "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions",
-        "system = System(motion, test_system.potential.forces, potential=test_system.potential.energy)",
-        "start = State(test_system.positions, test_system.velocities)",
-        f"stepper = {stepper!r}",
-        f"end = run(system, start, {float(f'{setting * unit:.15g}')!r}, 1000, stepper=stepper)",
-    ]
-    return "\n".join(lines) + "\n"
+    dt, rate = setting * system.units.time_unit, (friction or 1.0) / system.units.long_time_unit
+    stepper = SAMPLERS[name].make(Setting(system.thermal_energy, dt, rate, inner_step(system), 1))
+    imports = f"from kcons.thermostats import {type(stepper).__name__}"
+    if "BlanesMoan4" in repr(stepper):
+        imports = f"from kcons.steppers import BlanesMoan4\n{imports}"
+    last = f"stepper = {stepper!r}\nend = run(system, start, {float(f'{dt:.15g}')!r}, 1000, stepper=stepper)\n"
+    lines = lines_on_arrays(imports, last).replace("$made_by", made_by)
+    return lines.replace("potential.forces)", "potential.forces, potential=test_system.potential.energy)")

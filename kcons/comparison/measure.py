@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import textwrap
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import perf_counter, process_time
@@ -127,15 +127,28 @@ def compare(
     if reference is None:
         reference = reference_of(system, watching)
     about = {**described(system, reference), "budget": budget}
+    rows = run_pending(chosen, lambda m: all_settings(system, m, reference, budget, watching), about, done, keep)
+    timing = Rounds(system, rounds, min(ROUND_SHARE * budget, ROUND_SECONDS), PATIENCE * budget, watching)
+    return table_of(rows, {**about, "margin": timing.time(rows)})
+
+
+def run_pending(
+    chosen: Sequence[Any],
+    run: Callable[[Any], list[dict[str, Any]]],
+    about: dict[str, Any],
+    done: pd.DataFrame | None,
+    keep: Callable[[pd.DataFrame], None] | None,
+    columns: Iterable[str] = COLUMNS,
+) -> list[dict[str, Any]]:
+    """The rows of an unfinished table, and those of all methods that it does not have; `keep` gets the table so far."""
     rows: list[dict[str, Any]] = [] if done is None else done.to_dict("records")
     there = {row["method"] for row in rows}
     for method in chosen:
         if method.name not in there:
-            rows += all_settings(system, method, reference, budget, watching)
+            rows += run(method)
             if keep is not None:
-                keep(table_of(rows, about))
-    timing = Rounds(system, rounds, min(ROUND_SHARE * budget, ROUND_SECONDS), PATIENCE * budget, watching)
-    return table_of(rows, {**about, "margin": timing.time(rows)})
+                keep(table_of(rows, about, columns))
+    return rows
 
 
 def table_of(rows: list[dict[str, Any]], about: dict[str, Any], columns: Iterable[str] = COLUMNS) -> pd.DataFrame:

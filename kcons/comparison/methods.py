@@ -209,22 +209,28 @@ STEPPERS: dict[str, type[steppers.Stepper]] = {
 USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
 _ON_ARRAYS = """\
-from kcons import Motion, State, System$run
+from kcons import Motion, State, System, run
 from kcons.comparison import test_systems
-from kcons.steppers import $stepper
+$imports
 
 test_system = $made_by
 motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions
 system = System(motion, test_system.potential.forces)  # a function of positions and time
 start = State(test_system.positions, test_system.velocities)
 """
-_BY_STEPPER = _ON_ARRAYS.replace("$run", ", run") + "end = run(system, start, $step, $steps, stepper=$stepper())\n"
-_BY_EXTRAPOLATION = (
-    _ON_ARRAYS.replace("$run", "").replace("$stepper", "Extrapolation")
-    + """\
+
+
+def lines_on_arrays(imports: str, last: str) -> str:
+    """Lines of Python that build a System, with $made_by, and the last ones."""
+    return _ON_ARRAYS.replace("$imports", imports).replace(", run", ", run" if "run(" in last else "") + last
+
+
+_BY_EXTRAPOLATION = lines_on_arrays(
+    "from kcons.steppers import Extrapolation",
+    """\
 for end in Extrapolation($step).states(system, start, until=test_system.horizon):
     pass  # each state is the end of a step
-"""
+""",
 )
 _BY_DYNAMICS = """\
 from ase import units
@@ -260,7 +266,10 @@ def _nothing_held(system: TestSystem, dt: float) -> Run:
 
 
 def _code_of_stepper(stepper: str, system: TestSystem) -> str:
-    return (_BY_DYNAMICS if system.units.energy == "eV" else _BY_STEPPER).replace("$stepper", stepper)
+    if system.units.energy == "eV":
+        return _BY_DYNAMICS.replace("$stepper", stepper)
+    last = f"end = run(system, start, $step, $steps, stepper={stepper}())\n"
+    return lines_on_arrays(f"from kcons.steppers import {stepper}", last)
 
 
 def _without_step(kind: type[steppers.Stepper]) -> Callable[[float], steppers.Stepper]:
@@ -470,6 +479,11 @@ def exponent(tolerance: float) -> str:
     return f"{tolerance:.0e}".replace("e-0", "e-")
 
 
+def evaluations(scheme: str) -> int:
+    """Force evaluations of a step of a scheme."""
+    return 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
+
+
 def _engine(system: TestSystem) -> OpenMMEngine:
     assert system.openmm is not None
     return system.openmm
@@ -483,79 +497,81 @@ def only_water(system: TestSystem) -> bool:
     return not engine.surfaces and not take_constraints(engine.copy())
 
 
-def _in_openmm(
-    system: TestSystem, dt: float, integrator: Any, made: Any = None, *, force_evaluations: int = 1, own: bool = False
-) -> Run:
-    """`own`: an integrator of OpenMM, whose velocities are those of half a step earlier."""
+def _in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem, dt: float) -> Run:
+    """A run of an integrator of OpenMM or of `kcons.openmm`, by its name and what it takes beside the step.
+
+    `how`: 'own' constraints of the System; 'held', moved to the solver of kcons (rigid water stays, unless there is
+    nothing else); on 'surfaces'; or 'free' of them.
+    """
+    import openmm
+
+    import kcons.openmm as ours
+
     engine = _engine(system)
-    context = engine.context(engine.system if made is None else made, integrator)
-    context.setPositions(system.positions * engine.length)
+    made, x = engine.copy(constraints=how != "free"), system.positions * engine.length
+    own = hasattr(openmm, kind)
+    if own:
+        integrator = getattr(openmm, kind)(*given, dt * engine.time)
+        integrator.setConstraintTolerance(tolerance)
+        if hasattr(integrator, "setRandomNumberSeed"):
+            integrator.setRandomNumberSeed(1)
+    else:
+        options: dict[str, Any] = {"tolerance": tolerance}
+        if how == "held":
+            rows: Sequence[Any] = engine.surfaces
+            options["parts"] = [ours.hold(made, rows, x, take="all", keep_water=not only_water(system))]
+        elif how == "surfaces":
+            options |= {"surfaces": engine.surfaces, "system": made}
+        integrator = getattr(ours, kind)(engine.step(dt), *given, **options)
+    context = engine.context(made, integrator)
+    context.setPositions(x)
     v = system.velocities * engine.speed
     half_step = own or getattr(integrator, "scheme", "") is None
     if half_step:
-        # Then the first position is the one that RATTLE reaches.
+        # Velocities are those of half a step earlier: then the first position is the one that RATTLE reaches.
         state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
         v = v - 0.5 * dt * engine.time * state.getForces(asNumpy=True)._value / system.masses[:, None]
     context.setVelocities(v)
+    each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
     units = {"length": engine.length, "speed": engine.speed}
-    return InOpenMM(context, integrator, dt, force_evaluations=force_evaluations, half_step=half_step, **units)
+    return InOpenMM(context, integrator, dt, force_evaluations=each, half_step=half_step, **units)
 
 
-def _own(kind: str, arguments: tuple[float, ...], tolerance: float, system: TestSystem, dt: float) -> Run:
-    import openmm
+_IN_OPENMM = """\
+$imported
 
-    integrator = getattr(openmm, kind)(*arguments, dt * _engine(system).time)
-    if kind == "LangevinMiddleIntegrator":
-        integrator.setRandomNumberSeed(1)
-    integrator.setConstraintTolerance(tolerance)
-    return _in_openmm(system, dt, integrator, own=True)
+from kcons.comparison import test_systems
 
-
-def _free_in_openmm(system: TestSystem, dt: float) -> Run:
-    import openmm
-
-    engine = _engine(system)
-    made = engine.copy(constraints=False)
-    return _in_openmm(system, dt, openmm.VerletIntegrator(dt * engine.time), made, own=True)
+test_system = $made_by
+md_engine = test_system.openmm
+system = md_engine.copy()  # yours, with its constraints
+$integrator
+context = md_engine.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)
+context.setPositions(test_system.positions * md_engine.length)
+context.setVelocities(test_system.velocities * md_engine.speed)
+integrator.step($steps)
+"""
 
 
-def _projected(scheme: str, system: TestSystem, dt: float) -> Run:
-    from kcons.openmm import ProjectedIntegrator
-
-    integrator = ProjectedIntegrator(_engine(system).step(dt), scheme, tolerance=TIGHT)
-    return _in_openmm(system, dt, integrator, force_evaluations=evaluations(scheme))
-
-
-def _held(scheme: str, system: TestSystem, dt: float) -> Run:
-    """Constraints carried to kcons' solver; rigid water stays with OpenMM, unless there is nothing else."""
-    from kcons.openmm import ProjectedIntegrator, hold
-
-    engine = _engine(system)
-    made, x = engine.copy(), system.positions * engine.length
-    rows: Sequence[Any] = engine.surfaces
-    part = hold(made, rows, x, take="all", keep_water=not only_water(system))
-    integrator = ProjectedIntegrator(engine.step(dt), scheme, parts=[part], tolerance=TIGHT)
-    return _in_openmm(system, dt, integrator, made, force_evaluations=evaluations(scheme))
-
-
-def _on_surfaces(scheme: str, system: TestSystem, dt: float) -> Run:
-    from kcons.openmm import SurfaceIntegrator
-
-    engine = _engine(system)
-    made = engine.copy()
-    integrator = SurfaceIntegrator(engine.step(dt), scheme, surfaces=engine.surfaces, system=made, tolerance=TIGHT)
-    return _in_openmm(system, dt, integrator, made, force_evaluations=evaluations(scheme))
-
-
-def _compiled(tolerance: float, system: TestSystem, dt: float) -> Run:
-    from kcons.openmm import RattleIntegrator
-
-    return _in_openmm(system, dt, RattleIntegrator(_engine(system).step(dt), tolerance=tolerance))
-
-
-def evaluations(scheme: str) -> int:
-    """Force evaluations of a step of a scheme."""
-    return 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
+def _lines_in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem) -> str:
+    """Lines of Python that do what `_in_openmm` does."""
+    if not kind.startswith(("Projected", "Rattle", "Surface")):
+        lines = f"integrator = openmm.{kind}({', '.join([*map(repr, given), '$ps'])})\n"
+        lines, imported = f"{lines}integrator.setConstraintTolerance({tolerance:g})", "import openmm"
+    elif how == "surfaces":
+        return ""
+    else:
+        taken, imported = ["$ps", *(f'"{word}"' for word in given)], f"from kcons.openmm import {kind}"
+        lines = ""
+        if how == "held":
+            imported += ", hold"
+            taken.append("parts=[part]")
+            lines = f"""\
+x = test_system.positions * md_engine.length
+part = hold(system, md_engine.surfaces, x, take="all", keep_water={not only_water(system)})  # constraints move to kcons
+"""
+        lines += f"integrator = {kind}({', '.join(taken)}, tolerance={tolerance:g})"
+    return _IN_OPENMM.replace("$imported", imported).replace("$integrator", lines)
 
 
 def _bonds_in_openmm(system: TestSystem) -> str | None:
@@ -574,103 +590,63 @@ def _surfaces(system: TestSystem) -> str | None:
     return None if _engine(system).surfaces else "no particle is held on a surface"
 
 
-_IN_OPENMM = """\
-import openmm
-
-from kcons.comparison import test_systems
-
-test_system = $made_by
-md_engine = test_system.openmm
-system = md_engine.copy()  # yours, with its constraints
-$integrator
-context = md_engine.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)
-context.setPositions(test_system.positions * md_engine.length)
-context.setVelocities(test_system.velocities * md_engine.speed)
-integrator.step($steps)
-"""
-
-
-def _lines(integrator: str, imported: str = "") -> str:
-    """Lines of Python that run an integrator, which is of kcons if it is `imported`."""
-    made = _IN_OPENMM.replace("$integrator", integrator.rstrip())
-    return made.replace("import openmm\n", f"from kcons.openmm import {imported}\n") if imported else made
-
-
-def _held_lines(scheme: str, system: TestSystem) -> str:
-    return _lines(
-        f"""\
-x = test_system.positions * md_engine.length
-part = hold(system, md_engine.surfaces, x, take="all", keep_water={not only_water(system)})  # constraints move to kcons
-integrator = ProjectedIntegrator($ps, "{scheme}", parts=[part], tolerance={TIGHT:g})""",
-        "ProjectedIntegrator, hold",
+def in_openmm(
+    name: str, title: str, integrator: str, *given: Any, tolerance: float = TIGHT, how: str = "own", **options: Any
+) -> None:
+    """Register an integrator as `_in_openmm` takes it."""
+    each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
+    more: dict[str, Any] = {"refuses": _bonds_in_openmm, "force_evaluations": each} | options
+    if more.get("kind", "trajectory") == "trajectory":
+        more["code"] = partial(_lines_in_openmm, integrator, given, tolerance, how)
+    add_method(
+        name,
+        partial(_in_openmm, integrator, given, tolerance, how),
+        title=f"OpenMM {title}",
+        engine="OpenMM",
+        **more,
     )
 
 
-#: OpenMM's own integrators over tolerances.
-_OWN: tuple[tuple[str, str, str, tuple[float, ...]], ...] = (
-    ("openmm-verlet", "OpenMM Verlet", "VerletIntegrator", ()),
-    ("openmm-middle", "OpenMM LangevinMiddle, no friction", "LangevinMiddleIntegrator", (300.0, 0.0)),
-    ("openmm-nose-hoover", "OpenMM NoseHoover, no bath", "NoseHooverIntegrator", ()),
-)
-in_openmm = partial(add_method, engine="OpenMM")
-
-for _name, _title, _own_kind, _arguments in _OWN:
-    for _tolerance in TOLERANCES:
-        _plain, _told = _tolerance == DEFAULT, exponent(_tolerance)
-        _given = ", ".join([*(f"{a:g}" for a in _arguments), "$ps"])
-        in_openmm(
-            _name if _plain else f"{_name}-{_told}",
-            partial(_own, _own_kind, _arguments, _tolerance),
-            title=f"{_title}, {_told}",
-            usual=_name == "openmm-verlet" or _plain,
-            refuses=_bonds_in_openmm,
-            code=_lines(
-                f"integrator = openmm.{_own_kind}({_given})\nintegrator.setConstraintTolerance({_tolerance:g})"
-            ),
-        )
-for _name, _title, _own_kind in (
-    ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", "LangevinMiddleIntegrator"),
-    ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", "NoseHooverIntegrator"),
+for _name, _title, _own, _given in (
+    ("openmm-verlet", "Verlet", "VerletIntegrator", ()),
+    ("openmm-middle", "LangevinMiddle, no friction", "LangevinMiddleIntegrator", (300.0, 0.0)),
+    ("openmm-nose-hoover", "NoseHoover, no bath", "NoseHooverIntegrator", ()),
 ):
-    in_openmm(_name, partial(_own, _own_kind, (300.0, 1.0), DEFAULT), title=_title, kind="thermostat", refuses=_kelvin)
+    for _t in TOLERANCES:
+        _plain = _t == DEFAULT
+        _full, _usual = _name if _plain else f"{_name}-{exponent(_t)}", _plain or _name == "openmm-verlet"
+        in_openmm(_full, f"{_title}, {exponent(_t)}", _own, *_given, tolerance=_t, usual=_usual)
+for _name, _title, _own in (
+    ("openmm-middle-bath", "LangevinMiddle, 300 K", "LangevinMiddleIntegrator"),
+    ("openmm-nose-hoover-bath", "NoseHoover, 300 K", "NoseHooverIntegrator"),
+):
+    in_openmm(_name, _title, _own, 300.0, 1.0, tolerance=DEFAULT, kind="thermostat", refuses=_kelvin)
 for _scheme in (*USUAL, "geodesic", "yoshida4", "blanes-moan6a", "leapfrog"):
-    in_openmm(
-        f"openmm-kcons-{_scheme}",
-        partial(_projected, _scheme),
-        title=f"OpenMM + kcons {_scheme}",
-        force_evaluations=evaluations(_scheme),
-        usual=_scheme in USUAL,
-        refuses=_bonds_in_openmm,
-        code=_lines(f'integrator = ProjectedIntegrator($ps, "{_scheme}", tolerance={TIGHT:g})', "ProjectedIntegrator"),
-    )
-for _tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
-    _told = exponent(_tolerance)
-    in_openmm(
-        "openmm-rattle" if _tolerance == TIGHT else f"openmm-rattle-{_told}",
-        partial(_compiled, _tolerance),
-        title=f"OpenMM + kcons compiled RATTLE, {_told}",
-        refuses=_bonds_in_openmm,
-        code=_lines(f"integrator = RattleIntegrator($ps, tolerance={_tolerance:g})", "RattleIntegrator"),
-    )
+    _usual = _scheme in USUAL
+    in_openmm(f"openmm-kcons-{_scheme}", f"+ kcons {_scheme}", "ProjectedIntegrator", _scheme, usual=_usual)
+for _t in (1e-4, DEFAULT, 1e-6, TIGHT):
+    _name = "openmm-rattle" if _t == TIGHT else f"openmm-rattle-{exponent(_t)}"
+    in_openmm(_name, f"+ kcons compiled RATTLE, {exponent(_t)}", "RattleIntegrator", tolerance=_t)
 for _scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
     in_openmm(
         f"openmm-held-{_scheme}",
-        partial(_held, _scheme),
-        title=f"OpenMM + kcons {_scheme}, own solver",
-        force_evaluations=evaluations(_scheme),
+        f"+ kcons {_scheme}, own solver",
+        "ProjectedIntegrator",
+        _scheme,
+        how="held",
         usual=_scheme != "blanes-moan4",
         refuses=_bonds_or_surfaces,
-        code=partial(_held_lines, _scheme),
     )
 for _scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan6"):
-    in_openmm(
-        f"openmm-surface-{_scheme}",
-        partial(_on_surfaces, _scheme),
-        title=f"OpenMM + kcons {_scheme}, surfaces",
-        force_evaluations=evaluations(_scheme),
-        refuses=_surfaces,
-    )
-in_openmm("openmm-free", _free_in_openmm, title="baseline: OpenMM Verlet, nothing held", kind="baseline")
+    _name, _title = f"openmm-surface-{_scheme}", f"+ kcons {_scheme}, surfaces"
+    in_openmm(_name, _title, "SurfaceIntegrator", _scheme, how="surfaces", refuses=_surfaces)
+add_method(
+    "openmm-free",
+    partial(_in_openmm, "VerletIntegrator", (), DEFAULT, "free"),
+    title="baseline: OpenMM Verlet, nothing held",
+    engine="OpenMM",
+    kind="baseline",
+)
 
 
 # -- lines of Python --------------------------------------------------------------------------------

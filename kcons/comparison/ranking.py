@@ -1,7 +1,7 @@
 """What a table of measurements says: which method and which step, for which error.
 
-Methods are compared by processor time; where forces take less than a microsecond, which is less than a call from
-Python, by force evaluations. Costs that differ by less than the scatter of the times are the same.
+Methods are compared by processor time; where there are forces that take less than a microsecond, which is less than a
+call from Python, by force evaluations. Costs that differ by less than the scatter of the times are the same.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from kcons.comparison.measure import measure
 from kcons.comparison.methods import METHODS, Method
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
+from kcons.comparison.test_systems.potential import NO_FORCES
 from kcons.errors import InputError
 
 Criterion = Literal["error", "drift", "temperature"]
@@ -43,8 +44,9 @@ ORDERS, REACH = (0.5, 10.0), 30.0
 
 
 def cost_that_decides(table: pd.DataFrame) -> str:
-    """'seconds', or 'evaluations' where forces take no time."""
-    return "evaluations" if table.attrs["force_seconds"] < NO_FORCE else "seconds"
+    """'seconds', or 'evaluations' where there are forces that take no time."""
+    forced = table.attrs.get("forces") != NO_FORCES
+    return "evaluations" if forced and table.attrs["force_seconds"] < NO_FORCE else "seconds"
 
 
 def resolution(table: pd.DataFrame) -> float:

@@ -19,56 +19,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from kcons.constraints import compilation as compilation  # before any kernel is declared
-from kcons.constraints.collective import CenterDistance, CenterOfMass, RadiusOfGyration
-from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.functions.custom import Custom, ImplicitSurface
-from kcons.constraints.functions.formula import Formula
-from kcons.constraints.functions.velocity_formula import VelocityFormula
-from kcons.constraints.internal import Angle, Dihedral, Distance, DistanceDifference
-from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
-from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
+from kcons.constraints import collective, internal, linear, surface, velocity
+from kcons.constraints.collective import *
+from kcons.constraints.constraint import FAMILIES, Constraint, RowKind
+from kcons.constraints.functions import custom, formula
+from kcons.constraints.functions.custom import *
+from kcons.constraints.functions.formula import *
+from kcons.constraints.internal import *
+from kcons.constraints.linear import *
+from kcons.constraints.surface import *
 from kcons.constraints.target import MovingTarget
-from kcons.constraints.velocity import CustomVelocity, KnifeEdge, LinearVelocity, Rolling
+from kcons.constraints.velocity import *
 from kcons.errors import InputError
 
-__all__ = [
-    "Angle",
-    "CenterDistance",
-    "CenterOfMass",
-    "Constraint",
-    "Custom",
-    "CustomVelocity",
-    "Cylinder",
-    "Dihedral",
-    "Distance",
-    "DistanceDifference",
-    "Ellipsoid",
-    "FixedAtoms",
-    "Formula",
-    "ImplicitSurface",
-    "KnifeEdge",
-    "Line",
-    "LinearCombination",
-    "LinearRelation",
-    "LinearVelocity",
-    "MovingTarget",
-    "Plane",
-    "RadiusOfGyration",
-    "Rolling",
-    "RowKind",
-    "Sphere",
-    "Torus",
-    "VelocityFormula",
-    "from_dict",
-]
-
-_PUBLIC = [globals()[name] for name in __all__ if name in globals()]
-FAMILIES: dict[str, type[Constraint]] = {
-    each.family: each
-    for each in _PUBLIC
-    if isinstance(each, type) and issubclass(each, Constraint) and each is not Constraint
-}
+__all__ = ["Constraint", "MovingTarget", "RowKind", "from_dict"]
+__all__ += internal.__all__ + linear.__all__ + surface.__all__ + collective.__all__ + velocity.__all__
+__all__ += custom.__all__ + formula.__all__
 
 
 def from_dict(data: Mapping[str, Any]) -> Constraint:
@@ -77,7 +43,7 @@ def from_dict(data: Mapping[str, Any]) -> Constraint:
     Raises
     ------
     InputError
-        If the family is unknown or an entry is missing, unknown or of the wrong shape.
+        If the family is unknown or an entry is missing or unknown.
     """
     try:
         family = FAMILIES[data["family"]]

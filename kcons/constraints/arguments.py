@@ -14,9 +14,9 @@ import functools
 import inspect
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -109,7 +109,7 @@ def kept(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
+def check_out(out: FloatArray, shape: tuple[int, ...], item: str = "out") -> None:
     """Refuse arrays that results cannot be written into.
 
     Raises
@@ -118,18 +118,6 @@ def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> Non
     """
     if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
         raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
-
-
-def check_multipliers(multipliers: FloatArray, n_rows: int) -> None:
-    """Refuse arrays that one multiplier a row cannot be written into.
-
-    Raises
-    ------
-    InputError
-    """
-    good = isinstance(multipliers, np.ndarray) and multipliers.dtype == np.float64 and multipliers.shape == (n_rows,)
-    if not good or not multipliers.flags.writeable:
-        raise InputError(f"multipliers must be a writable float64 array of shape ({n_rows},)", item="multipliers")
 
 
 def atom_array(atoms: Any, item: str) -> NDArray[Any]:
@@ -147,6 +135,11 @@ def atom_array(atoms: Any, item: str) -> NDArray[Any]:
             f"{item}: rows name different numbers of atoms, {_shown(atoms)}; use one object for each number",
             item="atoms",
         ) from None
+
+
+def atom_column(atoms: Any, item: str) -> NDArray[Any]:
+    """One atom a row, shape (n, 1)."""
+    return atom_array(atoms, item).reshape(-1, 1)
 
 
 def check_pairs(pairs: ArrayLike, n_atoms: int | None = None, item: str = "bonds") -> IntArray:
@@ -189,8 +182,8 @@ def refuse_other(value: Any, kind: type | tuple[type, ...], item: str, remedy: s
 TAKES_TIME = "; say time_dependent=True for functions that take the time t as well"
 
 
-def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "") -> None:
-    """Refuse what is no function, or cannot be called with as many arguments; None is none.
+def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "", needed: bool = False) -> None:
+    """Refuse what is no function, or cannot be called with as many arguments; None, where none is needed, passes.
 
     Parameters
     ----------
@@ -206,7 +199,7 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
     ------
     InputError
     """
-    if function is not None and not callable(function):
+    if not callable(function) and (needed or function is not None):
         raise InputError(
             f"{item} is {function!r:.120}; give a function of {', '.join(arguments)}", item=item.rpartition(": ")[2]
         )
@@ -268,6 +261,28 @@ def positive(value: float, item: str) -> float:
     if not (math.isfinite(number) and number > 0):
         raise InputError(f"{item} is {_shown(value)}; give a positive number", item=item.rpartition(": ")[2])
     return number
+
+
+def all_positive(values: ArrayLike, item: str) -> FloatArray:
+    """Numbers above zero, infinite ones included, as an array of any shape."""
+    array = numbers(values, item)
+    if not np.all(array > 0):
+        raise InputError(
+            f"{item} {array[~(array > 0)].flat[0]:g} is not positive; give numbers above zero",
+            item=item.rpartition(": ")[2],
+        )
+    return array
+
+
+def unit(vectors: ArrayLike, item: str) -> FloatArray:
+    """Vectors of length 1 along the given ones, shape (..., 3)."""
+    array, name = numbers(vectors, item), item.rpartition(": ")[2]
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise InputError(f"{item} must be vectors of three numbers; its shape is {array.shape}", item=name)
+    length = np.sqrt(np.einsum("...i,...i->...", array, array))
+    if not np.all(np.isfinite(length) & (length > 0)):
+        raise InputError(f"{item} has a vector that is zero or not finite; give a direction", item=name)
+    return array / length[..., None]
 
 
 def whole_number(value: Any, item: str, least: int = 1, most: int | None = None) -> int:
@@ -350,16 +365,13 @@ ANGLE = Kind("radian", (("angle", 1),))
 TIME = Kind("ps", (("time", 1),))
 #: A vector of which only the direction counts.
 DIRECTION = Kind("one unit for all components", None)
+#: What the family of a constraint says of its targets.
+HELD = Kind("what is held", None)
 
-#: What the arguments of constraints are, by name; 'target' is what the family says.
-ARGUMENTS: Mapping[str, Kind] = {
-    **dict.fromkeys(("radius", "minor_radius", "offset", "center", "point", "major_radius", "semi_axes"), LENGTH),
-    **dict.fromkeys(("axis", "normal", "heading", "direction"), DIRECTION),
-    **dict.fromkeys(("coefficients", "weights", "contact", "rotation"), NUMBER),
-    "length": LENGTH,
-    "time_step": TIME,
-    "period": ANY,
-}
+Lengths: TypeAlias = Annotated[ArrayLike, LENGTH]
+PositiveLengths: TypeAlias = Annotated[ArrayLike, LENGTH, all_positive]
+Directions: TypeAlias = Annotated[ArrayLike, DIRECTION, unit]
+Duration: TypeAlias = Annotated[float, TIME, positive]
 
 
 def has_units(values: Any) -> bool:
@@ -383,11 +395,6 @@ def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
         For messages.
     kind : Kind
         What they must be; plain numbers may be angles, too.
-
-    Raises
-    ------
-    InputError
-        Of another kind; of units that are not OpenMM's.
     """
     if not has_units(values):
         return values, False
@@ -437,35 +444,6 @@ class Unitless:
         return without_units(found, self.item, self.kind)[0]
 
 
-def taking_quantities(init: Callable[..., None]) -> Callable[..., None]:
-    """Let `Constraint.__init__` of a family see plain numbers only, and the object remember what they are in."""
-
-    @functools.wraps(init)
-    def with_quantities(self: Any, *args: Any, **kwargs: Any) -> None:
-        if not any(_carries(value) for value in (*args, *kwargs.values())):
-            init(self, *args, **kwargs)
-            return
-        bound = inspect.signature(init).bind(self, *args, **kwargs)
-        remembered = False
-        for name, value in _given(bound):
-            kind = self.held if name == "target" else ARGUMENTS.get(name, NUMBER)
-            bound.arguments[name], matters = plain_target(value, f"{self.family}: {name}", kind)
-            remembered = remembered or matters
-        init(*bound.args, **bound.kwargs)
-        if remembered:
-            self.units = MD_UNITS
-
-    return with_quantities
-
-
-def _given(bound: inspect.BoundArguments) -> Iterator[tuple[str, Any]]:
-    return iter(list(bound.arguments.items())[1:])
-
-
-def _carries(value: Any) -> bool:
-    return has_units(value) or has_units(getattr(value, "time_step", None))
-
-
 def plain_target(target: Any, item: str, kind: Kind) -> tuple[Any, bool]:
     """`without_units` for what may also be a `MovingTarget`, whose time step is looked at."""
     step = getattr(target, "time_step", None)
@@ -473,3 +451,47 @@ def plain_target(target: Any, item: str, kind: Kind) -> tuple[Any, bool]:
         return without_units(target, item, kind)
     plain, matters = without_units(step, f"{item}: time_step", TIME)
     return target.with_time_step(float(plain)), matters
+
+
+# -- arguments looked at by what their annotations say ----------------------------------------------
+
+
+@functools.cache
+def rules_of(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
+    """What ``Annotated`` says of each argument but the first: its `Kind`, `NUMBER` if not said, then its rules."""
+    hints = get_type_hints(function, include_extras=True)
+    found = {}
+    for name in list(inspect.signature(function).parameters)[1:]:
+        hint = hints.get(name)
+        said = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)  # or None
+        told: tuple[Any, ...] = getattr(said, "__metadata__", ())
+        found[name] = told if told and isinstance(told[0], Kind) else (NUMBER, *told)
+    return found
+
+
+def checked(init: Callable[..., None]) -> Callable[..., None]:
+    """Let the annotations of an ``__init__`` look at its arguments.
+
+    Of ``Annotated[type, kind, rule, ...]`` the `Kind` says what units Quantities may have: they become plain numbers,
+    and the object remembers that in its `units`. A rule ``rule(value, item)`` gives what is taken in place of the
+    value, or raises `InputError`; for None it is not asked.
+    """
+    signature = inspect.signature(init)
+
+    @functools.wraps(init)
+    def checked_init(self: Any, *args: Any, **kwargs: Any) -> None:
+        bound, remembered = signature.bind(self, *args, **kwargs), False
+        rules = rules_of(init)
+        for name, value in list(bound.arguments.items())[1:]:
+            kind, *asked = rules[name]
+            item = f"{type(self).__name__}: {name}"
+            value, matters = plain_target(value, item, self.held if kind is HELD else kind)
+            remembered |= matters
+            for rule in asked if value is not None else ():
+                value = rule(value, item)
+            bound.arguments[name] = value
+        init(*bound.args, **bound.kwargs)
+        if remembered:
+            self.units = MD_UNITS
+
+    return checked_init

@@ -106,7 +106,12 @@ def plain_if_small(kernel: Any, size: int) -> Any:
 
 
 _PACKAGE = Path(__file__).parents[1]
-_HAS_KERNELS = re.compile(r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b", re.M)
+#: Kernels, and functions that are compiled as parts of kernels.
+_HAS_KERNELS = re.compile(
+    r"^(import|from) numba|^from kcons\.constraints\.compilation import .*\b(njit|cfunc)\b|^# Compiled into kernels"
+    r"|^ +def row\(r: Any, p: Any",
+    re.MULTILINE,
+)
 _IMPORTS = re.compile(r"^from (kcons[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 
 
@@ -218,9 +223,11 @@ class _KernelCache(caching.FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        source, stamp = Path(inspect.getfile(function)), self._impl.locator.get_source_stamp()
-        if source.is_relative_to(_PACKAGE):
-            stamp = kernel_sources(source)[1]
+        parts = (cell.cell_contents for cell in function.__closure__ or ())
+        files = {Path(inspect.getfile(part)) for part in (function, *parts) if inspect.isfunction(part)}
+        stamp = self._impl.locator.get_source_stamp()
+        if all(source.is_relative_to(_PACKAGE) for source in files):
+            stamp = "".join(kernel_sources(source)[1] for source in sorted(files))
         self._cache_file = _Files(self._cache_path, self._impl.filename_base, stamp)
 
     def save_overload(self, sig: Any, data: Any) -> None:

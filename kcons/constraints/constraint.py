@@ -14,7 +14,7 @@ Both are differentiated to A a = b (notes eqs. 81-92): A_k is `gradient`, and
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Self
@@ -23,21 +23,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import (
+    ANGLE,
     LENGTH,
     MD_UNITS,
     Kind,
     atom_array,
+    checked,
     kept,
     numbers,
     out_of_range,
     plain_target,
-    taking_quantities,
 )
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError
 
 IntArray = NDArray[np.int64]
+#: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
+_COMPLEX_STEP = 2.0**-100
+
+#: Rows of more atoms are compiled where others are taken at once, since loops over atoms are then long.
+WIDE = 32
+
+#: All families by name.
+FAMILIES: dict[str, type[Constraint]] = {}
 
 
 class RowKind(IntEnum):
@@ -51,8 +61,12 @@ class RowKind(IntEnum):
     VELOCITY = 6  # linear in the velocities, coefficients from a function; 5 and 7 are functions of differences
 
 
-class Constraint(ABC):
+class Constraint:
     """Rows of one family.
+
+    A family declares `row`, a function of numbers, and what its parameters are; value, gradient, curvature, compiled
+    kernels, files and errors follow from it. Families without such a function (linear rows, functions of users) say
+    what `value_and_gradient` and `curvature` are.
 
     Parameters
     ----------
@@ -60,6 +74,8 @@ class Constraint(ABC):
         Atoms of each row, in the order the family documents.
     target : float, array_like, MovingTarget, callable of time, or None
         What each row is held at; None takes the value found when the set is built.
+    **data : array_like
+        What is listed in `per_row`, for all rows or for each.
 
     Notes
     -----
@@ -69,20 +85,37 @@ class Constraint(ABC):
 
     family: ClassVar[str]
     holonomic: ClassVar[bool] = True
+    #: Puts the value into ``out[0]`` and the gradient behind it, x, y, z by atom: of the positions ``r[0]``, ``r[1]``,
+    #: ... of the atoms of one row in the same order, of its `parameters`, ``p[0]``, ... and of the time t. Written with
+    #: + - * /, ``numpy.sqrt`` and the like, so that it can be compiled, and takes arrays of many rows and complex
+    #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). See `VelocityRows` for those.
+    row: Any = None
+    #: How many of the parameters, the first ones, are the same in all rows of an object: numbers of atoms and the like.
+    alike: int = 0
     #: Atoms a row, where the family fixes it.
     row_width: ClassVar[int | None] = None
     #: Data held for each row: name -> shape of one row's entry, -1 standing for the width.
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    #: Which of these are lengths, and with which power, where units change.
+    length_powers: ClassVar[Mapping[str, int]] = {}
     #: Plain numbers or flags that all rows of the object have in common.
     shared: ClassVar[tuple[str, ...]] = ()
     #: Python functions the object holds; with one of them it cannot be written to a file.
     functions: ClassVar[tuple[str, ...]] = ()
     #: What targets are, for Quantities.
     held: ClassVar[Kind] = LENGTH
-    #: Whether kernels square the target, so that one below zero would hold its opposite.
-    squared: ClassVar[bool] = False
+    #: What the target is called where it has to be above zero; nothing where it may be any number.
+    positive: str = ""
+    #: Where the gradient is undefined, and the remedy, with {row} and {atoms}.
+    singular: ClassVar[str] = "{row}: its gradient is undefined; move the atoms"
     #: Whether the coordinate depends on the masses of its atoms.
     uses_masses: ClassVar[bool] = False
+    #: Whether the same atoms in reverse order name the same coordinate.
+    reversible: ClassVar[bool] = False
+    #: Whether rows fix all of an atom, three rows each, so that it moves as with infinite mass.
+    fixes_atoms: ClassVar[bool] = False
+    #: Whether the target is a position, so that replicas of the atoms take theirs from where they are.
+    held_in_place: ClassVar[bool] = False
 
     #: What its numbers are in, where it was given Quantities; None for any consistent units.
     units: str | None = None
@@ -101,14 +134,21 @@ class Constraint(ABC):
     whole: NDArray[np.bool_] | None = None
     windings: IntArray | None = None
 
-    def __init_subclass__(cls, **arguments: Any) -> None:
+    def __init_subclass__(cls, base: bool = False, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
+        cls.family = cls.__name__
+        if not base:
+            FAMILIES[cls.family] = cls
+        if cls.row is not None and cls.kind is RowKind.INTERPRETED:
+            cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
         if "__init__" in cls.__dict__:
-            cls.__init__ = taking_quantities(cls.__init__)  # type: ignore[method-assign]
+            cls.__init__ = checked(cls.__init__)  # type: ignore[method-assign]
 
-    def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
+    def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = kept(_atom_table(atoms, type(self).__name__, self.row_width))
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
+        self._keep(**data)
+        self._settle()
 
     def _keep(self, **data: ArrayLike) -> None:
         """Store data listed in `per_row`, broadcast to all rows; copies, which users cannot change."""
@@ -140,6 +180,11 @@ class Constraint(ABC):
         """Derive and check what follows from the per-row data; called once, when these were set."""
 
     @property
+    def holds_length(self) -> bool:
+        """Whether each row holds the length between two atoms: what ties them together."""
+        return self.kind is RowKind.DISTANCE
+
+    @property
     def n_rows(self) -> int:
         return int(self.atoms.shape[0])
 
@@ -152,17 +197,49 @@ class Constraint(ABC):
         """Whether value or gradient depend on time explicitly."""
         return isinstance(self.target, MovingTarget)
 
-    @abstractmethod
+    def _evaluated(self, r: NDArray[Any], time: float) -> NDArray[Any]:
+        """What `row` puts out, shape (1 + 3 width, n_rows): for all rows at once, or compiled where they are wide."""
+        out = np.zeros((self.n_rows, 1 + 3 * self.width), r.dtype)
+        if not self.n_rows:
+            return out.T
+        row, table, places = type(self).row, self.parameters(), r.reshape(self.n_rows, -1)
+        assert row is not None
+        if not self.holonomic:  # at the end of a flight that has gone nowhere
+            places = np.concatenate([places, np.zeros(places.shape)], axis=1)
+        if self.width > WIDE:
+            compiled = _compiled(row)
+            for k in range(self.n_rows):
+                compiled(places[k], table[k], time, out[k])
+        else:
+            row(places.T, [*table[0, : self.alike], *table.T[self.alike :]], time, out.T)
+        return out.T
+
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        """q, shape (n_rows,), and dq/dr, shape (n_rows, width, 3); of velocity rows 0 and the coefficients of v.
+
+        Parameters
+        ----------
+        r : ndarray, shape (n_rows, width, 3)
+        time : float
+        """
+        out = self._evaluated(r, time)
+        return out[0], np.ascontiguousarray(out[1:].T).reshape(r.shape)
+
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         """Natural coordinate q, shape (n_rows,), from positions `r` of shape (n_rows, width, 3)."""
+        with np.errstate(all="ignore"):  # a gradient may be undefined where the value is not
+            return self.value_and_gradient(r, time)[0]
 
-    @abstractmethod
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         """dq/dr (position rows) or the coefficients of v (velocity rows), shape (n_rows, width, 3)."""
+        return self.value_and_gradient(r, time)[1]
 
-    @abstractmethod
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         """v^T (d2q/dr2) v, or for velocity rows v . (d coefficients/dt along v, time terms included)."""
+        if not self.n_rows:
+            return np.zeros(0)
+        slope = self._evaluated(r + (1j * _COMPLEX_STEP) * v, time)[1:].imag
+        return np.asarray(np.einsum("ck,kc->k", slope, v.reshape(self.n_rows, -1)) / _COMPLEX_STEP)
 
     def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         """(dq/dt, 2 (d2q/dr dt) . v + d2q/dt2) at fixed target, for coordinates that move by themselves."""
@@ -179,9 +256,9 @@ class Constraint(ABC):
 
         0 where the row has no size of its own; the set then takes the size of the positions.
         """
-        if self.target is None or not self.holonomic:
-            return np.zeros(self.n_rows)
-        return np.abs(self.target_at(time))
+        if self.held is ANGLE:
+            return np.ones(self.n_rows)
+        return self.target_at(time) if self.positive and self.target is not None else np.zeros(self.n_rows)
 
     def target_at(self, time: float) -> FloatArray:
         """What each row is held at, shape (n_rows,)."""
@@ -190,11 +267,11 @@ class Constraint(ABC):
         if not isinstance(self.target, MovingTarget):
             return self.target
         target = self.target.at(time, self.n_rows)
-        if self.squared and not (target > 0).all():
+        if self.positive and not (target > 0).all():
             k = int(np.argmin(target))
             raise InputError(
-                f"{self.row_name(k)}: target {target[k]:g} is not positive at t = {time:g}; give a function that stays "
-                "above zero, or end the run before",
+                f"{self.row_name(k)}: {self.positive} {target[k]:g} is not positive at t = {time:g}; give a function "
+                "that stays above zero, or end the run before",
                 item="target",
                 atoms=self.atoms[k].tolist(),
             )
@@ -221,6 +298,26 @@ class Constraint(ABC):
 
         `first_row` is the number of this object's first row in its set, for messages.
         """
+        with np.errstate(all="ignore"):
+            value, slope = self.value_and_gradient(r, time)
+            size = np.sqrt(np.einsum("kai,kai->k", slope, slope))
+        bad = ~(np.isfinite(value) & np.isfinite(size) & (size > 0))
+        self.refuse_singular(bad, first_row, lambda k, row: self.undefined(k, row, r[k], time))
+        if self.positive and self.target is not None:
+            length = self.target_at(time)
+            self.refuse_input(
+                ~(length > 0),
+                first_row,
+                lambda k: (
+                    f"{self.positive} {length[k]:g} is not positive; give a length greater than zero, or None to hold "
+                    "the present one"
+                ),
+                self.positive,
+            )
+
+    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
+        """What is said of row `k`, which is called `row` and has no gradient at `r`, shape (width, 3)."""
+        return self.singular.format(row=row, atoms=" and ".join(str(a) for a in self.atoms[k, :6]))
 
     def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
         """Raise where rows are undefined.
@@ -250,21 +347,6 @@ class Constraint(ABC):
             raise InputError(
                 f"row {first_row + k}, {self.row_name(k)}: {say(k)}", item=item, atoms=self.atoms[k].tolist()
             )
-
-    def refuse_nonpositive(self, time: float, first_row: int, what: str = "target") -> None:
-        """Raise `InputError` where a length held is not positive; `what` it is called by."""
-        if self.target is None:
-            return
-        length = self.target_at(time)
-        self.refuse_input(
-            ~(length > 0),
-            first_row,
-            lambda k: (
-                f"{what} {length[k]:g} is not positive; give a length greater than zero, or None to hold the present "
-                "one"
-            ),
-            what,
-        )
 
     def with_masses(self, masses: FloatArray) -> Constraint:
         """Copy that knows the masses of its atoms, shape (n_rows, width); most families need none."""
@@ -352,17 +434,20 @@ class Constraint(ABC):
             wrong = sorted(names.symmetric_difference(found)) or list(cls.functions)
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
         item = object.__new__(cls)
-        Constraint.__init__(item, data["atoms"], data["target"])
         for name in cls.shared:
             setattr(item, name, data[name])
-        item._keep(**{name: data[name] for name in cls.per_row})
-        item._settle()
+        Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
         item.units = data.get("units")
         return item
 
     def __repr__(self) -> str:
         what = self.row_name(0) if self.n_rows == 1 else f"{self.family}({self.n_rows} rows)"
         return f"<{what}>"
+
+
+@functools.cache
+def _compiled(row: Callable[[Any, Any, Any, Any], None]) -> Any:
+    return njit(cache=True, error_model="numpy")(row)
 
 
 def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:

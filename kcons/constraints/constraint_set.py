@@ -19,7 +19,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import find_images
 from kcons.constraints.periodic.in_cell import InCell, contiguous, joined, whole_bodies
-from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.target import FloatArray, MovingTarget, nearest_image
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError
 
@@ -269,10 +269,10 @@ class ConstraintSet(InCell):
         sigma, reach, rates, speeds, sizes = [], [], [], [], []
         for c in self.constraints:
             r = self._gather(c, x, y)
-            gradient = c.gradient(r, time)
+            value, gradient = c.value_and_gradient(r, time)
             size = np.sqrt(np.einsum("kai,kai->ka", gradient, gradient))
             sizes.append(size.sum(axis=1))
-            sigma.append(self._sigma(c, r, time))
+            sigma.append(nearest_image(value - c.target_at(time), c.period) if c.holonomic else np.zeros(c.n_rows))
             reach.append(np.sum(size * np.linalg.norm(x[c.atoms], axis=2), axis=1))
             if v is not None:
                 u = v[c.atoms]
@@ -373,7 +373,7 @@ def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> N
     start = 0
     held = np.zeros(len(x), dtype=bool)
     for item in given:
-        if item.family == "FixedAtoms":
+        if item.fixes_atoms:
             held[item.atoms[item.atoms < len(x)]] = True
     for item in given:
         atoms = item.atoms
@@ -456,7 +456,7 @@ def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]
     if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
         return same
     same = np.all(item.atoms == wanted.atoms[k], axis=1)
-    if wanted.family == "Distance":
+    if wanted.reversible:
         same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
     for data in item.per_row:
         ours, theirs = getattr(item, data), getattr(wanted, data)[k]

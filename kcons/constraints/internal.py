@@ -6,16 +6,19 @@ All depend on differences of positions alone, so minimum images apply in periodi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy import arctan2, sqrt
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANGLE, kept, numbers
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import cross, dot, norm
-from kcons.errors import InputError, SingularGeometryError
+from kcons.constraints.vectors import cross, norm
+from kcons.errors import InputError
+
+__all__ = ["Angle", "Dihedral", "Distance", "DistanceDifference"]
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
 COLLINEAR = 1e-7
@@ -33,10 +36,6 @@ class Distance(Constraint):
     target : float, array_like, callable of time, MovingTarget or None
         Length held, in the unit of the positions.
 
-    Notes
-    -----
-    With u = (r_0 - r_1)/q and w = v_0 - v_1: dq/dr_0 = u, v^T (d2q/dr2) v = (|w|^2 - (u.w)^2)/q.
-
     Examples
     --------
     >>> import numpy as np
@@ -45,11 +44,12 @@ class Distance(Constraint):
     array([5.])
     """
 
-    family = "Distance"
-    squared = True
+    positive = "target"
     row_width = 2
+    reversible = True
     translation_invariant = True
     kind = RowKind.DISTANCE
+    singular = "atoms {atoms} coincide: distance gradient undefined ({row}); move them apart"
 
     def __init__(self, pairs: ArrayLike, target: Target = None) -> None:
         super().__init__(pairs, target)
@@ -59,34 +59,13 @@ class Distance(Constraint):
         """The one pair of each row, shape (n_rows, 1, 2)."""
         return self.atoms[:, None]
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return norm(r[:, 0] - r[:, 1])
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        d = r[:, 0] - r[:, 1]
-        u = d / norm(d)[:, None]
-        return np.stack([u, -u], axis=1)
-
-    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        d = r[:, 0] - r[:, 1]
-        w = v[:, 0] - v[:, 1]
-        q = norm(d)
-        # |u x w|^2 has no cancellation, unlike |w|^2 - (u.w)^2.
-        across = cross(d / q[:, None], w)
-        return dot(across, across) / q
-
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        self.refuse_singular(
-            norm(r[:, 0] - r[:, 1]) == 0,
-            first_row,
-            lambda k, row: (
-                f"atoms {self.atoms[k, 0]} and {self.atoms[k, 1]} coincide: distance gradient undefined "
-                f"(row {first_row + k}); move them apart"
-            ),
-        )
-        self.refuse_nonpositive(time, first_row)
+    @staticmethod
+    def row(r: Any, p: Any, t: Any, out: Any) -> None:
+        x, y, z = r[0] - r[3], r[1] - r[4], r[2] - r[5]
+        q = sqrt(x * x + y * y + z * z)
+        x, y, z = x / q, y / q, z / q
+        out[0], out[1], out[2], out[3] = q, x, y, z
+        out[4], out[5], out[6] = -x, -y, -z
 
 
 class DistanceDifference(Constraint):
@@ -104,10 +83,6 @@ class DistanceDifference(Constraint):
     weights : array_like, shape (n_pairs,)
         Weight of each distance, for all rows; 1 and -1 unless given.
 
-    Notes
-    -----
-    With u = (r_i - r_j)/d of a pair and c = v_i - v_j: dq/dr_i = sum w u, v^T (d2q/dr2) v = sum w (|c|^2 - (u.c)^2)/d.
-
     Examples
     --------
     >>> import numpy as np
@@ -116,9 +91,7 @@ class DistanceDifference(Constraint):
     array([-0.5])
     """
 
-    family = "DistanceDifference"
     translation_invariant = True
-    kind = RowKind.FUNCTION
     shared = ("slots", "weights")
     #: Which atoms of a row are the pairs, and the weight of each pair.
     slots: tuple[tuple[int, int], ...]
@@ -146,7 +119,6 @@ class DistanceDifference(Constraint):
                 )
         self.slots, self.weights = found[0][1], tuple(np.atleast_1d(numbers(weights, "weights")).ravel().tolist())
         super().__init__([atoms for atoms, _ in found], target)
-        self._settle()
 
     def _settle(self) -> None:
         try:
@@ -170,6 +142,8 @@ class DistanceDifference(Constraint):
         if self.n_rows and {slot for pair in self.slots for slot in pair} != set(range(self.width)):
             raise InputError("DistanceDifference: slots and atoms do not belong together", item="slots")
         self.links = kept(np.array(_walk(self.slots)[1], dtype=np.int64))
+        self.alike = 2 + 3 * n
+        self.positive = "target" if min(self.weights) > 0 else ""
 
     @property
     def pairs(self) -> IntArray:
@@ -180,32 +154,22 @@ class DistanceDifference(Constraint):
         """Of each row its pairs with their weights, [i, j, w], as ASE's ``bondcombos`` has them."""
         return [[[*pair, w] for pair, w in zip(row, self.weights, strict=True)] for row in self.pairs.tolist()]
 
-    def _arms(self, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Vectors of the pairs, shape (n_rows, n_pairs, 3), and their lengths."""
-        i, j = np.array(self.slots).T
-        d = r[:, i] - r[:, j]
-        return d, norm(d)
-
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return np.asarray(self._arms(r)[1] @ np.array(self.weights))
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        d, q = self._arms(r)
-        u = d / q[..., None]
-        result = np.zeros_like(r)
-        for k, ((i, j), w) in enumerate(zip(self.slots, self.weights, strict=True)):
-            result[:, i] += w * u[:, k]
-            result[:, j] -= w * u[:, k]
-        return result
-
-    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        d, q = self._arms(r)
-        across = cross(d / q[..., None], self._arms(v)[0])
-        return np.asarray(dot(across, across) / q @ np.array(self.weights))
-
-    def scale(self, time: float = 0.0) -> FloatArray:
-        """0: what is held may be 0, and says nothing of the size of the lengths."""
-        return np.zeros(self.n_rows)
+    @staticmethod
+    def row(r: Any, p: Any, t: Any, out: Any) -> None:
+        # p holds the number of atoms, that of pairs, and of each pair i, j and w.
+        for k in range(3 * int(p[0])):
+            out[1 + k] = 0.0
+        q = 0.0
+        for n in range(int(p[1])):
+            i, j, w = 3 * int(p[2 + 3 * n]), 3 * int(p[3 + 3 * n]), p[4 + 3 * n]
+            x, y, z = r[i] - r[j], r[i + 1] - r[j + 1], r[i + 2] - r[j + 2]
+            d = sqrt(x * x + y * y + z * z)
+            q += w * d
+            f = w / d
+            x, y, z = f * x, f * y, f * z
+            out[1 + i], out[2 + i], out[3 + i] = out[1 + i] + x, out[2 + i] + y, out[3 + i] + z
+            out[1 + j], out[2 + j], out[3 + j] = out[1 + j] - x, out[2 + j] - y, out[3 + j] - z
+        out[0] = q
 
     def parameters(self) -> FloatArray:
         row = [float(self.width), float(len(self.slots))]
@@ -214,26 +178,20 @@ class DistanceDifference(Constraint):
         return np.tile(row, (self.n_rows, 1))
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        lengths = self._arms(r)[1]
-        for k, (i, j) in enumerate(self.slots):
-            self.refuse_singular(
-                lengths[:, k] == 0,
-                first_row,
-                lambda row, name, i=i, j=j: (  # type: ignore[misc]
-                    f"atoms {self.atoms[row, i]} and {self.atoms[row, j]} of {name}, coincide: gradient undefined; "
-                    "move them apart"
-                ),
-            )
-        slope = np.sqrt(np.sum(self.gradient(r, time) ** 2, axis=(1, 2)))
+        super().check(r, time, first_row)
+        slope = self.gradient(r, time)
         self.refuse_singular(
-            slope < COLLINEAR * np.abs(self.weights).max(),
+            np.sqrt(np.einsum("kai,kai->k", slope, slope)) < COLLINEAR * np.abs(self.weights).max(),
             first_row,
-            lambda k, name: f"the gradient of {name}, vanishes: its atoms lie on a line; bend them, or hold a distance",
+            lambda k, row: f"the gradient of {row}, vanishes: its atoms lie on a line; bend them, or hold a distance",
         )
-        if min(self.weights) > 0:
-            self.refuse_nonpositive(time, first_row)
+
+    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
+        for i, j in self.slots:
+            if not np.any(r[i] - r[j]):
+                i, j = self.atoms[k, i], self.atoms[k, j]
+                return f"atoms {i} and {j} of {row}, coincide: gradient undefined; move them apart"
+        return f"the gradient of {row}, vanishes; move its atoms"
 
 
 def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
@@ -267,8 +225,22 @@ def _in_one_list(pairs: list[list[int]]) -> tuple[list[int], tuple[tuple[int, in
     return atoms, tuple((place[i], place[j]) for i, j in pairs)
 
 
+def angle_between(ux: Any, uy: Any, uz: Any, wx: Any, wy: Any, wz: Any) -> tuple[Any, ...]:
+    """Angle between two arms u and w and its gradients by both: dq/du = u x (u x w) / (u^2 |u x w|)."""
+    cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+    c = sqrt(cx * cx + cy * cy + cz * cz)
+    fu = 1.0 / ((ux * ux + uy * uy + uz * uz) * c)
+    fw = 1.0 / ((wx * wx + wy * wy + wz * wz) * c)
+    ax, ay, az = uy * cz - uz * cy, uz * cx - ux * cz, ux * cy - uy * cx
+    bx, by, bz = cy * wz - cz * wy, cz * wx - cx * wz, cx * wy - cy * wx
+    value = arctan2(c.real, (ux * wx + uy * wy + uz * wz).real)
+    return value, fu * ax, fu * ay, fu * az, fw * bx, fw * by, fw * bz
+
+
 class Angle(Constraint):
     """Angle at the middle atom, q = atan2(|u x w|, u.w), u = r_0 - r_1, w = r_2 - r_1, in radian.
+
+    Its gradient stays of order one up to 180 degrees, where that of cos q vanishes (2.449 for unit arms).
 
     Parameters
     ----------
@@ -276,21 +248,10 @@ class Angle(Constraint):
         Atoms i, j, k of each row; j is the vertex.
     target : float, array_like, callable of time, MovingTarget or None
         Angle held, in radian, between 0 and pi, both excluded.
-
-    Notes
-    -----
-    With e, f the unit vectors along the arms, n = e x f/sin q, e' = e x n and f' = n x f:
-    dq/dr_0 = e'/|u|, dq/dr_2 = f'/|w|. These stay of order one up to 180 degrees, where the gradient of
-    cos q vanishes (2.449 for unit arms). The arms turn with the in-plane rates a = e'.u'/|u| and
-    b = f'.w'/|w|, and the out-of-plane rates alpha = n.u'/|u| and beta = n.w'/|w|, so that
-
-    v^T (d2q/dr2) v = -2 [a (e.u')/|u| + b (f.w')/|w|] + ((alpha^2 + beta^2) cos q - 2 alpha beta)/sin q,
-
-    where u' and w' are the velocities of the arms.
     """
 
-    family = "Angle"
     row_width = 3
+    reversible = True
     held = ANGLE
     translation_invariant = True
     kind = RowKind.ANGLE
@@ -298,36 +259,18 @@ class Angle(Constraint):
     def __init__(self, triples: ArrayLike, target: Target = None) -> None:
         super().__init__(triples, target)
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
-        return np.arctan2(norm(cross(u, w)), dot(u, w))
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        u, w, normal, _ = _arms(r)
-        first = cross(u, normal) / dot(u, u)[:, None]
-        last = cross(normal, w) / dot(w, w)[:, None]
-        return np.stack([first, -first - last, last], axis=1)
-
-    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        u, w, n, sine = _arms(r)
-        uu, ww = dot(u, u), dot(w, w)
-        lu, lw = np.sqrt(uu), np.sqrt(ww)
-        du, dw = v[:, 0] - v[:, 1], v[:, 2] - v[:, 1]
-        a, b = dot(cross(u, n), du) / uu, dot(cross(n, w), dw) / ww
-        alpha, beta = dot(n, du) / lu, dot(n, dw) / lw
-        cosine = dot(u, w) / (lu * lw)
-        in_plane = -2 * (a * dot(u, du) / uu + b * dot(w, dw) / ww)
-        return in_plane + ((alpha**2 + beta**2) * cosine - 2 * alpha * beta) / sine
-
-    def scale(self, time: float = 0.0) -> FloatArray:
-        return np.ones(self.n_rows)
+    @staticmethod
+    def row(r: Any, p: Any, t: Any, out: Any) -> None:
+        out[0], ax, ay, az, bx, by, bz = angle_between(
+            r[0] - r[3], r[1] - r[4], r[2] - r[5], r[6] - r[3], r[7] - r[4], r[8] - r[5]
+        )
+        out[1], out[2], out[3] = ax, ay, az
+        out[4], out[5], out[6] = -ax - bx, -ay - by, -az - bz
+        out[7], out[8], out[9] = bx, by, bz
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
         _refuse_coincident(self, r, first_row)
-        angle = self.measure(r, time)
-        self._refuse_straight(angle, "is", first_row)
+        self._refuse_straight(self.measure(r, time), "is", first_row)
         if self.target is None:
             return
         target = self.target_at(time)
@@ -342,12 +285,11 @@ class Angle(Constraint):
     def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:
         def said(k: int, row: str) -> str:
             degrees = 180 if angle[k] > 1 else 0
-            remedy = (
-                "use a linear constraint (LinearRelation with the end atoms as bases)"
-                if degrees == 180
-                else "use a linear constraint, or distances"
+            remedy = " (LinearRelation with the end atoms as bases)" if degrees else ", or distances"
+            return (
+                f"angle constraint singular at {degrees} deg, use a linear constraint{remedy}: {row}, {verb} "
+                f"{np.degrees(angle[k]):.9g} deg"
             )
-            return f"angle constraint singular at {degrees} deg, {remedy}: {row}, {verb} {np.degrees(angle[k]):.9g} deg"
 
         self.refuse_singular(np.sin(angle) < COLLINEAR, first_row, said)
 
@@ -362,67 +304,43 @@ class Dihedral(Constraint):
     target : float, array_like, callable of time, MovingTarget or None
         Angle held, in radian; the nearest image modulo 2 pi counts. A number beyond three turns is refused.
 
-    Notes
-    -----
-    With F = r_0 - r_1, G = r_1 - r_2, H = r_3 - r_2, P = F x G, Q = H x G, p = P/|P|^2, s = Q/|Q|^2,
-    g = |G|, along any motion
-
-    dq/dt = -g p.F' + (F.G/g) p.G' - (H.G/g) s.G' + g s.H',
-
-    which gives the gradient, and, differentiated once more at constant velocities, the curvature.
-
     References
     ----------
     A. Blondel and M. Karplus, J. Comput. Chem. 17, 1132 (1996), eq. 27.
     """
 
-    family = "Dihedral"
     row_width = 4
+    reversible = True
     held = ANGLE
     translation_invariant = True
     period = 2 * np.pi
-    kind = RowKind.FUNCTION
 
     def __init__(self, quads: ArrayLike, target: Target = None) -> None:
         super().__init__(quads, target)
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        F, G, H = _legs(r)
-        P, Q = cross(F, G), cross(H, G)
-        return np.arctan2(dot(cross(Q, P), G) / norm(G), dot(P, Q))
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        F, G, H = _legs(r)
-        P, Q = cross(F, G), cross(H, G)
-        g = norm(G)
-        p, s = P / dot(P, P)[:, None], Q / dot(Q, Q)[:, None]
-        along_f = -g[:, None] * p
-        along_g = (dot(F, G) / g)[:, None] * p - (dot(H, G) / g)[:, None] * s
-        along_h = g[:, None] * s
-        return np.stack([along_f, along_g - along_f, -along_g - along_h, along_h], axis=1)
-
-    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        F, G, H = _legs(r)
-        dF, dG, dH = _legs(v)
-        P, Q = cross(F, G), cross(H, G)
-        dP, dQ = cross(dF, G) + cross(F, dG), cross(dH, G) + cross(H, dG)
-        g = norm(G)
-        dg = dot(G, dG) / g
-        p, dp = _over_square(P, dP)
-        s, ds = _over_square(Q, dQ)
-        f, h = dot(F, G) / g, dot(H, G) / g
-        df = (dot(dF, G) + dot(F, dG) - f * dg) / g
-        dh = (dot(dH, G) + dot(H, dG) - h * dg) / g
-        first = -dg * dot(p, dF) - g * dot(dp, dF) + df * dot(p, dG) + f * dot(dp, dG)
-        last = dg * dot(s, dH) + g * dot(ds, dH) - dh * dot(s, dG) - h * dot(ds, dG)
-        return first + last
-
-    def scale(self, time: float = 0.0) -> FloatArray:
-        return np.ones(self.n_rows)
+    @staticmethod
+    def row(r: Any, p: Any, t: Any, out: Any) -> None:
+        # f = i - j, g = j - k, h = l - k; a = f x g, b = h x g.
+        fx, fy, fz = r[0] - r[3], r[1] - r[4], r[2] - r[5]
+        gx, gy, gz = r[3] - r[6], r[4] - r[7], r[5] - r[8]
+        hx, hy, hz = r[9] - r[6], r[10] - r[7], r[11] - r[8]
+        ax, ay, az = fy * gz - fz * gy, fz * gx - fx * gz, fx * gy - fy * gx
+        bx, by, bz = hy * gz - hz * gy, hz * gx - hx * gz, hx * gy - hy * gx
+        size = sqrt(gx * gx + gy * gy + gz * gz)
+        a2 = ax * ax + ay * ay + az * az
+        b2 = bx * bx + by * by + bz * bz
+        sx, sy, sz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+        out[0] = arctan2(((sx * gx + sy * gy + sz * gz) / size).real, (ax * bx + ay * by + az * bz).real)
+        ga, gb = size / a2, size / b2
+        fa = (fx * gx + fy * gy + fz * gz) / (a2 * size)
+        hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)
+        tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
+        out[1], out[2], out[3] = -ga * ax, -ga * ay, -ga * az
+        out[4], out[5], out[6] = tx + ga * ax, ty + ga * ay, tz + ga * az
+        out[7], out[8], out[9] = -tx - gb * bx, -ty - gb * by, -tz - gb * bz
+        out[10], out[11], out[12] = gb * bx, gb * by, gb * bz
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
         _refuse_coincident(self, r, first_row)
         if self.target is not None and not self.moving:
             target = self.target_at(time)
@@ -432,48 +350,26 @@ class Dihedral(Constraint):
                 lambda k: f"target {target[k]:g} is over three turns, and in radian; give np.radians({target[k]:g})",
                 "target",
             )
-        F, G, H = _legs(r)
-        for first, second, three in ((F, G, slice(0, 3)), (H, G, slice(1, 4))):
-            straight = norm(cross(first, second)) < COLLINEAR * norm(first) * norm(second)
-            self.refuse_singular(straight, first_row, partial(_collinear, self.atoms[:, three]))
-
-
-def _collinear(trios: IntArray, k: int, row: str) -> str:
-    i, j, m = trios[k]
-    return (
-        f"dihedral constraint singular: atoms {i}, {j}, {m} of {row}, are collinear; bend them, or hold a dihedral of "
-        "other atoms"
-    )
-
-
-def _arms(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Arms of an angle, unit normal of their plane, and the sine of the angle."""
-    u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
-    normal = cross(u, w)
-    area = norm(normal)
-    return u, w, normal / area[:, None], area / (norm(u) * norm(w))
-
-
-def _legs(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return r[:, 0] - r[:, 1], r[:, 1] - r[:, 2], r[:, 3] - r[:, 2]
-
-
-def _over_square(a: FloatArray, da: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """a/|a|^2 and its derivative."""
-    square = dot(a, a)[:, None]
-    b = a / square
-    return b, da / square - 2 * (dot(a, da)[:, None] / square) * b
+        for first in (0, 1):
+            one, other = r[:, first] - r[:, first + 1], r[:, first + 2] - r[:, first + 1]
+            self.refuse_singular(
+                norm(cross(one, other)) < COLLINEAR * norm(one) * norm(other),
+                first_row,
+                lambda k, row, first=first: (  # type: ignore[misc]
+                    f"dihedral constraint singular: atoms {', '.join(map(str, self.atoms[k, first : first + 3]))} of "
+                    f"{row}, are collinear; bend them, or hold a dihedral of other atoms"
+                ),
+            )
 
 
 def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int) -> None:
-    """Neighbouring atoms of a row at one point leave an angle undefined."""
-    same = norm(np.diff(r, axis=1)) == 0
-    if same.any():
-        k, slot = (int(i) for i in np.argwhere(same)[0])
-        i, j = item.atoms[k, slot : slot + 2]
-        raise SingularGeometryError(
-            f"atoms {i} and {j} coincide: gradient of row {first_row + k}, {item.row_name(k)}, undefined; "
-            "move them apart",
-            rows=[first_row + k],
-            atoms=[i, j],
+    """Neighboring atoms of a row at one point leave an angle undefined."""
+    for slot in range(item.width - 1):
+        item.refuse_singular(
+            norm(r[:, slot] - r[:, slot + 1]) == 0,
+            first_row,
+            lambda k, row, slot=slot: (  # type: ignore[misc]
+                f"atoms {item.atoms[k, slot]} and {item.atoms[k, slot + 1]} coincide: gradient of {row}, undefined; "
+                "move them apart"
+            ),
         )

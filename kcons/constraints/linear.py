@@ -8,14 +8,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import atom_array, numbers
+from kcons.constraints.arguments import FloatArray, atom_array, atom_column, numbers
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.target import FloatArray, MovingTarget, Target
+from kcons.constraints.target import MovingTarget, Target
 from kcons.errors import InputError
 
+__all__ = ["FixedAtoms", "LinearCombination", "LinearRelation"]
 
-class LinearRows(Constraint):
-    """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3).
+
+class LinearRows(Constraint, base=True):
+    """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3), which are their parameters.
 
     They have no curvature. Minimum images apply if a common shift of all atoms leaves every row of the
     object unchanged (coefficients that sum to zero); otherwise the positions are taken as they are.
@@ -23,6 +25,7 @@ class LinearRows(Constraint):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
     kind = RowKind.LINEAR
+    held_in_place = True
     coefficients: FloatArray
 
     def _settle(self) -> None:
@@ -30,18 +33,18 @@ class LinearRows(Constraint):
         self.translation_invariant = bool(
             self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
         )
+        self.refuse_input(
+            ~np.any(c, axis=(1, 2)),
+            0,
+            lambda k: f"all coefficients of row {k} are zero; remove the row",
+            "coefficients",
+        )
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return np.asarray(np.einsum("kai,kai->k", self.coefficients, r))
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        return self.coefficients
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        slope = self.parameters().reshape(r.shape)
+        return np.asarray(np.einsum("kai,kai->k", slope, r)), slope
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        return np.zeros(self.n_rows)
-
-    def scale(self, time: float = 0.0) -> FloatArray:
-        # A coordinate may be zero by accident of the origin: the set takes the size of the positions.
         return np.zeros(self.n_rows)
 
     def parameters(self) -> FloatArray:
@@ -60,11 +63,6 @@ class LinearCombination(LinearRows):
     target : float, array_like, callable of time, MovingTarget or None
         Value held.
 
-    Raises
-    ------
-    InputError
-        Wrong shapes, coefficients that are not finite, or a row whose coefficients are all zero.
-
     Examples
     --------
     Two atoms kept at the same height:
@@ -74,23 +72,8 @@ class LinearCombination(LinearRows):
     1
     """
 
-    family = "LinearCombination"
-
     def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = None) -> None:
-        super().__init__(atoms, target)
-        self._keep(coefficients=coefficients)
-        self._settle()
-
-    def _settle(self) -> None:
-        super()._settle()
-        empty = ~np.any(self.coefficients, axis=(1, 2))
-        if empty.any():
-            row = int(np.argmax(empty))
-            raise InputError(
-                f"{self.row_name(row)}: all coefficients of row {row} are zero; remove the row",
-                item="coefficients",
-                atoms=self.atoms[row],
-            )
+        super().__init__(atoms, target, coefficients=coefficients)
 
 
 class LinearRelation(LinearRows):
@@ -119,10 +102,8 @@ class LinearRelation(LinearRows):
     (3, True)
     """
 
-    family = "LinearRelation"
-
     def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
-        dependent = atom_array(atoms, self.family).reshape(-1, 1)
+        dependent = atom_column(atoms, self.family)
         base = np.atleast_2d(atom_array(bases, self.family))
         try:
             base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
@@ -137,16 +118,18 @@ class LinearRelation(LinearRows):
             ) from None
         if not np.issubdtype(np.result_type(dependent, base), np.integer) and dependent.size:
             raise InputError("LinearRelation: atom indices must be integers", item="atoms")
-        super().__init__(np.repeat(np.hstack([dependent, base]).astype(np.int64), 3, axis=0), target)
         factors = np.hstack([np.ones((len(w), 1)), -w])
-        self._keep(coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, self.width, 3))
-        self._settle()
+        super().__init__(
+            np.repeat(np.hstack([dependent, base]).astype(np.int64), 3, axis=0),
+            target,
+            coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3),
+        )
 
 
 class FixedAtoms(LinearRows):
     """Atoms held at given points: three rows (x, y, z) an atom, in the order of `atoms`.
 
-    The engine gives them infinite mass; their multipliers are the reaction forces.
+    The engine gives them infinite mass; their multipliers are the reaction forces. Each may be named once.
 
     Parameters
     ----------
@@ -155,24 +138,20 @@ class FixedAtoms(LinearRows):
     target : array_like of shape (n, 3), callable of time returning (n, 3), MovingTarget, or None
         Where they are held; None takes the initial positions.
 
-    Raises
-    ------
-    InputError
-        If an atom is named twice.
     """
 
-    family = "FixedAtoms"
     row_width = 1
+    fixes_atoms = True
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
-        column = atom_array(atoms, self.family).reshape(-1, 1)
+        column = atom_column(atoms, self.family)
         if not callable(target) and not isinstance(target, MovingTarget | None):
             place = numbers(target, "target")
             target = np.tile(place, len(column)) if place.shape == (3,) else place
-        super().__init__(np.repeat(column, 3, axis=0), target)
+        super().__init__(
+            np.repeat(column, 3, axis=0), target, coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :]
+        )
         values, counts = np.unique(column, return_counts=True)
         if np.any(counts > 1):
             atom = int(values[np.argmax(counts > 1)])
             raise InputError(f"FixedAtoms names atom {atom} twice; name it once", item="atoms", atoms=[atom])
-        self._keep(coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :])
-        self._settle()

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.arguments import HELD, check_call, has_units, kept, numbers, out_of_range, positive
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import check_call, has_units, kept, numbers, out_of_range, positive
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -102,7 +102,7 @@ class MovingTarget:
         return True
 
 
-Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
+Target: TypeAlias = Annotated[float | ArrayLike | MovingTarget | TimeFunction | None, HELD]
 
 
 def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from kcons.constraints.arguments import numbers
-from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.constraints.arguments import FloatArray
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -38,20 +36,3 @@ def extent(x: FloatArray) -> float:
 def first_true(bad: NDArray[np.bool_]) -> int | None:
     """First True entry, or None."""
     return int(np.argmax(bad)) if bad.any() else None
-
-
-def unit(vectors: ArrayLike, name: str) -> FloatArray:
-    """Vectors of length 1 along the given ones, shape (..., 3).
-
-    Raises
-    ------
-    InputError
-        If the last axis is not 3, or a vector is zero or not finite.
-    """
-    array = numbers(vectors, name)
-    if array.ndim == 0 or array.shape[-1] != 3:
-        raise InputError(f"{name} must be vectors of three numbers; its shape is {array.shape}", item=name)
-    length = norm(array)
-    if not np.all(np.isfinite(length) & (length > 0)):
-        raise InputError(f"{name} has a vector that is zero or not finite; give a direction", item=name)
-    return array / length[..., None]

@@ -2,11 +2,10 @@
 
 - `torsion_force`: torsions turned as rigid groups
 - `held_coordinates`, `series`: multipliers and Z by name, and samples of them
-- `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
-- `windows`: many windows, by any executor
+- `windows`: recording in ASE and OpenMM, and many windows, by any executor
 - `scans`: relaxed scans
 """
 
@@ -20,11 +19,9 @@ _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
     "series": ("Recorder", "Series"),
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force", "thermal_multipliers"),
-    "ase_recorder": ("AseRecorder",),
-    "openmm_reporter": ("HeldCoordinatesReporter",),
     "windows.window": ("Settings", "Window"),
-    "windows.ase_windows": ("AseWindows",),
-    "windows.openmm_windows": ("OpenMMWindows",),
+    "windows.ase_windows": ("AseRecorder", "AseWindows"),
+    "windows.openmm_windows": ("HeldCoordinatesReporter", "OpenMMWindows"),
     "windows.free_energy": ("FreeEnergy", "WindowResult"),
     "windows.driver": ("Windows",),
     "windows.input_file": ("InputFile", "read_input"),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg.lapack import dtrtri
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -27,6 +27,8 @@ _PIVOT, _NONE = 1e-4, 1e-12
 _LOST = 1e-12
 #: Rows of the clusters, and atoms of a row, up to which the mean over velocities is computed.
 _MOST_ROWS, _MOST_ATOMS = 60, 12
+#: Configurations that are looked at together, and what is given of each.
+AT_ONCE, _ITEMS = 32, ("positions", "velocities", "forces")
 
 
 class Sample(NamedTuple):
@@ -173,10 +175,18 @@ class HeldCoordinates:
         widest = max(item.width for item in self._rows.constraints)
         self._averages = len(everything) <= _MOST_ROWS and widest <= _MOST_ATOMS and not self._rows.moving
         self._copies: dict[tuple[int, int], Constraint] = {}
+        #: Objects with coordinates among their rows, and all rows of these.
+        own = np.searchsorted(self._rows.starts, self._order[-len(self) :], side="right") - 1
+        self._own = {k: slice(*self._rows.starts[k : k + 2]) for k in set(own.tolist())}
+        # Where each number of the gradients stands in the dense ones, whose rows are in the order of results.
+        line, width = np.argsort(self._order), 3 * len(self.atoms)
+        every = zip(self._rows.starts, self._rows.constraints, strict=False)
+        first = [line[start + np.arange(c.n_rows), None, None] * width + 3 * c.atoms[:, :, None] for start, c in every]
+        self._places = np.concatenate([(place + np.arange(3)).ravel() for place in first])
         here = x[self.atoms]
         near = 1e-3 * np.random.default_rng(1).normal(size=here.shape) * np.ptp(here, axis=0).max()
-        for place in (here, here + near):  # beside a structure so symmetric that a gradient vanishes
-            self._at(place, time)
+        # Beside a structure so symmetric that a gradient vanishes, too.
+        self._at(self._gathered(np.stack([here, here + near])), time)
         self._turns: list[RigidTurn | None] = [None] * len(self)
         if bonds is not None:
             pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
@@ -211,34 +221,54 @@ class HeldCoordinates:
         SingularGeometryError
             A coordinate has come to depend on the other constraints.
         """
-        shape, d = (self._source.n_atoms, 3), len(self)
-        named = ((x, "positions"), (v, "velocities"), (f, "forces"))
-        whole = [as_array(array, shape, item) for array, item in named]
-        for array, (_, item) in zip(whole, named, strict=True):
-            finite = np.isfinite(array[self.atoms]).all(axis=1)
-            if not finite.all():
-                atom = int(self.atoms[np.argmin(finite)])
-                raise NonFiniteError(f"{item} of atom {atom} are not finite at time {time:g}", item=item, atom=atom)
-        here, speed, force = (array[self.atoms] for array in whole)
-        metric = self._at(here, time)
-        along = metric.directions
-        pairs = [along[s] + sign * along[j] for s in range(d) for j in range(s) for sign in (1, -1)]
-        fields = [speed.ravel(), *along, *pairs, *(metric.fields if self._averages else ())]
-        bent, traces = self._curvatures(here, np.array(fields), time)
-        rows, order, respond = self._rows, self._order, metric.respond
-        if rows.moving:
-            rest, driven = (rows.acceleration_target(here, u, time)[order] for u in (np.zeros_like(here), speed))
-        else:
-            rest, driven = np.zeros(len(order)), -bent[0]
-        still, moving = (respond @ b - along @ force.ravel() for b in (rest, driven))
-        mean = np.full(d, np.nan)
+        shape = (self._source.n_atoms, 3)
+        whole = np.stack([as_array(array, shape, item) for array, item in zip((x, v, f), _ITEMS, strict=True)])
+        return self._samples(whole[:, None], [time])[0]
+
+    def samples(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, times: Sequence[float]) -> list[Sample]:
+        """As `sample`, of n configurations in one cell, shape (n, n_atoms, 3): each costs a tenth of one alone."""
+        whole = np.array([x, v, f], dtype=np.float64)
+        at_once = 1 if self._rows.moving else AT_ONCE
+        parts = [slice(k, k + at_once) for k in range(0, len(times), at_once)]
+        return [each for part in parts for each in self._samples(whole[:, part], times[part])]
+
+    def _samples(self, whole: FloatArray, times: Sequence[float]) -> list[Sample]:
+        """Of positions, velocities and forces, shape (3, n, n_atoms, 3)."""
+        n, d, rows, order, time = len(times), len(self), self._rows, self._order, times[0]
+        here, speed, force = packed = whole[:, :, self.atoms]
+        if not np.isfinite(packed).all():
+            which, k, first = np.argwhere(~np.isfinite(packed).all(axis=3))[0].tolist()
+            item, atom = _ITEMS[which], int(self.atoms[first])
+            raise NonFiniteError(f"{item} of atom {atom} are not finite at time {times[k]:g}", item=item, atom=atom)
+        gathered = self._gathered(here)
+        metric = self._at(gathered, time)
+        along, respond = metric.directions, metric.respond
+        pairs = [along[:, s] + sign * along[:, j] for s in range(d) for j in range(s) for sign in (1, -1)]
+        fields = np.stack([speed.reshape(n, -1), *along.swapaxes(0, 1), *pairs], axis=1)
         if self._averages:
-            mean = respond @ (bent[1 + d * d :].sum(axis=0) - traces)
-        value = rows.measure(here, time)[order][-d:]
-        off = float(np.abs(nearest_image(value - rows.target(time)[order][-d:], self.periods)).max())
-        turned = np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns])
-        gradient = self._change_of_z(bent[1 : 1 + d * d] @ metric.shares.T)
-        return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, off, turned, mean)
+            fields = np.concatenate([fields, metric.fields], axis=1)
+        bent, traces = self._curvatures(gathered, fields, time)
+        rest, driven = np.zeros((n, len(order))), -bent[:, 0]
+        if rows.moving:
+            rest, driven = (rows.acceleration_target(here[0], u, time)[None, order] for u in (0 * speed[0], speed[0]))
+        pull = along @ force.reshape(n, -1, 1)
+        still, moving = ((respond @ b[:, :, None] - pull)[:, :, 0] for b in (rest, driven))
+        mean = np.full((n, d), np.nan)
+        if self._averages:
+            mean = (respond @ (bent[:, 1 + d * d :].sum(axis=1) - traces)[:, :, None])[:, :, 0]
+        values = np.zeros((n, rows.n_rows))
+        for k, mine in self._own.items():
+            r = gathered[k]
+            values[:, mine] = self._copied(k, n).measure(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1)
+        value = values[:, order[-d:]]
+        off = np.abs(nearest_image(value - rows.target(time)[order[-d:]], self.periods)).max(axis=1)
+        turned = np.full((n, d), np.nan)
+        for k, turn in enumerate(self._turns):
+            if turn is not None:
+                turned[:, k] = turn.force(whole[0], whole[2])
+        gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ metric.shares.swapaxes(1, 2))
+        columns = (value, moving, moving - still, metric.log_det_z.tolist(), gradient, off.tolist(), turned, mean)
+        return [Sample(*each) for each in zip(times, *columns, strict=True)]
 
     def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Displacements that change one coordinate by one, and no other nor any constraint, shape (d, n_atoms, 3).
@@ -248,32 +278,51 @@ class HeldCoordinates:
         """
         here = as_array(x, (self._source.n_atoms, 3), "positions")
         result = np.zeros((len(self), *here.shape))
-        result[:, self.atoms] = self._at(here[self.atoms], time).directions.reshape(len(self), -1, 3)
+        metric = self._at(self._gathered(here[None, self.atoms]), time)
+        result[:, self.atoms] = metric.directions[0].reshape(len(self), -1, 3)
         return result
 
     # -- pieces, on the atoms of the clusters ---------------------------------------------------
 
-    def _at(self, x: FloatArray, time: float) -> _Metric:
-        """Z and all that follows from the gradients at `x`; raises where a coordinate depends on other constraints."""
-        d = len(self)
+    def _copied(self, k: int, copies: int) -> Constraint:
+        """The rows of the k-th constraint object, so many times."""
+        item = self._rows.constraints[k]
+        if copies > 1 and (k, copies) not in self._copies:
+            self._copies[k, copies] = item.select(np.tile(np.arange(item.n_rows), copies))
+        return item if copies == 1 else self._copies[k, copies]
+
+    def _gathered(self, x: FloatArray) -> list[FloatArray]:
+        """Positions of each object's rows in n configurations, shape (n, n_rows, width, 3)."""
         self._rows.lattice = self._source.lattice
-        gradients = _gradients(self._rows, x, time)[self._order]
+        return [np.stack([self._rows.gather(item, y) for y in x]) for item in self._rows.constraints]
+
+    def _at(self, gathered: Sequence[FloatArray], time: float) -> _Metric:
+        """Z and all that follows from the gradients; raises where a coordinate depends on other constraints."""
+        d, n, shape = len(self), len(gathered[0]), (len(self._order), 3 * len(self.atoms))
+        slopes = [
+            self._copied(k, n).gradient(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1)
+            for k, r in enumerate(gathered)
+        ]
+        size = shape[0] * shape[1]
+        places = self._places + size * np.arange(n)[:, None]
+        gradients = np.bincount(places.ravel(), np.concatenate(slopes, axis=1).ravel(), n * size).reshape(n, *shape)
         weighed = gradients * self._inverse_masses
-        product = weighed @ gradients.T
+        product = weighed @ gradients.swapaxes(1, 2)
         if not np.isfinite(product).all():
             raise NonFiniteError(f"the gradient of {', '.join(self.names)} is not finite", item="positions")
-        size = np.sqrt(np.diagonal(product))
-        size = np.where(size > 0, size, 1.0)
-        root, lost = _root(product / np.outer(size, size))
-        self._refuse(np.flatnonzero(lost[-d:] > _LOST).tolist())
-        root /= size
-        respond = root[:, -d:].T @ root  # of (A M^-1 A^T)^-1, of which Z^-1 is the last block
-        z = np.linalg.inv(respond[:, -d:])
-        share = z / np.outer(size[-d:], size[-d:])
-        left, mixture = np.linalg.eigh(share)
-        if left[0] < DEPENDENT:
-            self._refuse([k for k in range(d) if abs(mixture[k, 0]) > 0.1])
-        log_det_z = float(np.log(left).sum() + 2 * np.log(size[-d:]).sum())
+        sizes = np.sqrt(np.diagonal(product, axis1=1, axis2=2))
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        root, lost = _root(product / (sizes[:, :, None] * sizes[:, None]))
+        self._refuse(np.flatnonzero((lost[:, -d:] > _LOST).any(axis=0)).tolist())
+        root = root / sizes[:, None]
+        respond = root[:, :, -d:].swapaxes(1, 2) @ root  # of (A M^-1 A^T)^-1, of which Z^-1 is the last block
+        z = np.linalg.inv(respond[:, :, -d:])
+        own = sizes[:, -d:]
+        left, mixture = np.linalg.eigh(z / (own[:, :, None] * own[:, None]))
+        worst = int(np.argmin(left[:, 0]))
+        if left[worst, 0] < DEPENDENT:
+            self._refuse(np.flatnonzero(np.abs(mixture[worst, :, 0]) > 0.1).tolist())
+        log_det_z = np.log(left).sum(axis=1) + 2 * np.log(own).sum(axis=1)
         return _Metric(log_det_z, respond, z @ respond, respond @ weighed, root @ weighed)
 
     def _refuse(self, dependent: list[int]) -> None:
@@ -287,42 +336,44 @@ class HeldCoordinates:
                 atoms=np.unique(np.concatenate(atoms)),
             )
 
-    def _curvatures(self, x: FloatArray, u: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        """u^T q'' u of all rows for k fields u, shape (k, rows), and the trace of M^-1 q'' of each row, or zeros."""
-        fields, bent, traces = u.reshape(len(u), -1, 3), [], []
-        for k, item in enumerate(self._rows.constraints):
-            w = item.width
-            unit = np.repeat(np.eye(3 * w).reshape(-1, 1, w, 3), item.n_rows, axis=1)
-            v = np.concatenate([fields[:, item.atoms], unit]) if self._averages else fields[:, item.atoms]
-            if (k, len(v)) not in self._copies:  # the rows once more for each field
-                self._copies[k, len(v)] = item.select(np.tile(np.arange(item.n_rows), len(v)))
-            r = np.tile(self._rows.gather(item, x), (len(v), 1, 1))
-            found = self._copies[k, len(v)].curvature(r, v.reshape(r.shape), time).reshape(len(v), -1)
-            bent.append(found[: len(u)])
-            each = found[len(u) :].reshape(-1, 3, item.n_rows).sum(axis=1)
-            traces.append((each * self._inverse_masses[::3][item.atoms].T[: len(each)]).sum(axis=0))
-        return np.concatenate(bent, axis=1)[:, self._order], np.concatenate(traces)[self._order]
+    def _curvatures(self, gathered: Sequence[FloatArray], u: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        """u^T q'' u of all rows for k fields u, shape (n, k, rows); the trace of M^-1 q'' of each row, or zeros."""
+        n, k = u.shape[:2]
+        fields, bent, traces = u.reshape(n, k, -1, 3), [], []
+        for number, (item, r) in enumerate(zip(self._rows.constraints, gathered, strict=True)):
+            v, w = fields[:, :, item.atoms], item.width
+            if self._averages:
+                unit = np.eye(3 * w).reshape(-1, 1, w, 3)
+                v = np.concatenate([v, np.broadcast_to(unit, (n, 3 * w, item.n_rows, w, 3))], axis=1)
+            count = v.shape[1]
+            r = np.broadcast_to(r[:, None], v.shape).reshape(-1, w, 3)
+            found = self._copied(number, n * count).curvature(r, v.reshape(r.shape), time).reshape(n, count, -1)
+            bent.append(found[:, :k])
+            each = found[:, k:].reshape(n, -1, 3, item.n_rows).sum(axis=2)
+            traces.append((each * self._inverse_masses[::3][item.atoms].T[: each.shape[1]]).sum(axis=1))
+        return np.concatenate(bent, axis=2)[:, :, self._order], np.concatenate(traces, axis=1)[:, self._order]
 
     def _change_of_z(self, bent: FloatArray) -> FloatArray:
-        """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarized."""
+        """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarized; shape (n, d)."""
         d = len(self)
-        result, pairs = np.diagonal(bent).copy(), iter(bent[d:])
+        result, pairs = np.diagonal(bent[:, :d], axis1=1, axis2=2).copy(), iter(np.moveaxis(bent[:, d:], 1, 0))
         for s in range(d):
             for j in range(s):
                 mixed = (next(pairs) - next(pairs)) / 4
-                result[s] += mixed[j]
-                result[j] += mixed[s]
+                result[:, s] += mixed[:, j]
+                result[:, j] += mixed[:, s]
         return result
 
 
 class _Metric(NamedTuple):
-    """At one configuration, for d coordinates among r rows on n atoms.
+    """At n configurations, for d coordinates among r rows on a atoms.
 
-    `respond` (d, r), rows of (A M^-1 A^T)^-1; `shares` (d, r), of each row in a coordinate's gradient that the other
-    rows have answered; `directions` (d, 3 n); `fields` (r, 3 n), whose squares are what the rows take from M^-1.
+    `respond` (n, d, r), rows of (A M^-1 A^T)^-1; `shares` (n, d, r), of each row in a coordinate's gradient that the
+    other rows have answered; `directions` (n, d, 3 a); `fields` (n, r, 3 a), whose squares are what the rows take from
+    M^-1.
     """
 
-    log_det_z: float
+    log_det_z: FloatArray
     respond: FloatArray
     shares: FloatArray
     directions: FloatArray
@@ -330,25 +381,15 @@ class _Metric(NamedTuple):
 
 
 def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """W with W^T W the (pseudo)inverse of a matrix with a diagonal of 1; how much of each row depends on others."""
-    try:
+    """W with W^T W the (pseudo)inverse of matrices with a diagonal of 1; how much of each row depends on others."""
+    with suppress(np.linalg.LinAlgError):
         root = np.linalg.cholesky(product)
-        if np.diagonal(root).min() > _PIVOT:
-            return np.array(dtrtri(root, lower=1)[0]), np.zeros(len(product))
-    except np.linalg.LinAlgError:
-        pass
+        if np.diagonal(root, axis1=1, axis2=2).min() > _PIVOT:
+            return np.linalg.inv(root), np.zeros(product.shape[:2])
     sizes, axes = np.linalg.eigh(product)
-    known = sizes > _NONE * sizes[-1]
-    return (axes[:, known] / np.sqrt(sizes[known])).T, (axes[:, ~known] ** 2).sum(axis=1)
-
-
-def _gradients(held: ConstraintSet, x: FloatArray, time: float) -> FloatArray:
-    """The rows' gradients, shape (n_rows, 3 n_atoms)."""
-    result = np.zeros((held.n_rows, *x.shape))
-    for start, item in zip(held.starts, held.constraints, strict=False):
-        rows = start + np.arange(item.n_rows)[:, None]
-        np.add.at(result, (rows, item.atoms), item.gradient(held.gather(item, x), time))
-    return result.reshape(held.n_rows, -1)
+    known = sizes > _NONE * sizes[:, -1:]
+    inverse = np.where(known, 1 / np.sqrt(np.where(known, sizes, 1.0)), 0.0)
+    return (axes * inverse[:, None]).swapaxes(1, 2), (axes**2 * ~known[:, None]).sum(axis=2)
 
 
 def _row(held: ConstraintSet, row: int) -> Constraint:

@@ -1,4 +1,4 @@
-"""Samples of held coordinates one after another, in memory and in files."""
+"""Samples of held coordinates one after another, in memory and in files, and what records them in runs of the core."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
 from kcons.steppers.files import in_one_piece, stored_arrays
 from kcons.steppers.state import State, System
 
-#: What a sample has for each coordinate, and once.
-_VECTORS = ("value", "multiplier", "kinetic", "gradient", "turned", "mean_kinetic")
+#: What a sample has once, and not for each coordinate.
 _NUMBERS = ("time", "log_det_z", "off")
 
 
@@ -24,8 +23,8 @@ def _column(field: str) -> property:
     """A quantity of all samples."""
 
     def column(series: Series) -> FloatArray:
-        found = np.array([getattr(sample, field) for sample in series], dtype=np.float64)
-        return found.reshape(len(series), len(series.names)) if field in _VECTORS else found
+        shape = (len(series),) if field in _NUMBERS else (len(series), len(series.names))
+        return np.array([getattr(sample, field) for sample in series], dtype=np.float64).reshape(shape)
 
     return property(column)
 
@@ -108,8 +107,12 @@ class Series:
             raise InputError(f"there is no coordinate {name!r}; there are {', '.join(self.names)}", item="name")
         return self.multiplier[:, self.names.index(name)]
 
-    time, log_det_z, off = map(_column, _NUMBERS)
-    value, multiplier, kinetic, gradient, turned, mean_kinetic = map(_column, _VECTORS)
+    time, value, multiplier, kinetic, log_det_z, gradient, off, turned, mean_kinetic = map(_column, Sample._fields)
+
+    @property
+    def multipliers(self) -> dict[str, float]:
+        """Those of the last sample, by name."""
+        return dict(zip(self.names, self._samples[-1].multiplier.tolist(), strict=True)) if self._samples else {}
 
     @property
     def weights(self) -> FloatArray:
@@ -139,11 +142,11 @@ class Series:
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write all of it in NumPy's .npz format; an interrupted write leaves the older file."""
-        arrays = {field: getattr(self, field) for field in (*_NUMBERS, *_VECTORS)}
+        arrays = {field: getattr(self, field) for field in Sample._fields}
         with in_one_piece(file) as opened:
             arrays |= {"names": np.array(self.names), "periods": self.periods}
-            arrays["isokinetic_degrees_of_freedom"] = np.array(self.isokinetic_degrees_of_freedom)
-            arrays["seconds"] = np.array(self.seconds)
+            for name in ("isokinetic_degrees_of_freedom", "seconds"):
+                arrays[name] = np.array(getattr(self, name))
             np.savez(opened, **arrays)  # type: ignore[arg-type]
 
     @classmethod
@@ -158,17 +161,14 @@ class Series:
         try:
             with open(file, "rb") as opened:
                 data = stored_arrays(opened)
-            names = [str(name) for name in data["names"]]
-            g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data.get("seconds", 0.0))
-            series = cls(names, data["periods"], g, seconds)
+            g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data["seconds"])
+            series = cls([str(name) for name in data["names"]], data["periods"], g, seconds)
             d = len(series.names)
-            unknown = np.full_like(data["value"], np.nan)
-            data = {"turned": unknown, "mean_kinetic": unknown} | dict(data)
-            columns = [data[f].reshape(-1) for f in _NUMBERS] + [data[f].reshape(-1, d) for f in _VECTORS]
+            columns: list[Any] = [
+                data[f].reshape(-1).tolist() if f in _NUMBERS else data[f].reshape(-1, d) for f in Sample._fields
+            ]
             for row in zip(*columns, strict=True):
-                known: dict[str, Any] = dict(zip((*_NUMBERS, *_VECTORS), row, strict=True))
-                known |= {field: float(known[field]) for field in _NUMBERS}
-                series.append(Sample(**known))
+                series.append(Sample(*row))
         except FileNotFoundError:
             raise
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
@@ -208,7 +208,6 @@ class Recorder:
     Attributes
     ----------
     series : Series
-    last : Sample or None
 
     Raises
     ------
@@ -227,18 +226,9 @@ class Recorder:
                 f"with periods {mine[1]}; go on with a series of the same, or leave it out",
                 item="series",
             )
-        self.last: Sample | None = None
 
     def __call__(self, state: State) -> None:
         x, v, forces = self.system.taken(state)  # in the cell of the state
         if forces is None:
             forces = self.system.forces(x, v, state.time, state.step)
-        self.last = self.coordinates.sample(x, v, forces, state.time)
-        self.series.append(self.last)
-
-    @property
-    def multipliers(self) -> dict[str, float]:
-        """Those of the last sample, by name."""
-        return (
-            {} if self.last is None else dict(zip(self.coordinates.names, self.last.multiplier.tolist(), strict=True))
-        )
+        self.series.append(self.coordinates.sample(x, v, forces, state.time))

@@ -15,6 +15,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray, nearest_image
+from kcons.constraints.vectors import cross, dot, norm
 
 #: A trial turn in radian, what it may change of other rows, and by which factor a bond may change before it is broken.
 _TRIAL, _SAME, _BROKEN = 0.3, 1e-8, 1.5
@@ -25,20 +26,13 @@ class RigidTurn(NamedTuple):
 
     Such a turn changes no bond and no angle, and has no divergence, so that dF/dphi is the weighted mean of the torque
     against it (Ciccotti, Lelievre and Vanden-Eijnden, Commun. Pure Appl. Math. 61, 371, 2008, for any such field).
-
-    Attributes
-    ----------
-    axis : ndarray of int, shape (2,)
-        A turn about the line from the first to the second by a positive angle makes the torsion larger.
-    group : ndarray of int, shape (n,)
-        The atoms that move.
-    bonds : ndarray of int, shape (b, 2)
-        Those of the group, to the axis and of the axis.
-    lengths : ndarray, shape (b,)
     """
 
+    #: Two atoms: a turn about the line from the first to the second by a positive angle makes the torsion larger.
     axis: IntArray
+    #: The atoms that move.
     group: IntArray
+    #: Those of the group, to the axis and of the axis, shape (b, 2), and their lengths.
     bonds: IntArray
     lengths: FloatArray
 
@@ -47,19 +41,21 @@ class RigidTurn(NamedTuple):
         e = self._direction(x)
         r = x[self.group] - x[self.axis[1]]
         result = x.copy()
-        result[self.group] += np.sin(angle) * np.cross(e, r) + (1 - np.cos(angle)) * (np.outer(r @ e, e) - r)
+        result[self.group] += np.sin(angle) * cross(e, r) + (1 - np.cos(angle)) * (np.outer(r @ e, e) - r)
         return result
 
-    def force(self, x: FloatArray, f: FloatArray) -> float:
-        """dU/dphi of the turn; NaN where a bond of the group is broken, by a box for example."""
+    def force(self, x: FloatArray, f: FloatArray) -> FloatArray:
+        """dU/dphi of the turn, of one or several configurations; NaN where a bond of the group is broken, by a box for
+        example."""
         i, j = self.bonds.T
-        if (((x[i] - x[j]) ** 2).sum(axis=1) > (_BROKEN * self.lengths) ** 2).any():
-            return float("nan")
-        return float(-self._direction(x) @ np.cross(x[self.group] - x[self.axis[1]], f[self.group]).sum(axis=0))
+        broken = (((x[..., i, :] - x[..., j, :]) ** 2).sum(axis=-1) > (_BROKEN * self.lengths) ** 2).any(axis=-1)
+        arms = x[..., self.group, :] - x[..., self.axis[1:], :]
+        torque = cross(arms, f[..., self.group, :]).sum(axis=-2)
+        return np.where(broken, np.nan, -dot(self._direction(x), torque))
 
     def _direction(self, x: FloatArray) -> FloatArray:
-        e: FloatArray = x[self.axis[1]] - x[self.axis[0]]
-        return e / np.linalg.norm(e)
+        e: FloatArray = x[..., self.axis[1], :] - x[..., self.axis[0], :]
+        return e / norm(e)[..., None]
 
 
 def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None:
@@ -88,14 +84,7 @@ def rigid_turn(
 ) -> RigidTurn | None:
     """The smaller group of one torsion; None of another coordinate, or where the middle bond is missing or in a ring.
 
-    Parameters
-    ----------
-    coordinate : Constraint
-        One row.
-    bonds : ndarray of int, shape (n, 2)
-    x : ndarray, shape (n_atoms, 3)
-    lattice : ndarray, shape (2, 3, 3), optional
-        In which bonds have their lengths, also where a box has cut them.
+    Bonds have their lengths in the lattice, also where a box has cut them.
     """
     if coordinate.family != "Dihedral":
         return None
@@ -119,16 +108,7 @@ def leaves_the_rest(
 ) -> bool:
     """Whether a turn changes its coordinate by its angle, no other row of the set, and not det(A M^-1 A^T) of `others`.
 
-    Parameters
-    ----------
-    turn : RigidTurn
-    row : int
-        Of the coordinate in `everything`.
-    everything : ConstraintSet
-    others : ndarray of int
-        The other rows of the clusters of the coordinates.
-    x : ndarray, shape (n_atoms, 3)
-    time : float
+    `row` is that of the coordinate in the set, `others` the other rows of the clusters of the coordinates.
     """
     there = turn.turned(x, _TRIAL)
     change = everything.measure(there, time) - everything.measure(x, time)

@@ -222,21 +222,24 @@ def from_openmm(
     part : CarriedConstraints, optional
         Rows that kcons carries in this System.
     """
+    snapshot, rows = _of_openmm(topology, positions, system, velocities, part)
+    return FromMDEngine(universe_of(snapshot), rows)
+
+
+def _of_openmm(
+    topology: Any, positions: unit.Quantity, system: openmm.System | None, velocities: unit.Quantity | None, part: Any
+) -> tuple[Snapshot, list[Constraint]]:
+    """A snapshot, and what a System and a part hold, in angstrom."""
     from kcons.openmm.topology import snapshot_of as snapshot_of_topology
 
-    snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
-    return FromMDEngine(universe_of(snapshot), all_rescaled(_constraints_in(system, part), 1 / NM))
-
-
-def _constraints_in(system: openmm.System | None, part: Any) -> list[Constraint]:
-    """What a System and a part hold, in nm."""
     rows: list[Constraint] = []
     if system is not None and system.getNumConstraints():
         held = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
         rows.append(Distance([(i, j) for i, j, _ in held], [length._value for _, _, length in held]))
     if part is not None:
         rows += part.motion.constraint_set.constraints
-    return rows
+    snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
+    return snapshot, all_rescaled(rows, 1 / NM)
 
 
 # -- ASE and OpenMM -------------------------------------------------------------------------------
@@ -258,10 +261,7 @@ def openmm_to_ase(
     part: Any = None,
 ) -> ase.Atoms:
     """`Atoms` with what a System holds; see `from_openmm`."""
-    from kcons.openmm.topology import snapshot_of as snapshot_of_topology
-
-    snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
-    return _held_atoms(snapshot, all_rescaled(_constraints_in(system, part), 1 / NM))
+    return _held_atoms(*_of_openmm(topology, positions, system, velocities, part))
 
 
 # -- pieces ---------------------------------------------------------------------------------------
@@ -390,13 +390,13 @@ def _openmm(
         snapshot = replace(snapshot, positions=x)
     topology, positions = openmm_topology(snapshot)
     system = _system(snapshot, topology, sites, force_field, options)
-    distances = [item for item in rows if isinstance(item, Distance)]
-    known: set[tuple[int, int]] = set()
-    for item in distances:
-        for (i, j), length in zip(np.sort(item.atoms, axis=1).tolist(), np.asarray(item.target).tolist(), strict=True):
-            if (i, j) not in known:
-                known.add((i, j))
-                system.addConstraint(i, j, length)
+    lengths: dict[tuple[int, int], float] = {}
+    for item in rows:
+        if isinstance(item, Distance):
+            for (i, j), length in zip(np.sort(item.atoms).tolist(), np.asarray(item.target).tolist(), strict=True):
+                lengths.setdefault((i, j), length)
+    for (i, j), length in lengths.items():
+        system.addConstraint(i, j, length)
     others = [item for item in rows if not isinstance(item, Distance)]
     part = hold(system, others, x, periodic=snapshot.cell is not None) if others else None
     velocities = None

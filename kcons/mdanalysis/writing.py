@@ -13,7 +13,6 @@ import tempfile
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TextIO
 
 import MDAnalysis
@@ -329,20 +328,16 @@ class TrajectoryWriter:
 
     def close(self) -> None:
         """Close the files; more than once does no harm."""
-        if self._writer is not None:
-            if self.n_frames or self._format != "H5MD":
-                self._writer.close()
-            self._writer = None
+        if self._writer is not None and (self.n_frames or self._format != "H5MD"):
+            self._writer.close()
         if self._side is not None:
             self._side.close()
-            self._side = None
+        self._writer = self._side = None
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -486,20 +481,15 @@ class OpenMMReporter:
 
     def report(self, simulation: Any, state: Any) -> None:
         """Write a frame."""
-        from openmm.unit import md_unit_system
-
-        def plain(quantity: Any) -> Any:
-            return quantity.value_in_unit_system(md_unit_system)
-
-        x, v = (plain(get(asNumpy=True)) for get in (state.getPositions, state.getVelocities))
-        f = plain(state.getForces(asNumpy=True)) if self._forces else None
+        x, v = (get(asNumpy=True)._value for get in (state.getPositions, state.getVelocities))  # nm and ps
+        f = state.getForces(asNumpy=True)._value if self._forces else None
         periodic = simulation.system.usesPeriodicBoundaryConditions()
-        cell = plain(state.getPeriodicBoxVectors(asNumpy=True)) if periodic else None
+        cell = state.getPeriodicBoxVectors(asNumpy=True)._value if periodic else None
         if self.writer is None:
-            interval = self.interval * plain(simulation.integrator.getStepSize())
+            interval = self.interval * simulation.integrator.getStepSize()._value
             options = {"units": OPENMM_UNITS, "motion": self.motion, "interval": interval, **self._options}
             self.writer = TrajectoryWriter(self.path, len(x), **options)
-        self.writer.write(x, v, time=plain(state.getTime()), cell=cell, forces=f, step=simulation.currentStep)
+        self.writer.write(x, v, time=state.getTime()._value, cell=cell, forces=f, step=simulation.currentStep)
 
     def close(self) -> None:
         """Close the file."""

@@ -1,8 +1,7 @@
 """The engine: what constraints do to positions, velocities, accelerations and forces.
 
 - `motion`: `Motion`, the engine itself
-- `projector`: its projections of whole systems
-- `local_projections`: all solvers of a plan, one after another
+- `solver_sequence`: all solvers of a plan, one after another
 - `certificate`: results checked by the constraints as they were given
 - `failures`: what to tell the user where a solve failed
 - `report`: what is held, and how well

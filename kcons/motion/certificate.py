@@ -24,7 +24,7 @@ CHECK_EVERY = 1000
 #: ... and the part of a run's time that certificates may then take: less than the one per cent that is promised, since
 #: what the next one takes is not known. Where steps take microseconds, they come later.
 SHARE = 0.009
-#: That many times later at most, and then again.
+#: A certificate that is due is put off by this many intervals at most, and then looked at again.
 MOST = 100
 #: |A v - c| that counts as held, in parts of what the atoms of the row, or of the fastest row, move with: so many times
 #: the part of its scale that |sigma| may be, since gradients at rounded positions are no better known.
@@ -70,11 +70,9 @@ def certify(
 
 
 def _refuse(held: ConstraintSet, miss: FloatArray, allowed: FloatArray, what: str, residual: str) -> None:
-    bad = ~(miss <= allowed)
-    if not bad.any():
+    row = off_row(miss, allowed)
+    if row < 0:
         return
-    with np.errstate(divide="ignore", invalid="ignore"):
-        row = int(np.argmax(np.where(bad, np.nan_to_num(miss / allowed, nan=np.inf), -1.0)))
     raise CertificateError(
         f"the {what} are off row {held.row_name(row)}: {residual} is {miss[row]:.3g}, allowed {allowed[row]:.3g}. "
         "The solver reported success; this is an error of kcons, or something changed the arrays, the cell or the "
@@ -83,6 +81,15 @@ def _refuse(held: ConstraintSet, miss: FloatArray, allowed: FloatArray, what: st
         residual=float(miss[row]),
         atoms=held.row_atoms(row),
     )
+
+
+def off_row(miss: FloatArray, allowed: FloatArray) -> int:
+    """The row that is off by most, in parts of what is allowed; -1 if none is. NaN counts as most."""
+    bad = ~(miss <= allowed)
+    if not bad.any():
+        return -1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return int(np.argmax(np.where(bad, np.nan_to_num(miss / allowed, nan=np.inf), -1.0)))
 
 
 def checked_every(check_every: int | None) -> tuple[int, bool]:

@@ -10,6 +10,7 @@ import numpy as np
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.motion.condition import worst_condition
+from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import Plan
 
 #: Conversions that a printed report names.
@@ -116,7 +117,9 @@ def make_report(
         speed = float(np.max(miss / np.where(norms > 0, norms, 1.0), initial=0.0))
     conditions = [float("nan")] * len(plan.kinds)
     if condition:
-        inverse_masses = _inverse_masses(constraint_set)
+        movable = np.setdiff1d(constraint_set.touched, fixed_atoms(constraint_set))
+        inverse_masses = np.zeros(constraint_set.n_atoms)
+        inverse_masses[movable] = 1.0 / constraint_set.masses[movable]
         conditions = [
             worst_condition(jacobian, inverse_masses, solver.rows, plan.labels, deficiency=kind.rows - kind.rank)
             for solver, kind in zip(plan.solvers, plan.kinds, strict=True)
@@ -137,12 +140,3 @@ def make_report(
         kinds=kinds,
         conversions=[str(body) for body in constraint_set.conversions],
     )
-
-
-def _inverse_masses(constraint_set: ConstraintSet) -> FloatArray:
-    """1/m of the atoms that rows touch, 0 for fixed atoms, shape (n_atoms,)."""
-    fixed = [c.atoms.ravel() for c in constraint_set.constraints if c.family == "FixedAtoms"]
-    movable = np.setdiff1d(constraint_set.touched, np.concatenate(fixed)) if fixed else constraint_set.touched
-    inverse = np.zeros(constraint_set.n_atoms)
-    inverse[movable] = 1.0 / constraint_set.masses[movable]
-    return inverse

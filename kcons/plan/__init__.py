@@ -4,8 +4,7 @@
 - `independent_blocks`: pieces of a cluster whose ranks add up
 - `rank`: the number of independent rows
 - `second_order`: rows that are singular only at second order
-- `solver_table`: which solver serves which shape
-- `plan`: the clusters of a set, with a solver each
+- `plan`: the clusters of a set, with a solver each, and the table which solver serves which shape
 """
 
 from kcons.plan.plan import Plan, make_plan

@@ -66,7 +66,7 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows:
     if n_rows == 0:
         return labels
     begins, atoms = links.indptr.astype(np.int64), links.indices.astype(np.int64)
-    found = plain_if_small(_joined, len(atoms))(begins, atoms, n_atoms)
+    found = joined(begins, atoms, n_atoms)
     movable = np.diff(links.indptr) > 0
     movable[pinned_rows] = False
     if movable.any():
@@ -76,9 +76,15 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows:
     return labels
 
 
+def joined(begins: IntArray, atoms: IntArray, n_atoms: int) -> IntArray:
+    """Number of the cluster of each row, by its first row; row k has the atoms from begins[k] to begins[k + 1]."""
+    labels: IntArray = plain_if_small(_joined, len(atoms))(begins, atoms, n_atoms)
+    return labels
+
+
 @njit(cache=True)
 def _joined(begins, atoms, n_atoms):  # type: ignore[no-untyped-def]
-    """Number of the cluster of each row, by its first row (union-find with path halving)."""
+    # Union-find with path halving.
     n = len(begins) - 1
     first = np.full(n_atoms, -1, np.int64)
     parent = np.arange(n)

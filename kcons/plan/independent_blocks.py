@@ -16,6 +16,7 @@ import numpy as np
 from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.plan.clusters import joined
 
 _GROUND = -1
 
@@ -73,7 +74,9 @@ def row_blocks(
     u, v, row, closing = u[proper], v[proper], row[proper], closing[proper]
     vertices, index = np.unique(np.concatenate([u, v]), return_inverse=True)
     u, v = index[: len(u)], index[len(u) :]
-    if plain_if_small(_is_forest, len(u))(u[~closing], v[~closing], len(vertices)):
+    sides = np.stack([u[~closing], v[~closing]], axis=1)
+    n_parts = int(joined(2 * np.arange(len(sides) + 1), sides.ravel(), len(vertices)).max(initial=-1)) + 1
+    if len(sides) == len(vertices) - n_parts:  # no edge closes a cycle
         return nothing
     block = plain_if_small(_edge_blocks, len(u))(u, v, len(vertices))
     # A wide row has several edges, all in one block.
@@ -83,24 +86,6 @@ def row_blocks(
     keep = sizes[block] > 1
     sizes = sizes[sizes > 1]
     return row[keep], np.concatenate([[0], np.cumsum(sizes)])
-
-
-@njit(cache=True)
-def _is_forest(u, v, n_vertices):  # type: ignore[no-untyped-def]
-    """Whether no edge closes a cycle (union-find with path halving)."""
-    parent = np.arange(n_vertices)
-    for e in range(len(u)):
-        a, b = u[e], v[e]
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
-        if a == b:
-            return False
-        parent[a] = b
-    return True
 
 
 @njit(cache=True)

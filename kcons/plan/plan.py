@@ -14,10 +14,15 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import rank_of_shape, ranked, small_enough
-from kcons.plan.solver_table import solver_of
+from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent
+from kcons.solvers.rigid_triangles import RigidTriangles
+from kcons.solvers.single_rows import SingleRows
+from kcons.solvers.small_clusters import SmallClusters
+from kcons.solvers.sparse.distances import SparseDistances
+from kcons.solvers.sparse.mixed_rows import SparseRows
 
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
@@ -282,6 +287,32 @@ def make_plan(
         example = named.row_name(int(shape.rows.ravel()[0]))
         plan.kinds.append(ClusterKind(solver.name, shape.clusters, shape.rows.size, rank, example))
     return plan
+
+
+def solver_of(
+    shape: Shape,
+    constraint_set: ConstraintSet,
+    inverse_masses: FloatArray,
+    labels: IntArray,
+    time: float,
+    late: BoolArray | None = None,
+) -> ClusterSolver:
+    """The table: which solver serves which shape."""
+    rows = shape.rows
+    if shape.kind == "general":
+        return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
+    if shape.kind == "single":
+        return SingleRows(constraint_set, rows, inverse_masses)
+    if shape.kind == "mixed":
+        return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
+    targets = constraint_set.target(time)[rows]
+    if shape.kind == "water":
+        return RigidTriangles(rows, shape.atoms, targets, inverse_masses[shape.atoms[0]])
+    if shape.kind == "lanes":
+        return SmallClusters(rows, shape.atoms, shape.pairs, targets, inverse_masses[shape.atoms[0]])
+    if shape.kind == "chain":
+        return Chains(rows, shape.starts, shape.atoms, targets, inverse_masses[shape.atoms])
+    return SparseDistances(rows, shape.pairs, targets, inverse_masses, None if late is None else late[rows])
 
 
 def _shapes(

@@ -9,13 +9,10 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
+from kcons.solvers.called_solvers import CalledSolver
 from kcons.solvers.cluster_solver import ClusterSolver
-from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent, rank
-from kcons.solvers.single_rows import SingleRows
-from kcons.solvers.sparse.distances import SparseDistances
-from kcons.solvers.sparse.mixed_rows import SparseRows
 
 #: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
 ORDERED_ROWS = 400
@@ -83,13 +80,8 @@ def rank_of_shape(
     moved: FloatArray | None,
 ) -> int:
     """Independent rows of a shape whose graph does not tell; `moved` as in `Request`."""
-    if isinstance(solver, SparseRows):
+    if isinstance(solver, GeneralClusters):
+        return solver.rank(positions, time, moved)
+    if isinstance(solver, CalledSolver):
         return solver.rank(positions, lattice, time, moved)
-    if isinstance(solver, SingleRows):
-        return solver.rank(positions, lattice, time)
-    if isinstance(solver, SparseDistances):
-        return solver.rank(positions, lattice)
-    if isinstance(solver, DistanceClusters):
-        return rank_of_small(shape, inverse_masses, positions, lattice)
-    assert isinstance(solver, GeneralClusters)
-    return solver.rank(positions, time, moved)
+    return rank_of_small(shape, inverse_masses, positions, lattice)

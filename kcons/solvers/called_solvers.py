@@ -1,54 +1,90 @@
-"""Solvers that other kernels call by the addresses of their functions.
+"""Solvers as data: what kernels know of one is tables in one array, and functions that are called by their addresses.
 
-A kernel that knew every solver would be compiled for each combination of them. Here a solver is data: its tables in one
-array, the numbers of its rows in another, and three functions that all such solvers have alike. They are compiled for
-the solver itself, and for nobody else again:
+A kernel that is called from Python pays for each array that it is given, and one that knows solvers of many kinds is
+compiled for each of their combinations. Here a solver's functions are compiled for the solver itself, and for nobody
+else again. They are alike for all of them; `kind` says which minimum image the lattice needs (`kernels.lattices`):
 
-``_positions(careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers)``
+``_positions(careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers)``
     solves the SHAKE condition; ``_tangents(alone, x, y, wanted, ...)`` makes y tangent at x. Both return what an
     `Outcome` holds. An empty `wanted` stands for the targets found at set-up, and for no motion of the surface.
 ``_apply(x, factor, tables)``
-    adds the last solution times `factor`. Solvers that are `alone` have done so with 1 for what they solve, and with
-    inv_dt for velocities. Otherwise nothing is written until each of them has found its solution.
+    adds the last solution times `factor`. A solver that is `alone` has done so with 1 for what it solves, and with
+    inv_dt for velocities. Otherwise nothing is written until each of several has found its solution.
+``_undo(x, tangents, velocities, tables)``
+    of solvers that write at once instead: puts back points, or (`tangents` and `velocities` say which) velocities.
+``_resolved(x, lattice, kind, tables)``
+    whether positions show what was found, where multipliers may be so large that their own rounding does not.
+
+`pack_solver_tables` puts several behind one array, for `packed_positions` and `packed_tangents`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
-from kcons.solvers.kernels.array_views import view
-from kcons.solvers.kernels.groups_of_eight import NO_LATTICE, NO_NUMBERS
-from kcons.solvers.sparse.row_functions import GivenRows
+from kcons.solvers.kernels.aligned_memory import in_one_array
+from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, none_of, piece, view
+from kcons.solvers.kernels.lattices import NO_LATTICE, lattice_kind
+from kcons.solvers.kernels.two_and_four_wide import entry, number, put
+from kcons.solvers.tolerances import MAX_ROUNDS
 
+NO_NUMBERS = np.zeros(0)
 _NUMBERS, _POINTS, _LATTICE = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
-_ALIKE = _NUMBERS, _LATTICE, types.boolean, _NUMBERS, _NUMBERS
+_ALIKE = _NUMBERS, _LATTICE, types.int64, _NUMBERS, _NUMBERS
 _FOUND = types.Tuple((types.boolean, types.float64, types.int64, types.int64))
 _POSITIONS = _FOUND(types.boolean, types.boolean, _POINTS, _POINTS, _POINTS, types.float64, *_ALIKE)
 _TANGENTS = _FOUND(types.boolean, _POINTS, _POINTS, *_ALIKE)
 _APPLY = types.none(_POINTS, types.float64, _NUMBERS)
-#: Words that are kept of a solver: where its functions are, then where each array is and how many numbers it has.
-WORDS = 7
+_UNDO = types.none(_POINTS, types.boolean, types.boolean, _NUMBERS)
+_RESOLVED = types.boolean(_POINTS, _LATTICE, types.int64, _NUMBERS)
+_SIGNATURES = _POSITIONS, _TANGENTS, _APPLY, _UNDO, _RESOLVED
+#: Words that are kept of a solver: where its functions are (0 for none), then where each array is and how many numbers
+#: it has.
+WORDS = 9
+
+
+class Kernels(NamedTuple):
+    """The functions of a solver, as the module describes them; None where it has none."""
+
+    positions: Any
+    tangents: Any
+    apply: Any = None
+    undo: Any = None
+    resolved: Any = None
+
+
+class Addressable(Protocol):
+    """What kernels can call, to be kept as long as they do."""
+
+    kernels: Kernels
+    tables: FloatArray
+    numbers: FloatArray
+
+    def refuse(self) -> None:
+        """Raise what a Python function among the rows has raised while a kernel ran."""
 
 
 class CalledSolver(ABC):
-    """Base of these solvers, each a `ClusterSolver`.
+    """Base of the solvers that all kernels can call, each a `ClusterSolver`.
 
     Attributes
     ----------
     rows : ndarray of int64
         Row numbers in the order of the kernels.
+    kernels : Kernels
     tables : ndarray of float64
         What the kernels know of the rows, in one array.
     numbers : ndarray of float64
@@ -56,74 +92,78 @@ class CalledSolver(ABC):
     """
 
     rows: IntArray
+    kernels: Kernels
     tables: FloatArray
+    numbers: FloatArray = NO_NUMBERS
     #: Ways of solving for positions, one after the other until one arrives.
     ways: tuple[bool, ...] = (False,)
-    _given: GivenRows
     _solution: FloatArray
     #: Whether rows take whole cells off positions.
     _moved = False
+    #: The last lattice, an array that nobody writes to, as the kernels take it.
+    _lattice: FloatArray | None = None
+    _cell, _kind = lattice_kind(None)
 
     @property
     @abstractmethod
-    def kernels(self) -> tuple[Any, Any, Any]:
-        """`_positions`, `_tangents` and `_apply`."""
-
-    @property
-    def numbers(self) -> FloatArray:
-        return self._given.numbers
+    def pivots(self) -> FloatArray:
+        """Of the last tangents, by row: 0 for rows that depend on others."""
 
     def refuse(self) -> None:
         """Raise what a Python function among the rows has raised while a kernel ran."""
-        self._given.refuse()
 
     def _take_off(self, moved: FloatArray | None) -> None:
         """Let rows with a place in space take these whole cells off the positions of their atoms."""
 
+    def _multipliers(self) -> FloatArray:
+        """The last solution, by unit steps in what rows measure."""
+        return self._solution
+
+    def _enter(self, request: Request, times: tuple[float, float, float]) -> FloatArray:
+        """Take over cell and times of a request; returns what is wanted of the rows."""
+        if request.moved is not None or self._moved:
+            self._take_off(request.moved)
+        if request.lattice is not self._lattice:
+            self._lattice = request.lattice
+            self._cell, self._kind = lattice_kind(request.lattice)
+        if self.numbers.size:
+            self.numbers[:3] = times
+        return NO_NUMBERS if request.wanted is None else request.wanted[self.rows]
+
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt, flight, moved = request
-        if moved is not None or self._moved:
-            self._take_off(moved)
-        numbers = self._given.numbers
-        numbers[:3] = time, reference_time, flight
+        x, reference, _, _, time, reference_time, velocities, inv_dt, flight, _ = request
+        wanted = self._enter(request, (time, reference_time, flight))
+        if velocities is None:
+            velocities, inv_dt = x, 0.0
         for careful in self.ways:
             found = self.kernels[0](
-                careful, True, x, reference, x if velocities is None else velocities,
-                0.0 if velocities is None else inv_dt, NO_NUMBERS if wanted is None else wanted[self.rows],
-                NO_LATTICE if lattice is None else lattice, lattice is not None, self.tables, numbers,
+                careful, True, x, reference, velocities, inv_dt, wanted, self._cell, self._kind, self.tables,
+                self.numbers,
             )  # fmt: skip
-            self._given.refuse()
+            self.refuse()
             if found[0]:
                 break
         if found[0] and multipliers is not None:
-            multipliers[:] = self._solution
+            multipliers[:] = self._multipliers()
         return Outcome(*found)
 
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, wanted, lattice, time, _, _, _, _, moved = request
-        if moved is not None or self._moved:
-            self._take_off(moved)
-        self._given.numbers[:3] = time, time, 1.0
-        found = self.kernels[1](
-            True, x, y, NO_NUMBERS if wanted is None else wanted[self.rows],
-            NO_LATTICE if lattice is None else lattice, lattice is not None, self.tables, self._given.numbers,
-        )  # fmt: skip
-        self._given.refuse()
+        y, x, _, _, time, _, _, _, _, _ = request
+        wanted = self._enter(request, (time, time, 1.0))
+        found = self.kernels[1](True, x, y, wanted, self._cell, self._kind, self.tables, self.numbers)
+        self.refuse()
         if found[0] and multipliers is not None:
-            np.negative(self._solution, out=multipliers)
+            np.negative(self._multipliers(), out=multipliers)
         return Outcome(*found)
 
-
-def words_of(solvers: Sequence[CalledSolver]) -> IntArray:
-    """By what `solve_positions`, `solve_tangents` and `add` know solvers, to be kept as long as it is used."""
-    words: list[int] = []
-    for solver in solvers:
-        words += [address_of(*each) for each in zip(solver.kernels, (_POSITIONS, _TANGENTS, _APPLY), strict=True)]
-        for array in (solver.tables, solver.numbers):
-            words += [array.ctypes.data, array.size]
-    return np.array(words, dtype=np.int64)
+    def rank(
+        self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0, moved: FloatArray | None = None
+    ) -> int:
+        """Independent rows at `x`: those whose pivot does not vanish; `moved` as in `Request`."""
+        outcome = self.tangents(Request(np.zeros_like(x), x, None, lattice, time, moved=moved))
+        return int(np.count_nonzero(self.pivots)) if outcome.converged else len(self.rows)
 
 
 def address_of(kernel: Any, signature: Any) -> int:
@@ -153,7 +193,7 @@ def caller_of(signature: Any) -> Any:
     return function
 
 
-_call_positions, _call_tangents, _call_apply = (caller_of(kind) for kind in (_POSITIONS, _TANGENTS, _APPLY))
+_call_positions, _call_tangents, _call_apply, _call_undo, _call_resolved = (caller_of(kind) for kind in _SIGNATURES)
 
 
 @intrinsic
@@ -166,45 +206,120 @@ def _borrowed(typingctx, address, size):  # type: ignore[no-untyped-def]
     return _NUMBERS(types.int64, types.int64), codegen
 
 
+# -- several behind one array ---------------------------------------------------------------------------------
+
+#: Pieces: words of the solvers, fixed atoms and their places, the cell, and those of the caller.
+_SOLVERS, _PINNED, _PLACES, _KIND, _CELL, MORE = range(6)
+
+
+def words_of(solvers: Sequence[Addressable]) -> IntArray:
+    """By what kernels know solvers, to be kept as long as it is used."""
+    words: list[int] = []
+    for solver in solvers:
+        pairs = zip(solver.kernels, _SIGNATURES, strict=True)
+        words += [0 if kernel is None else address_of(kernel, signature) for kernel, signature in pairs]
+        for array in (solver.tables, solver.numbers):
+            words += [array.ctypes.data, array.size]
+    return np.array(words, dtype=np.int64)
+
+
+def pack_solver_tables(
+    solvers: Sequence[Addressable], pinned: IntArray, places: FloatArray, *more: NDArray[Any]
+) -> FloatArray:
+    """What `packed_positions` and `packed_tangents` need to know.
+
+    Parameters
+    ----------
+    solvers : sequence of Addressable
+        Those that write at once come last, and of these those without `undo`.
+    pinned : ndarray of int
+        Fixed atoms.
+    places : ndarray, shape (n_pinned, 3)
+    *more : ndarray of float64, int64 or uint32, flat
+        Pieces number `MORE` and on, for the caller's own kernels.
+
+    Returns
+    -------
+    ndarray of float64
+        Begins with where each piece starts and ends, as integers.
+    """
+    held = pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel()
+    return in_one_array((words_of(solvers), *held, *more))
+
+
+def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
+    """Change the periodic cell, shape (2, 3, 3) with its inverse, in tables of `pack_solver_tables`."""
+    values, kind = lattice_kind(lattice)
+    header = tables.view(np.int64)
+    tables[header[2 * _CELL] : header[2 * _CELL + 1]] = values.ravel()
+    header[header[2 * _KIND]] = kind
+
+
 @njit(cache=True, nogil=True, inline="always")
-def solve_positions(words, x, x_ref, v, inv_dt, none, lattice, periodic):  # type: ignore[no-untyped-def]
-    """Bring `x` onto the constraints of all, and change `v` by that times `inv_dt`, if all arrive.
+def _arrays(words, k):  # type: ignore[no-untyped-def]
+    return _borrowed(words[k + 5], words[k + 6]), _borrowed(words[k + 7], words[k + 8])
+
+
+@njit(cache=True, nogil=True)
+def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+    """Bring `x` onto the rows along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
     Returns
     -------
     int
-        The most iterations of one of them, or -1 with everything as it was.
+        The most iterations of a solver; -1 where one finds no solution, with `x` and `v` as they were but for fixed
+        atoms.
     """
-    most, alone = 0, words.size == WORDS
+    t, h, u = tables, integers(tables), halves(tables)
+    pinned, places = at_piece(u, h, _PINNED), at_piece(t, h, _PLACES)
+    for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
+        put(x, 3 * entry(pinned, k // 3) + k % 3, number(places, k))
+    words, lattice, kind, none = piece(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
+    most = 0
     for k in range(0, words.size, WORDS):
-        tables, numbers = _borrowed(words[k + 3], words[k + 4]), _borrowed(words[k + 5], words[k + 6])
-        given = (False, alone, x, x_ref, v, inv_dt, none, lattice, periodic, tables, numbers)
-        found, _, iterations, _ = _call_positions(words[k], given)
+        mine, numbers = _arrays(words, k)
+        alike = x, x_ref, v, inv_dt, none, lattice, kind, mine, numbers
+        found, _, iterations, _ = _call_positions(words[k], (False, False, *alike))
         if not found:
+            for j in range(0, k, WORDS):
+                if words[j + 3] != 0:
+                    _call_undo(words[j + 3], (x, False, False, _arrays(words, j)[0]))
+                    _call_undo(words[j + 3], (v, False, True, _arrays(words, j)[0]))
             return -1
         most = max(most, iterations)
-    if not alone:
-        add(words, x, 1.0)
-        add(words, v, inv_dt)
+    for k in range(0, words.size, WORDS):
+        mine, numbers = _arrays(words, k)
+        alike = x, x_ref, v, inv_dt, none, lattice, kind, mine, numbers
+        # Large multipliers have a rounding that shows in the positions; another round takes it away.
+        for again in range(MAX_ROUNDS + 1):
+            if words[k + 2] != 0:
+                _call_apply(words[k + 2], (x, 1.0, mine))
+                _call_apply(words[k + 2], (v, inv_dt, mine))
+            if words[k + 4] == 0 or again == MAX_ROUNDS or _call_resolved(words[k + 4], (x, lattice, kind, mine)):
+                break
+            found, _, iterations, _ = _call_positions(words[k], (False, False, *alike))
+            if not found:
+                break
+            most = max(most, iterations)
     return most
 
 
-@njit(cache=True, nogil=True, inline="always")
-def solve_tangents(words, y, x, none, lattice, periodic):  # type: ignore[no-untyped-def]
-    """Make `y` tangent at `x` for all; whether they arrived, with everything as it was if not."""
-    alone = words.size == WORDS
+@njit(cache=True, nogil=True)
+def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
+    """Project `v` so that no row changes; whether that was possible, `v` otherwise as it was."""
+    t, h, u = tables, integers(tables), halves(tables)
+    pinned = at_piece(u, h, _PINNED)
+    for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
+        put(v, 3 * entry(pinned, k // 3) + k % 3, 0.0)
+    words, lattice, kind, none = piece(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
     for k in range(0, words.size, WORDS):
-        tables, numbers = _borrowed(words[k + 3], words[k + 4]), _borrowed(words[k + 5], words[k + 6])
-        given = (alone, x, y, none, lattice, periodic, tables, numbers)
-        if not _call_tangents(words[k + 1], given)[0]:
+        mine, numbers = _arrays(words, k)
+        if not _call_tangents(words[k + 1], (False, x, v, none, lattice, kind, mine, numbers))[0]:
+            for j in range(0, k, WORDS):
+                if words[j + 3] != 0:
+                    _call_undo(words[j + 3], (v, True, False, _arrays(words, j)[0]))
             return False
-    if not alone:
-        add(words, y, 1.0)
-    return True
-
-
-@njit(cache=True, nogil=True, inline="always")
-def add(words, x, factor):  # type: ignore[no-untyped-def]
-    """Add `factor` times the solutions to `x`."""
     for k in range(0, words.size, WORDS):
-        _call_apply(words[k + 2], (x, factor, _borrowed(words[k + 3], words[k + 4])))
+        if words[k + 2] != 0:
+            _call_apply(words[k + 2], (v, 1.0, _arrays(words, k)[0]))
+    return True

@@ -90,7 +90,7 @@ class ClusterSolver(Protocol):
         ...
 
 
-def go_on(
+def resume(
     positions: Callable[[Request, FloatArray | None], Outcome], request: Request, multipliers: FloatArray | None
 ) -> bool:
     """Let a solver go on from the positions where it ended, and add to `multipliers`; whether it converged again."""

@@ -18,15 +18,17 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
-from kcons.solvers.sparse.step_control import FLAT, MANY_ITERATIONS, ROUNDINGS
-
-MAX_ITERATIONS = 50
-#: |A v - c| allowed after a projection, relative to the speeds of the cluster (unit rows).
-SPEED_TOLERANCE = 1e-11
-_HALVINGS = 30
-#: So many steps towards the least squares without gain are their end.
-_STALLED = 10
-_EPS = float(np.finfo(float).eps)
+from kcons.solvers.tolerances import (
+    DENSE_SPEED_TOLERANCE,
+    EPS,
+    FLAT,
+    MANY_ITERATIONS,
+    MAX_HALVINGS,
+    MAX_ITERATIONS,
+    ROUNDING,
+    ROUNDINGS,
+    STALLED,
+)
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ class GeneralClusters:
         sizes = np.linalg.norm(state.reshape(-1)[batch.columns].reshape(len(batch.rows), -1, 3), axis=2)
         norms = np.linalg.norm(batch.gradients(data).reshape(*batch.rows.shape, -1, 3), axis=3)
         reach = np.einsum("nka,na->nk", norms, sizes)
-        return np.maximum(1e-14, 2 * _EPS * reach / self._scale[batch.rows])
+        return np.maximum(ROUNDING, 2 * EPS * reach / self._scale[batch.rows])
 
     def _sigma(self, batch: _Batch, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
         return (self.subset.value(state, time) + (0.0 if flight is None else flight.slips(state)))[batch.rows]
@@ -240,7 +242,7 @@ class GeneralClusters:
             shift = root_w * np.einsum("nrc,nr->nc", basis, step)
             here = flat[batch.columns]
             factor = np.where(done, 0.0, 1.0)
-            for _ in range(_HALVINGS):
+            for _ in range(MAX_HALVINGS):
                 flat[batch.columns] = here + factor[:, None] * shift
                 trial = self._sigma(batch, state, time, flight) * held
                 trial_error = _rms(trial / scale)
@@ -301,7 +303,7 @@ class GeneralClusters:
             b = np.where(held[..., None], b, 0.0)
             here = flat[batch.columns]
             active = ~settled
-            for _ in range(_HALVINGS):
+            for _ in range(MAX_HALVINGS):
                 step = -root_w * damped(b, sigma, damping)
                 flat[batch.columns] = here + np.where(active[:, None], step, 0.0)
                 trial = self._sigma(batch, state, time) * held
@@ -316,7 +318,7 @@ class GeneralClusters:
             damping = np.where(active, 0.1 * damping, damping)
             damping[damping < 1e-8] = 0.0
             sigma, error = trial, trial_error
-            if iteration % _STALLED == 0:
+            if iteration % STALLED == 0:
                 stalled = active & (error > (1 - 1e-8) * before)
                 if stalled.any():
                     return _failed(batch, held & stalled[:, None], iteration, relative)
@@ -362,7 +364,7 @@ class GeneralClusters:
                     scaled = scaled - np.einsum("nkc,nk->nc", unit, step)
                     total += step
                 miss = np.abs(np.einsum("nkc,nc->nk", unit, scaled) - wanted)
-                bad = ~(miss <= SPEED_TOLERANCE * reach[:, None])
+                bad = ~(miss <= DENSE_SPEED_TOLERANCE * reach[:, None])
                 if bad.any():
                     return _failed(batch, bad, 3, miss)
                 flat[batch.columns] = np.where(free, root_w * scaled, speeds)

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.target import FloatArray
-
-#: Singular values below this part of the largest belong to rows that depend on others. It is the square root of the
-#: rounding error, 1.5e-8: the matrix A M^-1 A^T of a projection has the squares of these values, so that what lies
-#: below is rounding there, and as a condition number it leaves multipliers half of their digits. Rows that do depend
-#: on each other come out at the rounding of their gradients, eps |x| / d for rows of the size d at the place x, which
-#: stays below it up to 10^7 bond lengths from the origin.
-RANK_TOLERANCE = 1e-8
+from kcons.solvers.tolerances import RANK_TOLERANCE
 
 
 def independent(singular: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:

@@ -6,14 +6,14 @@ shape, spanned by ``s01`` and ``s02``. Two bond vectors describe the triangle
 3-by-3 solve and four updates.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.distance_clusters import EightAtATime
-from kcons.solvers.kernels.array_views import at_first
+from kcons.solvers.called_solvers import Kernels
+from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver
+from kcons.solvers.kernels.aligned_memory import copied, in_one_array, room
+from kcons.solvers.kernels.array_views import at_first, halves, integers, none_of, piece
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -28,23 +28,14 @@ from kcons.solvers.kernels.eight_wide import (
     square_root,
     store_triple,
 )
-from kcons.solvers.kernels.groups_of_eight import (
-    MAX_ITERATIONS,
-    OPEN,
-    POSITION_TOLERANCE,
-    SAVED,
-    TANGENT_TOLERANCE,
-    TINY,
-    dot,
-    lane_tables,
-    lattice_numbers,
-    minimum_image,
-    restore_points,
-    worst_row,
-)
+from kcons.solvers.kernels.groups_of_eight import SAVED, dot, lane_tables, restore_points, worst_row
+from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
+from kcons.solvers.tolerances import MAX_ITERATIONS, NEWTON_TOLERANCE, SPEED_TOLERANCE, TINY
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Order of the three rows of a triangle, in local atoms."""
+#: Of the pieces of the tables, those that are named.
+_SIDES, _UNDO = 3, 4
 
 
 # Spliced into the loop as they stand: what is compiled apart is rounded otherwise, and takes longer.
@@ -130,14 +121,10 @@ def _report(multipliers, slots, place, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz)
 
 
 @njit(cache=True, fastmath=FASTMATH)
-def project_triangles(
-    points, references, velocities, inverse_dt, tangent, atoms, slots, inv_mass, given, lattice, kind, multipliers, undo
-):
-    """Project one group of eight triangles after another.
-
-    `tangent` is None where `points` are positions, to be brought to the lengths `given`, and anything else where
-    they are velocities, to be brought to these rates: a kernel is compiled for each.
-    """
+def project_triangles(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
+    """Project one group of eight triangles after another; `SimdClusterSolver` says what the arguments are."""
+    t, h, u = tables, integers(tables), halves(tables)
+    atoms, slots, inv_mass, undo = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2), piece(t, h, _UNDO)
     move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
     n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
     # Arrays that are handed on inside the loop would cost reference counting.
@@ -176,7 +163,7 @@ def project_triangles(
                 r0, r1, r2 = gather_points(given, slots, group * WIDTH)
                 size = size + (r0 * r0 + r1 * r1 + r2 * r2)
                 r0, r1, r2 = r0 * square_root(l0), r1 * square_root(l1), r2 * square_root(l2)
-            size = size * (TANGENT_TOLERANCE * TANGENT_TOLERANCE)
+            size = size * (SPEED_TOLERANCE * SPEED_TOLERANCE)
             factor = _tangent_factor(l0, l1, l2, st, w0, w1, w2, w01, w02, w12)
             c00, c01, c02, c10, c11, c12, c20, c21, c22, scale = factor
         iteration, ok = 0, False
@@ -184,7 +171,7 @@ def project_triangles(
             if tangent is None:
                 e0, e1, e2 = _length_errors(l0, l1, l2, px, py, pz, qx, qy, qz)
                 if iteration >= 3:
-                    ok = _small(absolute(e0), absolute(e1), absolute(e2), l0, l1, l2, 2.0 * POSITION_TOLERANCE)
+                    ok = _small(absolute(e0), absolute(e1), absolute(e2), l0, l1, l2, 2.0 * NEWTON_TOLERANCE)
                     if ok or iteration == MAX_ITERATIONS:
                         break
                 # A factor serves two steps: Newton, then chord; order three for both.
@@ -232,7 +219,27 @@ def project_triangles(
     return True, worst if tangent is None else np.sqrt(worst), most, worst_at
 
 
-class RigidTriangles(EightAtATime):
+@njit(cache=True, nogil=True)
+def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
+    """This and the next two as `kcons.solvers.called_solvers` says."""
+    sides = wanted if wanted.size else piece(tables, integers(tables), _SIDES)
+    return project_triangles(None, x, x_ref, v, inv_dt, sides, lattice, kind, none_of(tables), tables)
+
+
+@njit(cache=True, nogil=True)
+def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):
+    none = none_of(tables)
+    return project_triangles(True, y, x, none.reshape(0, 3), 0.0, wanted, lattice, kind, none, tables)
+
+
+@njit(cache=True, nogil=True)
+def _undo(points, tangents, velocities, tables):
+    h, u = integers(tables), halves(tables)
+    groups, kept, first = piece(u, h, 1).size // WIDTH, 3 if tangents else 6, 3 if velocities else 0
+    restore_points(points, piece(u, h, 0), piece(tables, h, _UNDO), groups, 3, kept, first)
+
+
+class RigidTriangles(SimdClusterSolver):
     """Triangles of equal masses held rigid by three distances each.
 
     Parameters
@@ -253,16 +260,9 @@ class RigidTriangles(EightAtATime):
     def __init__(self, rows: ArrayLike, atoms: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike) -> None:
         super().__init__(rows, lengths, 3)
         slots, corners = lane_tables(np.asarray(atoms).reshape(-1, 3), 3)
-        self._tables = corners, slots, np.array(inv_mass, dtype=np.float64)
-        self._sizes = (6 * len(corners),)
+        weights = np.array(inv_mass, dtype=np.float64)
+        self.tables = in_one_array((corners, slots, weights, self.lengths, room(6 * len(corners))))
 
-    def tables(self) -> tuple[NDArray[Any], ...]:
-        """What kernels that call `project_triangles` need.
-
-        Returns
-        -------
-        tuple of ndarray
-            Atoms, slots, lengths, inverse masses, flat; and the room to undo in, of which only the size counts.
-        """
-        atoms, slots, inv_mass = self._tables
-        return atoms, slots, self.lengths, inv_mass, np.broadcast_to(0.0, self._sizes)
+    def packed(self) -> PackedLanes:
+        """A copy for other kernels."""
+        return PackedLanes(Kernels(_positions, _tangents, undo=_undo), copied(self.tables))

@@ -7,7 +7,6 @@ What one particle on a surface takes, and a hundred thousand. Values and gradien
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -15,22 +14,31 @@ from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import CalledSolver
-from kcons.solvers.cluster_solver import Request
+from kcons.solvers.called_solvers import CalledSolver, Kernels
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import halves, integers, piece
+from kcons.solvers.kernels.lattices import OPEN
 from kcons.solvers.kernels.two_and_four_wide import entry, lane, load_point, number, put, quad, rolled
 from kcons.solvers.sparse.elimination import FAST
-from kcons.solvers.sparse.mixed_rows import SPEED_TOLERANCE
 from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
 from kcons.solvers.sparse.row_values import cell_of, miss, near
 from kcons.solvers.sparse.rows_at_once import BLOCK, call_rows
-from kcons.solvers.sparse.step_control import FLAT, MANY_ITERATIONS, MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
+from kcons.solvers.tolerances import (
+    EPS,
+    FLAT,
+    MANY_ITERATIONS,
+    MAX_HALVINGS,
+    MAX_ITERATIONS,
+    NEAR,
+    NEWTON_TOLERANCE,
+    ROUNDING,
+    SPEED_ROUNDINGS,
+    SPEED_TOLERANCE,
+)
 
-_EPS = float(np.finfo(float).eps)
 #: What is known of one of them: the error that is rounding, the last one, the multiplier that had it, and how
 #: often the step from there was halved, -1 once it has arrived.
-WORDS, ROUNDING, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
+WORDS, ALLOWED, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
 #: Of the pieces of `SingleRows.tables`, those that are named.
 _PUSHES, _SOLUTION, _RUNS = 7, 8, 9
 
@@ -70,21 +78,17 @@ class SingleRows(CalledSolver):
             )
         )
         self._pushes, self._solution = part_of(self.tables, _PUSHES), part_of(self.tables, _SOLUTION)
+        self.kernels, self.numbers = Kernels(_positions, _tangents, _apply), self._given.numbers
+        self.refuse = self._given.refuse  # type: ignore[method-assign]
         self._made_of = constraint_set, rows, inverse_masses
 
     def __reduce__(self) -> tuple[type[SingleRows], tuple[object, ...]]:
         return SingleRows, self._made_of  # addresses are of no use elsewhere
 
     @property
-    def kernels(self) -> tuple[Any, Any, Any]:
-        return _positions, _tangents, _apply
-
-    def rank(self, x: FloatArray, lattice: FloatArray | None, time: float) -> int:
-        """Independent rows at `x`: those that some atom can answer."""
-        outcome = self.tangents(Request(np.zeros_like(x), x, None, lattice, time))
-        if not outcome.converged:
-            return len(self.rows)
-        return int(np.count_nonzero(np.add.reduceat(np.abs(self._pushes), 3 * self._links[:-3:3].astype(np.int64))))
+    def pivots(self) -> FloatArray:
+        pushes: FloatArray = np.add.reduceat(np.abs(self._pushes), 3 * self._links[:-3:3].astype(np.int64))
+        return pushes
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -155,7 +159,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers
+    careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
     """As `kcons.solvers.called_solvers` says; all is careful here."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -163,7 +167,7 @@ def _positions(  # type: ignore[no-untyped-def]
     state, scale, pushes, solution = piece(t, h, 4), piece(t, h, 5), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
     if not wanted.size:
         wanted = piece(t, h, 6)
-    runs = piece(h, h, _RUNS)
+    runs, periodic = piece(h, h, _RUNS), kind != OPEN
     worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     for begin in range(0, len(solution), BLOCK):
         stop = min(begin + BLOCK, len(solution))
@@ -190,7 +194,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 reach += math.sqrt(size * far)
             _gather(x, slot, end, atoms, relative, lattice, periodic, base, 3 * (slot - first))
             at = WORDS * (k - begin)
-            put(state, at + ROUNDING, max(1e-14 * number(scale, k), 2 * _EPS * reach))
+            put(state, at + ALLOWED, max(ROUNDING * number(scale, k), 2 * EPS * reach))
             put(state, at + PREVIOUS, np.inf)
             put(state, at + LAST, 0.0)
             put(state, at + HALVINGS, 0.0)
@@ -224,7 +228,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 whole, error, previous = number(scale, k), abs(off), number(state, at + PREVIOUS)
                 if not (error < np.inf):
                     return False, np.inf, iteration, k
-                rounding = number(state, at + ROUNDING)
+                rounding = number(state, at + ALLOWED)
                 if error <= rounding and (error <= NEWTON_TOLERANCE * whole or error > 0.1 * previous):
                     # A gradient must not have turned by 90 degrees or more within the step.
                     if not (slope > 0.0) or (iteration > MANY_ITERATIONS and _flat(slope, slot, count, masses, pushes)):
@@ -237,7 +241,7 @@ def _positions(  # type: ignore[no-untyped-def]
                     return False, error / whole, iteration, k
                 left += 1
                 last = number(state, at + LAST)
-                if previous < np.inf and not (error < 0.999 * previous) and error > 1e-10 * whole:
+                if previous < np.inf and not (error < 0.999 * previous) and error > NEAR * whole:
                     put(state, at + HALVINGS, halvings + 1.0)
                     put(solution, k, last + 0.5 * (lam - last))
                 else:
@@ -255,12 +259,12 @@ def _positions(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type: ignore[no-untyped-def]
+def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2)
     pushes, solution, driven = piece(t, h, _PUSHES), piece(t, h, _SOLUTION), wanted.size > 0
-    runs = piece(h, h, _RUNS)
+    runs, periodic = piece(h, h, _RUNS), kind != OPEN
     worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     begin, rows = 0, np.int64(0)
     for k in range(len(solution)):
@@ -305,7 +309,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type:
             lam += off * inverse
             iteration += 1
         put(solution, k, lam)
-        if not (abs(off) <= 1e3 * SPEED_TOLERANCE * size):
+        if not (abs(off) <= SPEED_ROUNDINGS * SPEED_TOLERANCE * size):
             return False, abs(off), iteration, k
         if abs(off) >= worst:
             worst, worst_row = abs(off), k

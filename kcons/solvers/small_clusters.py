@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.distance_clusters import EightAtATime
+from kcons.solvers.distance_clusters import SimdClusterSolver
 from kcons.solvers.kernels import groups_of_eight as groups
-from kcons.solvers.kernels.array_views import at_first
+from kcons.solvers.kernels.aligned_memory import in_one_array, room
+from kcons.solvers.kernels.array_views import at_first, halves, integers, piece
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -33,6 +34,8 @@ from kcons.solvers.kernels.eight_wide import (
     stack,
     store,
 )
+from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
+from kcons.solvers.tolerances import MAX_ITERATIONS, NEWTON_TOLERANCE, SPEED_TOLERANCE, TINY
 
 LARGEST = 6
 """Rows of the largest cluster; its matrix of 36 vectors stays in the first cache."""
@@ -155,10 +158,10 @@ def _begin(
         i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
         x, y, z = gather_differences(references, atoms, i, j)
         a, b, c = gather_differences(points, atoms, i, j)
-        if kind != groups.OPEN:
-            x, y, z = groups.minimum_image(x, y, z, cell, kind)
+        if kind != OPEN:
+            x, y, z = minimum_image(x, y, z, cell, kind)
             if tangent is None:
-                a, b, c = groups.minimum_image(a, b, c, cell, kind)
+                a, b, c = minimum_image(a, b, c, cell, kind)
         _set_point(s, k, x, y, z)
         _set_point(r, k, a, b, c)
         poke(sums, k, splat(0.0))
@@ -193,7 +196,7 @@ def _judge(error, step, squares, bonds, references, tangent, limit, n):
             e = e * e
         poke(error, k, e)
         poke(step, k, inner)
-        kept = kept and all_within(groups.TINY, inner)
+        kept = kept and all_within(TINY, inner)
         better = better and all_within(e, peek(squares, k) * limit)
     return kept, better
 
@@ -205,11 +208,11 @@ def _kernel(n_rows: int) -> Any:
     n_shifts = 3 * (n_rows + 1)
 
     @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
-    def project(
-        points, references, velocities, inverse_dt, tangent, atoms, slots, ends, weights, couplings,
-        given, lattice, kind, multipliers, undo,
-    ):  # fmt: skip
-        """Project one group of eight clusters after another; `tangent` as in `project_triangles`."""
+    def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
+        """Project one group of eight clusters after another; `SimdClusterSolver` says what the arguments are."""
+        t, h, u = tables, integers(tables), halves(tables)
+        atoms, slots, ends, weights = piece(u, h, 0), piece(u, h, 1), piece(h, h, 2), piece(t, h, 3)
+        couplings, undo = piece(t, h, 4), piece(t, h, 5)
         move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]
         # Arrays that are handed on inside the loop would cost reference counting.
@@ -218,7 +221,7 @@ def _kernel(n_rows: int) -> Any:
         row_ends, heavy = at_first(ends), at_first(weights)
         # Points kept of a cluster, what residuals are counted in, and the sign of multipliers.
         kept_points, unit, sign = (2 * n_local, 2.0, 1.0) if tangent is None else (n_local, 1.0, -1.0)
-        cell = groups.lattice_numbers(lattice)
+        cell = lattice_numbers(lattice)
         errors, sizes = np.empty(n * WIDTH), np.empty(n * WIDTH)
         # Reference bonds s, present bonds r; what is wanted of these, and what errors are compared with.
         s, r, shifts = stack(n_coordinates), stack(n_coordinates), stack(n_shifts)
@@ -235,7 +238,7 @@ def _kernel(n_rows: int) -> Any:
                 s, r, squares, wanted, total, n,
             )  # fmt: skip
             if tangent is not None:
-                size = size * (groups.TANGENT_TOLERANCE * groups.TANGENT_TOLERANCE)
+                size = size * (SPEED_TOLERANCE * SPEED_TOLERANCE)
                 _gram(matrix, s, s, coupling, n)
             iteration = 0
             ok = False
@@ -246,14 +249,14 @@ def _kernel(n_rows: int) -> Any:
                     x, y, z = _point(r, k)
                     if tangent is None:
                         e = peek(squares, k) - groups.dot(x, y, z, x, y, z)
-                        limit = peek(squares, k) * (2.0 * groups.POSITION_TOLERANCE)
+                        limit = peek(squares, k) * (2.0 * NEWTON_TOLERANCE)
                         ok = ok and all_within(absolute(e), limit)
                     else:
                         a, b, c = _point(s, k)
                         e = peek(wanted, k) - groups.dot(x, y, z, a, b, c)
                         ok = ok and all_within(e * e, size * peek(squares, k))
                     poke(error, k, e)
-                if ok or iteration == groups.MAX_ITERATIONS:
+                if ok or iteration == MAX_ITERATIONS:
                     break
                 # A factor serves two steps: Newton, then chord; order three for both.
                 if tangent is None and iteration % 2 == 0:
@@ -300,7 +303,7 @@ def _couplings(pairs: NDArray[np.int64], inv_mass: NDArray[np.float64]) -> NDArr
     return np.ascontiguousarray((incidence * inv_mass) @ incidence.T).reshape(-1)
 
 
-class SmallClusters(EightAtATime):
+class SmallClusters(SimdClusterSolver):
     """Clusters of the same connection and masses, up to `LARGEST` distances each.
 
     Parameters
@@ -335,5 +338,5 @@ class SmallClusters(EightAtATime):
         self._kernel = _kernel(len(local))
         weights = np.array(inv_mass, dtype=np.float64)
         slots, points = groups.lane_tables(members, len(local))
-        self._tables = points, slots, local.reshape(-1), weights, _couplings(local, weights)
-        self._sizes = (6 * len(points),)
+        given = points, slots, local.reshape(-1), weights, _couplings(local, weights)
+        self.tables = in_one_array((*given, room(6 * len(points))))

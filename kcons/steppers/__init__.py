@@ -5,25 +5,32 @@ A stepper never changes its input. Where it raises, nothing has happened.
 - `state`: where a system is, and what acts on it
 - `files`: its files, and folders of results that belong to one run
 - `operations`: a time step as data
-- `stepper`: what a stepper is
-- `stages`: what steps are made of
 - `program`, `interpreter`: operations as rows of numbers, and who makes them
-- `splitting`: kicks and drifts in turn
-- `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
-- `adaptive`: steps that choose their own size
+- `stages`: what steps are made of
+- `stepper`: what a stepper is
+- `splitting`: kicks and drifts in turn, of orders 2, 4 and 6
+- `extrapolation`: steps that choose their own size
 - `projected_ode`: the projected equation of motion, for comparison
 - `running`, `reversibility_check`: steps one after another, and taken back
 """
 
-from kcons.steppers.adaptive.extrapolation import Extrapolation
-from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4
-from kcons.steppers.geodesic import Geodesic
+from kcons.steppers.extrapolation import Extrapolation
 from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
-from kcons.steppers.rattle import Rattle
 from kcons.steppers.reversibility_check import ReversibilityCheck
-from kcons.steppers.runge_kutta_nystrom import BlanesMoan4, BlanesMoan6, BlanesMoan6a, RungeKuttaNystrom
 from kcons.steppers.running import Observer, Trajectory, run
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import (
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Composition,
+    Geodesic,
+    KahanLi6,
+    Rattle,
+    RungeKuttaNystrom,
+    Splitting,
+    Suzuki4,
+    Yoshida4,
+)
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper
 

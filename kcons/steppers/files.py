@@ -35,8 +35,6 @@ LOCK = ".kcons.lock"
 
 #: The record at the end of an archive without comment; the fifth number is how many files there are.
 _LAST_RECORD = Struct("<4s4H2LH")
-#: What reads the header of an array, by its version.
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def as_path(value: str | PathLike[str], item: str) -> Path:
@@ -240,24 +238,13 @@ def _holder(place: Path) -> str:
         return "it has just ended"
 
 
-def plain(value: Any, digits: int | None = None) -> Any:
-    """What JSON has: lists, keys that are text, and None for NaN and infinity.
-
-    Parameters
-    ----------
-    value
-    digits : int, optional
-        Significant digits that are kept of a number.
-    """
+def plain(value: Any) -> Any:
+    """What JSON has: lists, keys that are text, and None for NaN and infinity."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item, digits) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item, digits) for item in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return value if digits is None else float(f"{value:.{digits}g}")
-    return value
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def text(data: Any, indent: int | None = 1) -> str:
@@ -283,23 +270,12 @@ def stored_arrays(file: BinaryIO) -> dict[str, Any]:
             raise ValueError(f"it has {length:,} bytes and would unpack to {unpacked:,}")
         for name in archive.namelist():
             # Read whole: what `numpy.load` does not look at, it does not check either.
-            content = archive.read(name)
-            found[name.removesuffix(".npy")] = _stored_array(content, name)
+            content = BytesIO(archive.read(name))
+            array = np.lib.format.read_array(content, allow_pickle=False)
+            if content.read(1):
+                raise ValueError(f"{name} has more than its array")
+            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
     return found
-
-
-def _stored_array(content: bytes, name: str) -> Any:
-    """An array, or its only number, whose header says what there is: room is made for what a header says."""
-    opened = BytesIO(content)
-    read_header = _HEADERS.get(np.lib.format.read_magic(opened))
-    if read_header is None:
-        raise ValueError(f"{name} is no array as NumPy writes it")
-    shape, _, kind = read_header(opened)
-    said, there = math.prod(shape) * kind.itemsize, len(content) - opened.tell()
-    if not kind.hasobject and said != there:
-        raise ValueError(f"{name} has {there:,} bytes for {said:,}")
-    array = np.lib.format.read_array(BytesIO(content), allow_pickle=False)
-    return array if array.ndim else array.item()
 
 
 def refuse_clock(time: Any, step: Any, time_remainder: Any) -> None:

@@ -1,9 +1,9 @@
 """The interpreter of time steps on arrays: programs run in compiled calls, and in Python where no kernel can.
 
-Every operation is made by a method that is named by its verb. The kernel (`stages.compiled_operations`) makes as many
-of them as it knows in one call; it comes back for the forces, and for what it cannot solve, which the engine then does
-with more means. Where rows move, are too many or of kinds that kernels do not know, all operations are made by the
-methods.
+The kernel (`stages.compiled_operations`) makes as many operations as it knows in one call: kicks, flights, great
+circles, projections. It comes back for the forces, for operations that have a method of their name here, and for rows
+that it cannot solve: those that move, are too many or of kinds that kernels do not know are solved by the engine, as
+are those that need more means.
 """
 
 from __future__ import annotations
@@ -17,21 +17,18 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError
 from kcons.motion.certificate import checked_every
-from kcons.steppers.operations import Damp, Fly, Settle
 from kcons.steppers.program import Program, Row
 from kcons.steppers.stages.compiled_operations import (
+    ENGINE,
     FAR,
     ITERATIONS,
     LENGTH,
     PAIRS,
+    PYTHON,
     ROOM,
     WIDTH,
-    add_kick,
     check_finite,
-    fly,
-    fly_once,
     kernel,
-    land,
     tangents,
 )
 from kcons.steppers.state import State, System
@@ -41,14 +38,7 @@ _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
 _FLOAT = np.dtype(np.float64)
 _EMPTY = np.empty(0)
-#: A room of nothing but its beginning.
-_PLAIN = np.array([0.0, -1.0, 0.0])
 _compiled, _tangents = cache(kernel), cache(tangents)
-
-
-def _nothing(at: int, *given: Any) -> int:
-    """In the place of the kernel where everything is left to Python."""
-    return at
 
 
 class Interpreted(Listed):
@@ -85,7 +75,7 @@ class Interpreted(Listed):
         known, steps = self.depends_on(system, state), self.at_once(state, steps)
         if kept is not None and kept[0] is state and kept[1] is self and kept[2] == known and kept[3].dt == dt:
             on_their_way = kept[3]
-            on_their_way.go_on(state, steps)
+            on_their_way.resume(state, steps)
         else:
             on_their_way = self.begun(system, state, dt, steps)
         after = on_their_way.through()
@@ -179,7 +169,7 @@ class Interpreter:
     __slots__ = (
         *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
-        "far",
+        *("table", "far"),
     )
 
     #: Whether forces are those of the System's function, all at once.
@@ -207,21 +197,23 @@ class Interpreter:
         self.known = f is not None
         self.forces: FloatArray = np.zeros(shape) if f is None or system.force is None else f
         self.low: FloatArray | None = None
-        if program.pairs or numbers is not _EMPTY:
-            size = 3 * x.size if program.pairs else 0
-            self.room = room = np.empty(ROOM + size + len(numbers))
-            room[PAIRS], room[ITERATIONS], room[FAR] = program.pairs, -1.0, 0.0
-            room[ROOM + size :] = numbers
-            self.numbers = room[ROOM + size :]
-            if size:
-                self.low, self.push, self.spare = room[ROOM : ROOM + size].reshape(3, *shape)
-                room[ROOM : ROOM + 2 * x.size] = 0.0
-        else:
-            self.room, self.numbers = _PLAIN.copy(), numbers
+        size = 3 * x.size if program.pairs else 0
+        self.room = room = np.zeros(ROOM + size + len(numbers))
+        room[PAIRS], room[ITERATIONS] = program.pairs, -1.0
+        if size:
+            self.low, self.push, self.spare = room[ROOM : ROOM + size].reshape(3, *shape)
+        self.numbers = room[ROOM + size :]
+        self.numbers[:] = numbers
+        self.table = program.numbers
+        if system.friction is not None:  # flights take another time than their length
+            self.table = self.table.copy()
+            for k, row in enumerate(program.rows):
+                if row.name == "fly":
+                    self.table[WIDTH * k + LENGTH] = self.length(row) / dt
         self.then, self.left_over_then = start.time, start.time_remainder
         self._look_ahead()
 
-    def go_on(self, state: State, steps: int) -> None:
+    def resume(self, state: State, steps: int) -> None:
         """Get ready for more steps, from the state that the last ones have ended in."""
         self.start, self.steps, self.made = state, steps, 0
         self.number += 1
@@ -266,13 +258,11 @@ class Interpreter:
         """Go through the program; where the positions are in the end."""
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
         system, program, dt, v, room, shape = self.system, self.program, self.dt, self.v, self.room, self.shape
-        packed, force, at = system.packed, system.force, 0
+        packed, force, numbers, run, at = system.packed, system.force, self.table, _compiled(), 0
         given, held = system.motion.sources
-        numbers = program.numbers if system.friction is None else self._damped()
-        run, tables, simple = _nothing, _EMPTY, False
-        if packed is not None:
-            run, tables, simple = _compiled(), packed.tables, self.simple and not system.velocity_dependent
-        cell = held.lattice
+        room[ENGINE] = packed is None
+        tables = system.tables_without_rows if packed is None else packed.tables
+        simple, cell = self.simple and not system.velocity_dependent, held.lattice
         new, array, double, end = np.empty, np.ndarray, _FLOAT, len(program.rows) - 1
         while True:
             more = self.made + 1 < self.steps
@@ -299,33 +289,34 @@ class Interpreter:
                     self.forces, self.known = raw if usual else system.accepted(raw, self.number, False), True
                     if held.lattice is not cell or given.lattice is not cell:
                         # It may be a barostat, too.
-                        tables, cell = packed.tables, held.lattice  # type: ignore[union-attr]
+                        tables, cell = tables if packed is None else packed.tables, held.lattice
             elif at == end:
-                if (not more and not program.rows[end].here and packed is not None) or self.end_step(program.rows[end]):
+                here = program.rows[end].here
+                if here:
+                    self.x = self.place(here)
+                if not more or room[FAR]:
                     break
+                # The kernel goes on by itself but where positions are in another array.
+                self.out = new(shape)
+                if self.low is not None:
+                    self.low.fill(0.0)
+                self._next_step()
                 at = 0
                 continue
             else:
-                if found < 0:
-                    packed.refuse()  # type: ignore[union-attr]
                 row = program.rows[at]
-                if row.function is None or found < 0 or not self.call(row):
-                    getattr(self, row.name)(row, found < 0)
+                if found >= 0 and row.verb != PYTHON:
+                    check_finite(self.force_of(row), "force", self.number)
+                if packed is not None and found < 0:
+                    packed.refuse()
+                getattr(self, row.name)(row, found < 0)
                 if packed is not None:
                     tables = packed.tables
             at += 1
         self.made += 1
         if packed is not None and room[ITERATIONS] != packed.iterations:
             packed.took(room[ITERATIONS])
-        return program.rows[end].here
-
-    def _damped(self) -> FloatArray:
-        """What the kernel reads of the program where friction changes the length of flights."""
-        numbers = self.program.numbers.copy()
-        for k, row in enumerate(self.program.rows):
-            if row.name == "fly":
-                numbers[WIDTH * k + LENGTH] = self.length(row) / self.dt
-        return numbers
+        return here
 
     def _next_step(self) -> None:
         self.made += 1
@@ -340,20 +331,6 @@ class Interpreter:
         self.then = then = time + change
         part = then - time
         self.left_over_then = (time - (then - part)) + (change - part)
-
-    def end_step(self, row: Row) -> bool:
-        """Whether the march is over: all steps are made, or all is so far from the origin that remainders are kept."""
-        if row.here:
-            self.x = self.place(row.here)
-            self.out = np.empty(self.shape)
-        if self.system.packed is None:
-            self.room[FAR] = self.system.is_far(self.x)
-        if self.made + 1 >= self.steps or self.room[FAR]:
-            return True
-        if self.low is not None:
-            self.low.fill(0.0)
-        self._next_step()
-        return False
 
     # -- where it is ----------------------------------------------------------------------------
 
@@ -381,7 +358,7 @@ class Interpreter:
     def force_of(self, row: Row) -> FloatArray:
         """The forces of its group."""
         n = len(self.x)
-        return self.forces[row.group * n : (row.group + 1) * n] if row.kick else self.system.weights
+        return self.forces[row.group * n : (row.group + 1) * n]
 
     def along(self, v: FloatArray, x: FloatArray, time: float) -> FloatArray:
         """v itself, made tangent to the constraints at x."""
@@ -401,15 +378,8 @@ class Interpreter:
     # -- verbs ----------------------------------------------------------------------------------
     # Each is given its row, and whether the kernel has done all of it but the solve.
 
-    def kick(self, row: Row, begun: bool) -> None:
-        """Take the kick, and what rounding took of velocities."""
-        kick, f, weights = row.kick * self.dt, self.force_of(row), self.system.weights
-        pairs = self.low is not None
-        if not (land(self.v, self.push, kick, f, weights) if pairs else add_kick(self.v, kick, f, weights)):
-            check_finite(f, "force", self.number)
-
     def fly(self, row: Row, begun: bool) -> None:
-        """A flight along the constraints, from velocities on them or off by M^-1 A^T times anything.
+        """The end of a flight along the constraints, from velocities on them or off by M^-1 A^T times anything.
 
         x1 = x0 + h u with sigma(x1, t1) = 0, u = v + M^-1 A(x0)^T l: RATTLE without forces, order 2. The impulse takes
         what v has across the constraints, so that kicks need no projection before it. Rows of velocities hold at the
@@ -420,32 +390,15 @@ class Interpreter:
         ----------
         McLachlan and Perlmutter, J. Nonlinear Sci. 16, 283 (2006).
         """
-        assert isinstance(row.operation, Fly)
-        system, h, here, there = self.system, self.length(row), self.place(row.here), self.place(row.there)
-        kick, f, weights = row.kick * self.dt, self.force_of(row), system.weights
-        circles = system.great_circles if row.operation.exact else None
-        before = np.zeros(0) if circles is None or self.low is None else self.low.copy()
-        if not begun:
-            if self.low is None:
-                sound = fly_once(here, self.v, kick, f, weights, h, there)
-            else:
-                sound = fly(here, self.low, self.v, self.push, kick, f, weights, h, there)
-            if not sound:
-                check_finite(f, "force", self.number)
-        if circles is not None:
-            assert self.low is not None
-            circles.land(here, before, self.v, self.push, h, there, self.low)
-            return
+        h, here, there = self.length(row), self.place(row.here), self.place(row.there)
         self.room[ITERATIONS] = -1.0
-        system.motion.project_positions(
+        self.system.motion.project_positions(
             there, here, time=self.at(row.end), reference_time=self.at(row.begin), velocities=self.push, dt=h, flight=h,
             out=there,
         )  # fmt: skip
 
     def project(self, row: Row, begun: bool) -> None:
         """Velocities onto the constraints."""
-        if not begun:
-            self.kick(row, False)
         x = self.place(row.here)
         check_finite(x, "position", self.number)
         self.system.motion.project_velocities(x, self.v, time=self.at(row.end), out=self.v)
@@ -459,18 +412,9 @@ class Interpreter:
             self.forces = self.system.forces(x, self.v, self.at(row.end), self.number, copy=False, finite=False)
             self.known = True
 
-    def call(self, row: Row) -> bool:
-        """Let a function do what the kernel would let it do; whether it has."""
-        self.kick(row, False)
-        n, h, x = len(self.x), row.length * self.dt, self.place(row.here)
-        f = self.forces[row.group * n : (row.group + 1) * n].ravel()
-        return not row.function(x, self.v, f, h, self.numbers, _EMPTY)
-
     def settle(self, row: Row, begun: bool) -> None:
         """v = projected(v + h M^-1 f(x, v)), by iteration."""
-        assert isinstance(row.operation, Settle)
         system, now = self.system, self.at(row.end)
-        self.kick(row, False)
         self.show(row)
         positions, drifted = self.whole(self.x), self.v.copy()
         half_kick = (row.length * self.dt) * system.inverse_masses
@@ -499,10 +443,8 @@ class Interpreter:
 
     def damp(self, row: Row, begun: bool) -> None:
         """Friction of the system at fixed positions."""
-        assert isinstance(row.operation, Damp) and self.system.friction is not None
-        self.kick(row, False)
-        here = self.place(row.here)
-        self.system.friction.damp(here, self.v, row.length * self.dt, self.at(row.end))
+        assert self.system.friction is not None
+        self.system.friction.damp(self.place(row.here), self.v, row.length * self.dt, self.at(row.end))
 
     # -- the end --------------------------------------------------------------------------------
 

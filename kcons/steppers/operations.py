@@ -26,16 +26,18 @@ class Operation:
         What it does, in words.
     fraction : float
         The share of the step that it is over; 0 where it takes no time.
+    group : str
+        Whose forces it takes, where they come in groups (`kcons.thermostats.multistep`); empty for all.
     """
 
     verb: ClassVar[str]
     meaning: ClassVar[str]
     fraction: ClassVar[float] = 0.0
+    group: ClassVar[str] = ""
 
     def __str__(self) -> str:
         share = f"{self.fraction:.8g}" if isinstance(self, Timed) else ""
-        group = getattr(self, "group", "")
-        return f"{self.verb:<9} {share:<13} {self.meaning}" + (f": {group}" if group else "")
+        return f"{self.verb:<9} {share:<13} {self.meaning}" + (f": {self.group}" if self.group else "")
 
 
 @dataclass(frozen=True)
@@ -47,17 +49,10 @@ class Timed(Operation):
 
 @dataclass(frozen=True)
 class Kick(Timed):
-    """v changes by h M^-1 f, with the forces last evaluated.
-
-    Attributes
-    ----------
-    group : str
-        Whose forces, where they come in groups (`kcons.thermostats.multistep`); empty for all.
-    """
+    """v changes by h M^-1 f, with the forces last evaluated."""
 
     verb, meaning = "kick", "change velocities by forces"
-
-    group: str = ""
+    group: str = ""  # type: ignore[misc]
 
 
 class Settle(Timed):
@@ -68,17 +63,10 @@ class Settle(Timed):
 
 @dataclass(frozen=True)
 class Turn(Timed):
-    """The isokinetic kick: v turns towards M_par^+ f and keeps its length (`kcons.thermostats.isokinetic.kick`).
-
-    Attributes
-    ----------
-    group : str
-        As for `Kick`.
-    """
+    """The isokinetic kick: v turns towards M_par^+ f and keeps its length (`kcons.thermostats.isokinetic.kick`)."""
 
     verb, meaning = "turn", "change velocities by forces at constant kinetic energy"
-
-    group: str = ""
+    group: str = ""  # type: ignore[misc]
 
 
 class Damp(Timed):
@@ -114,7 +102,6 @@ class Fly(Timed):
     """
 
     verb = "fly"
-
     flights: tuple[float, ...]
     ends: tuple[float, ...]
     exact: bool = False
@@ -128,17 +115,10 @@ class Fly(Timed):
 
 @dataclass(frozen=True)
 class Evaluate(Operation):
-    """Forces at the positions and the time that the step has come to.
-
-    Attributes
-    ----------
-    group : str
-        As for `Kick`.
-    """
+    """Forces at the positions and the time that the step has come to."""
 
     verb, meaning = "evaluate", "forces at the new positions"
-
-    group: str = ""
+    group: str = ""  # type: ignore[misc]
 
 
 class Project(Operation):
@@ -194,16 +174,11 @@ def splitting(
     if settled:
         for fraction, stage in zip(drifts, stages, strict=True):
             done += [Kick(0.5 * fraction), stage, Settle(0.5 * fraction)]
-    elif len(kicks) > len(drifts):
-        done.append(Kick(kicks[0]))
-        for stage, fraction in zip(stages, kicks[1:], strict=True):
-            done += [stage, Evaluate(), Kick(fraction)]
-        done.append(Project())
     else:
-        done.append(stages[0])
-        for fraction, stage in zip(kicks, stages[1:], strict=True):
-            done += [Evaluate(), Kick(fraction), stage]
-        done.append(Project())
+        first = [Kick(kicks[0])] if len(kicks) > len(drifts) else []
+        for fraction, stage in zip(kicks[len(first) :], stages, strict=False):
+            done += [stage, Evaluate(), Kick(fraction)]
+        done = [*first, *done, *stages[len(kicks) - len(first) :], Project()]
     return tuple(_damped(done) if damped else done)
 
 

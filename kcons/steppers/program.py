@@ -17,7 +17,8 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.solvers.called_solvers import address_of
 from kcons.steppers.operations import Fly, Kick, Operation
-from kcons.steppers.stages.compiled_operations import ADDRESS, CALL, END, FLY, FUNCTION, KICK, PROJECT, PYTHON, WIDTH
+from kcons.steppers.stages import compiled_operations as kernel
+from kcons.steppers.stages.compiled_operations import ADDRESS, CALL, FUNCTION, PYTHON, WIDTH
 
 #: Operations that show positions to a force function, after which they are not written to again.
 SHOWN = ("evaluate", "settle")
@@ -50,13 +51,13 @@ class Row(NamedTuple):
 
     name: str
     verb: int
-    here: int = 0
-    there: int = 0
-    length: float = 0.0
-    kick: float = 0.0
-    group: int = 0
-    begin: float = 0.0
-    end: float = 0.0
+    here: int
+    there: int
+    length: float
+    kick: float
+    group: int
+    begin: float
+    end: float
     number: int = 0
     operation: Operation | None = None
     function: Any = None
@@ -121,17 +122,17 @@ def _rows(
 ) -> Iterator[Row]:
     kick = Kick(0.0)  # what is still to be taken
     here, time, met = 0, 0.0, Counter[str]()
-    for number, operation in enumerate(operations):
-        verb = operation.verb
+    for number, operation in enumerate([*operations, None]):
+        verb = "end_step" if operation is None else operation.verb
         if kick.fraction and verb not in ("fly", "project"):
-            yield Row("kick", KICK, here, here, 0.0, kick.fraction, groups[kick.group], time, time)
+            yield Row("kick", kernel.KICK, here, here, 0.0, kick.fraction, groups[kick.group], time, time)
             kick = Kick(0.0)
-        if isinstance(operation, Kick):
+        if operation is None:
+            yield Row("end_step", kernel.END, here, here, 0.0, 0.0, 0, 1.0, 1.0)
+        elif isinstance(operation, Kick):
             kick = operation
-            continue
-        what = CALL if verb in functions else FLY if verb == "fly" else PROJECT if verb == "project" else PYTHON
-        if isinstance(operation, Fly):
-            what = PYTHON if operation.exact or verb in python else what
+        elif isinstance(operation, Fly):
+            what = PYTHON if verb in python else kernel.CIRCLE if operation.exact else kernel.FLY
             later = takewhile(lambda other: other.verb not in SHOWN, operations[number:])
             left = sum(len(other.flights) for other in later if isinstance(other, Fly))
             for length, end in zip(operation.flights, operation.ends, strict=True):
@@ -139,13 +140,11 @@ def _rows(
                 there, group = 1 + left % 2, groups.get(kick.group, 0)
                 yield Row(verb, what, here, there, length, kick.fraction, group, time, end, 0, operation)
                 here, time, kick = there, end, Kick(0.0)
-            continue
-        what = PYTHON if verb in python else what
-        group = groups.get(kick.group if kick.fraction else getattr(operation, "group", ""), 0)
-        times = (operation.fraction, kick.fraction, group, time, time, met[verb])
-        yield Row(verb, what, here, here, *times, operation, functions.get(verb))
-        met[verb] += 1
-        kick, here = Kick(0.0), 0 if verb in SHOWN else here
-    if kick.fraction:
-        yield Row("kick", KICK, here, here, 0.0, kick.fraction, groups[kick.group], time, time)
-    yield Row("end_step", END, here, here, 0.0, 0.0, 0, 1.0, 1.0)
+        else:
+            what = CALL if verb in functions else kernel.PROJECT if verb == "project" else PYTHON
+            what = PYTHON if verb in python else what
+            group = groups.get(kick.group if kick.fraction else operation.group, 0)
+            times = (operation.fraction, kick.fraction, group, time, time, met[verb])
+            yield Row(verb, what, here, here, *times, operation, functions.get(verb))
+            met[verb] += 1
+            kick, here = Kick(0.0), 0 if verb in SHOWN else here

@@ -27,19 +27,25 @@ from kcons.steppers.stepper import explained, stays
 STABLE = 2.0
 
 
-class ProjectedOde:
-    """Base of the schemes that integrate (105).
+class ProjectedVerlet:
+    """Velocity Verlet on (105), the velocity in b predicted: order 2, one force evaluation, nothing conserved.
+
+    Neither reversible nor symplectic. Not for use but for comparison: energy drifts by a thousand times what that of
+    `Rattle` may, and without `project` the constraints drift too, until it diverges.
 
     Parameters
     ----------
     project : bool
-        Whether to project positions (along the gradients at the start) and velocities after each step.
+        Whether to project positions (along the gradients at the start) before the force is evaluated, and velocities
+        at the end of the step.
     """
 
     order: int = 2
     reversible = False
     symplectic = False
     force_evaluations: int = 1
+    #: Of the feedback.
+    rate = 0.0
 
     def __init__(self, *, project: bool = False) -> None:
         self.project = bool(project)
@@ -78,70 +84,51 @@ class ProjectedOde:
                 "shorter step, or Rattle, which is exact",
                 item="dt",
             )
-        time, time_remainder = state.later(dt)
-        start = self._with_forces(system, state)
+        time, left_over = state.later(dt)
         try:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                x, v, forces = self._advance(system, start, dt, time, number)
-                check_finite(x, "position", number)
-                check_finite(v, "velocity", number)
+                x, v, forces = self._advance(system, state, dt, time)
+                _refuse_diverged(x, v, number)
                 if self.project:
                     system.motion.project_velocities(x, v, time=time, out=v)
         except ConvergenceError as error:
             raise explained(error, system, state, dt, number) from error
-        more = None, state.barostat, (ref(system), x, v, time)
-        return State(x, v, time, forces, number, None, time_remainder, *more)
-
-    def _with_forces(self, system: System, state: State) -> State:
-        return system.with_forces(state)
+        return State(x, v, time, forces, number, None, left_over, None, state.barostat, (ref(system), x, v, time))
 
     def _advance(
-        self, system: System, start: State, dt: float, time: float, number: int
+        self, system: System, start: State, dt: float, time: float
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        raise NotImplementedError
+        """Positions, velocities, and forces where these are those at the end."""
+        start, number = system.with_forces(start), start.step + 1
+        x0, v0, f0 = system.taken(start)
+        assert f0 is not None
+        a0 = self._acceleration(system, x0, v0, f0, start.time, number)
+        half = v0 + (0.5 * dt) * a0
+        x = x0 + dt * half
+        self._arrive(system, start, x, time)
+        predicted = half + (0.5 * dt) * a0
+        f = system.forces(x, predicted, time, number)
+        v = half + (0.5 * dt) * self._acceleration(system, x, predicted, f, time, number)
+        return x, v, None if system.velocity_dependent else f
 
-    def _arrive(self, system: System, start: State, x: FloatArray, time: float, number: int) -> None:
+    def _arrive(self, system: System, start: State, x: FloatArray, time: float) -> None:
         """With `project`, bring the new positions onto the constraints, in place."""
-        check_finite(x, "position", number)
+        check_finite(x, "position", start.step + 1)
         if self.project:
             system.motion.project_positions(x, start.positions, time=time, reference_time=start.time, out=x)
 
     def _acceleration(
         self, system: System, x: FloatArray, v: FloatArray, f: FloatArray, time: float, number: int
     ) -> FloatArray:
-        check_finite(x, "position", number)
-        check_finite(v, "velocity", number)
-        return system.motion.acceleration(x, v, system.resisted(f, v), time)
+        _refuse_diverged(x, v, number)
+        feedback, held = None, system.motion.constraint_set
+        if self.rate:
+            slip = held.jacobian(x, time) @ v.ravel() - held.velocity_target(x, time)
+            feedback = -2 * self.rate * slip - self.rate**2 * held.value(x, time)
+        return system.motion.acceleration(x, v, system.resisted(f, v), time, feedback=feedback)
 
 
-class ProjectedVerlet(ProjectedOde):
-    """Velocity Verlet on (105), the velocity in b predicted: order 2, one force evaluation, nothing conserved.
-
-    Neither reversible nor symplectic. Not for use but for comparison: energy drifts by a thousand times what that of
-    `Rattle` may, and without `project` the constraints drift too, until it diverges.
-
-    Parameters
-    ----------
-    project : bool
-        Whether to project positions before the force is evaluated, and velocities at the end of the step.
-    """
-
-    def _advance(
-        self, system: System, start: State, dt: float, time: float, number: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0, f0 = system.taken(start)
-        assert f0 is not None
-        a0 = self._acceleration(system, x0, v0, f0, start.time, number)
-        half = v0 + (0.5 * dt) * a0
-        x = x0 + dt * half
-        self._arrive(system, start, x, time, number)
-        predicted = half + (0.5 * dt) * a0
-        f = system.forces(x, predicted, time, number)
-        v = half + (0.5 * dt) * self._acceleration(system, x, predicted, f, time, number)
-        return x, v, None if system.velocity_dependent else f
-
-
-class ProjectedRungeKutta4(ProjectedOde):
+class ProjectedRungeKutta4(ProjectedVerlet):
     """The classical Runge-Kutta scheme on (105): order 4, four force evaluations, nothing conserved.
 
     Neither reversible nor symplectic. Not for long runs, in which energy drifts steadily; use `BlanesMoan4` or
@@ -156,14 +143,11 @@ class ProjectedRungeKutta4(ProjectedOde):
     order = 4
     force_evaluations = 4
 
-    def _with_forces(self, system: System, state: State) -> State:
-        return replace(state, forces=None)
-
     def _advance(
-        self, system: System, start: State, dt: float, time: float, number: int
+        self, system: System, start: State, dt: float, time: float
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0, _ = system.taken(start)
-        middle = start.time + 0.5 * dt
+        x0, v0, _ = system.taken(replace(start, forces=None))
+        middle, number = start.time + 0.5 * dt, start.step + 1
 
         def slope(x: FloatArray, v: FloatArray, t: float) -> FloatArray:
             return self._acceleration(system, x, v, system.forces(x, v, t, number), t, number)
@@ -177,7 +161,7 @@ class ProjectedRungeKutta4(ProjectedOde):
         a4 = slope(x4, v4, time)
         x = x0 + (dt / 6) * (v0 + 2 * v2 + 2 * v3 + v4)
         v = v0 + (dt / 6) * (a1 + 2 * a2 + 2 * a3 + a4)
-        self._arrive(system, start, x, time, number)
+        self._arrive(system, start, x, time)
         return x, v, None
 
 
@@ -203,12 +187,7 @@ class Baumgarte(ProjectedRungeKutta4):
     def __repr__(self) -> str:
         return f"Baumgarte(rate={self.rate:g})"
 
-    def _acceleration(
-        self, system: System, x: FloatArray, v: FloatArray, f: FloatArray, time: float, number: int
-    ) -> FloatArray:
-        check_finite(x, "position", number)
-        check_finite(v, "velocity", number)
-        held = system.motion.constraint_set
-        slip = held.jacobian(x, time) @ v.ravel() - held.velocity_target(x, time)
-        feedback = -2 * self.rate * slip - self.rate**2 * held.value(x, time)
-        return system.motion.acceleration(x, v, system.resisted(f, v), time, feedback=feedback)
+
+def _refuse_diverged(x: FloatArray, v: FloatArray, number: int) -> None:
+    check_finite(x, "position", number)
+    check_finite(v, "velocity", number)

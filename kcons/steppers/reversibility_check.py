@@ -62,8 +62,8 @@ class ReversibilityCheck(Listed):
     def check(self, system: System) -> None:
         self.stepper.check(system)
 
-    def turned(self, state: State) -> State:
-        return self.stepper.turned(state) if isinstance(self.stepper, Listed) else state
+    def time_reversed(self, state: State) -> State:
+        return self.stepper.time_reversed(state) if isinstance(self.stepper, Listed) else state
 
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.

@@ -11,7 +11,7 @@ from kcons.constraints.arguments import check_call, finite_number, refuse_other,
 from kcons.constraints.target import FloatArray
 from kcons.motion.certificate import checked_every
 from kcons.steppers.files import refuse_clock
-from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Rattle
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper, require_stepper
 

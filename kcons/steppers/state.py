@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, TypeAlias
 from weakref import ReferenceType, ref
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import as_array, check_call, finite_array, finite_number, lent, numbers, refuse_other
 from kcons.constraints.constraint import IntArray
@@ -25,8 +25,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
 from kcons.steppers.stages.compiled_operations import beyond, check_finite
 from kcons.steppers.stages.friction import Friction
-from kcons.steppers.stages.great_circles import GreatCircles
-from kcons.steppers.stages.packed_system import PackedSystem
+from kcons.steppers.stages.packed_system import PackedSystem, more_tables, spheres_of, tables_without_rows
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -68,14 +67,14 @@ class State:
 
     positions: FloatArray
     velocities: FloatArray
-    time: float = 0.0
-    forces: FloatArray | None = None
-    step: int = 0
-    remainder: FloatArray | None = None
-    time_remainder: float = 0.0
-    thermostat: FloatArray | None = None
-    barostat: FloatArray | None = None
-    origin: Origin | None = None
+    time: float
+    forces: FloatArray | None
+    step: int
+    remainder: FloatArray | None
+    time_remainder: float
+    thermostat: FloatArray | None
+    barostat: FloatArray | None
+    origin: Origin | None
 
     def __init__(
         self,
@@ -91,17 +90,11 @@ class State:
         origin: Origin | None = None,
     ) -> None:
         # Written out, since a step makes one: what dataclass writes takes three times as long.
+        origin = (None, positions, velocities, time) if origin is None and forces is not None else origin
         own = vars(self)
-        own["positions"] = positions
-        own["velocities"] = velocities
-        own["time"] = time
-        own["forces"] = forces
-        own["step"] = step
-        own["remainder"] = remainder
-        own["time_remainder"] = time_remainder
-        own["thermostat"] = thermostat
-        own["barostat"] = barostat
-        own["origin"] = (None, positions, velocities, time) if origin is None and forces is not None else origin
+        own["positions"], own["velocities"], own["time"], own["forces"] = positions, velocities, time, forces
+        own["step"], own["remainder"], own["time_remainder"] = step, remainder, time_remainder
+        own["thermostat"], own["barostat"], own["origin"] = thermostat, barostat, origin
 
     def __getstate__(self) -> dict[str, Any]:
         """All that means something to another process."""
@@ -146,7 +139,7 @@ class State:
         if self.thermostat is not None and not hasattr(stepper, "step"):
             raise InputError("the state carries variables of a thermostat; give it: reversed(stepper)", item="stepper")
         back = replace(self, velocities=-self.velocities, forces=None)  # these may depend on velocities
-        return stepper.turned(back) if hasattr(stepper, "turned") else back
+        return stepper.time_reversed(back) if hasattr(stepper, "time_reversed") else back
 
     def save(self, file: str | PathLike[str] | BinaryIO) -> None:
         """Write everything the state holds in NumPy's .npz format: a run continued from it is the same to the last bit.
@@ -193,16 +186,13 @@ class State:
 class _Shown(State):
     """A state that shares the arrays of another one, and lends them only."""
 
-    positions = property(lambda self: lent(vars(self)["positions"]))  # type: ignore[assignment]
-    velocities = property(lambda self: lent(vars(self)["velocities"]))  # type: ignore[assignment]
-    forces = property(lambda self: _lent(vars(self)["forces"]))  # type: ignore[assignment]
-    remainder = property(lambda self: _lent(vars(self)["remainder"]))  # type: ignore[assignment]
-    thermostat = property(lambda self: _lent(vars(self)["thermostat"]))  # type: ignore[assignment]
-    barostat = property(lambda self: _lent(vars(self)["barostat"]))  # type: ignore[assignment]
+
+def _lent(name: str) -> property:
+    return property(lambda self: None if vars(self)[name] is None else lent(vars(self)[name]))
 
 
-def _lent(array: FloatArray | None) -> FloatArray | None:
-    return None if array is None else lent(array)
+for _name in ("positions", "velocities", "forces", "remainder", "thermostat", "barostat"):
+    setattr(_Shown, _name, _lent(_name))
 
 
 class System:
@@ -494,16 +484,25 @@ class System:
         return out, v
 
     @cached_property
-    def packed(self) -> PackedSystem | None:
-        """What compiled steps know of the system; None where the engine makes them, operation by operation."""
+    def _more_tables(self) -> tuple[NDArray[Any], ...]:
         held = self._free_of_origin
         atoms = np.zeros(0, dtype=np.int64) if held is None else np.append(self.anchor, held)
-        return PackedSystem.of(self.motion, self.weights, atoms, self.far)
+        return more_tables(self.weights, atoms, self.far, self.great_circles)
 
     @cached_property
-    def great_circles(self) -> GreatCircles | None:
-        """Exact constrained flight; None unless every row keeps one atom on a resting sphere (or at rest)."""
-        return GreatCircles.of(self.motion)
+    def packed(self) -> PackedSystem | None:
+        """What compiled steps know of the system; None where its rows are left to the engine."""
+        return PackedSystem.of(self.motion, *self._more_tables)
+
+    @cached_property
+    def tables_without_rows(self) -> FloatArray:
+        """What they know then."""
+        return tables_without_rows(*self._more_tables)
+
+    @cached_property
+    def great_circles(self) -> FloatArray | None:
+        """Center and radius of each atom, see `spheres_of`; None unless all rows keep one on a resting sphere."""
+        return spheres_of(self.motion)
 
     @cached_property
     def anchor(self) -> int:
@@ -540,23 +539,10 @@ class System:
         far: bool = False,
         thermostat: FloatArray | None = None,
     ) -> State:
-        """The state that steps end in, with what rounding takes from its positions where they are far.
+        """The state that steps from `start` end in, with what rounding takes from its positions where they are far.
 
-        Parameters
-        ----------
-        start : State
-            Where they began.
-        number : int
-            Of the last.
-        when : tuple of float
-            The time, and what its rounding leaves over.
-        arrays : tuple of ndarray
-            Positions less `shift`, velocities, and forces.
-        low : ndarray, optional
-            What rounding has taken from the positions, where these are whole.
-        far : bool
-            Whether they have become so large that it counts.
-        thermostat : ndarray, optional
+        `when` is the time, and what its rounding leaves over; `arrays` are positions less `shift`, velocities, forces.
+        `low` is what rounding has taken from the positions, where these are whole; `far` whether that counts by now.
         """
         (x, v, forces), (time, left_over) = arrays, when
         positions, remainder = x, None

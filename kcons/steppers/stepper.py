@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from kcons.errors import ConvergenceError, InputError
+from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import State, System
+
+Error = TypeVar("Error", bound=KconsError)
 
 
 class Stepper(Protocol):
@@ -61,23 +63,20 @@ def require_stepper(stepper: Any, item: str = "stepper") -> None:
         raise InputError(f"{item} is {stepper!r}; {remedy}", item=item)
 
 
-class Portable:
+class DropsSystemCaches:
     """Base of those that remember what they found for a System: copies and other processes find it anew."""
 
     #: What the last step ended in, by which a state that goes on is known; in a copy it may be that of another System.
     _left: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
-        found = {name for name, value in vars(self).items() if isinstance(value, tuple) and _is_of_a_system(value)}
-        found.add("_left")
+        found = {n for n, v in vars(self).items() if isinstance(v, tuple) and v and isinstance(v[0], System)} | {
+            "_left"
+        }
         return {name: None if name in found else value for name, value in vars(self).items()}
 
 
-def _is_of_a_system(value: tuple[Any, ...]) -> bool:
-    return bool(value) and isinstance(value[0], System)
-
-
-class Listed(Portable):
+class Listed(DropsSystemCaches):
     """Base of those whose step is a list of operations."""
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
@@ -91,7 +90,7 @@ class Listed(Portable):
         """
         raise NotImplementedError
 
-    def turned(self, state: State) -> State:
+    def time_reversed(self, state: State) -> State:
         """A state that was `reversed`, with what its variables become: most stay."""
         return state
 
@@ -132,7 +131,7 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
     return retold(error, f"step {number}: {cause}. {error}", type(error), number)
 
 
-def retold(error: ConvergenceError, message: str, kind: type[ConvergenceError], step: int) -> ConvergenceError:
+def retold(error: Error, message: str, kind: type[Error], step: int) -> Error:
     """The same in other words."""
     told = kind(message)
     vars(told).update(vars(error), step=step)

@@ -3,6 +3,7 @@
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
+- `noise`: normal numbers drawn in kernels
 - `pressure`: barostats beside them
 - `monte_carlo`: without any error of the time step
 - `multistep`: several time steps, and isokinetic spheres

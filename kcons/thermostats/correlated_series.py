@@ -1,14 +1,15 @@
 """Errors of means and slopes of values along a run, which depend on their neighbors.
 
-The error of a mean follows from the spectrum of the series at frequency zero. A spectrum is described by three numbers:
-a level N, and a Lorentzian of one memory that makes it R N at frequency zero,
+The error of a mean follows from the spectrum of the series at frequency zero. A spectrum is described by a level N, and
+a shape L that makes it R N at frequency zero,
 
     S(f) = N (1 + (R - 1) L(f)),   L(0) = 1.
 
-R > 1 is something slow, beside whatever noise there is; R < 1 are values that swing back; R = 1 are independent values.
-All memories from a third of a block to a sixth of the series, and all R, are tried on the means of 16 to 127 blocks,
-by the likelihood of what is left when the mean (or the line) is taken out. The error is the average over all of them:
-a slow part that a run barely shows counts as far as the run leaves it likely.
+L is that of an exponential memory (a Lorentzian), or of an oscillator that is damped critically or less. R > 1 is
+something slow, beside whatever noise there is; R < 1 are values that swing back; R = 1 are independent values. All
+memories from a third of a block to a sixth of the series, with several frequencies each, and all R are tried on the
+means of 16 to 127 blocks, by the likelihood of what is left when the mean (or the line) is taken out. The error is the
+average over all of them: a slow part that a run barely shows counts as far as the run leaves it likely.
 """
 
 from __future__ import annotations
@@ -29,11 +30,16 @@ from kcons.errors import InputError
 FEWEST, FEW_INDEPENDENT = 32, 10
 #: Fewest blocks of a long series. They are joined in pairs while neighbors are so alike and `_JOINED` remain: what
 #: matters is how the spectrum begins, not how smooth a series is from value to value.
-_BLOCKS, _JOINED, _ALIKE = 64, 16, 0.6
+_BLOCKS, _JOINED, _ALIKE = 64, 16, 0.8
 #: Shortest memory in blocks, longest as a part of the series, and how many are tried between them.
 _SHORTEST, _LONGEST, _MEMORIES = 0.35, 1 / 6, 12
+#: Oscillators, by frequency times memory (0.05 stands for critical damping), how likely each is against an exponential
+#: memory before the values are seen, and their shortest period in blocks.
+_OSCILLATORS, _RARER, _PERIOD = (0.05, 2.0, 4.0, 10.0), 0.4, 1.3
+#: Smallest part of the level N that a spectrum with R < 1 falls to.
+_LOWEST = 0.05
 #: ln R. Before the values are seen R is 1 within a factor of 7 or so (a Cauchy distribution of this width).
-_LOG_R: FloatArray = np.linspace(-math.log(16.0), math.log(512.0), 40)
+_LOG_R: FloatArray = np.linspace(-math.log(16.0), math.log(4096.0), 48)
 _WIDTH = 2.0
 #: Before the values are seen a memory t has the density t^-0.25 in ln t. Chosen, with the bounds of R, so that errors
 #: are right on average for series of 20 memories and more, whether all of a series is slow or a small part of it.
@@ -72,31 +78,36 @@ class Spread(NamedTuple):
     independent: float
 
 
-class _Memory(NamedTuple):
-    """Lorentzians of one memory, as covariances between blocks: along their axes, and of the mean or the slope."""
+class _Process(NamedTuple):
+    """Covariances between blocks: along their axes, of the mean or the slope, and ln of how likely the process is."""
 
     sizes: FloatArray
     axes: FloatArray
     own: float
+    prior: float
 
 
-@lru_cache(maxsize=16)
-def _memories(blocks: int, degree: int) -> tuple[list[_Memory], float]:
-    """For each memory, and for independent blocks of unit variance the variance of the mean or of the slope."""
+@lru_cache(maxsize=4)
+def _processes(blocks: int, degree: int) -> tuple[list[_Process], float]:
+    """All that are tried, and for independent blocks of unit variance the variance of the mean or of the slope."""
     t = np.arange(blocks, dtype=np.float64)
     design = np.vander(t - t.mean(), degree + 1)
     inside = np.linalg.qr(design, mode="complete")[0][:, degree + 1 :]
     rule = np.linalg.pinv(design)[0]
     apart = np.abs(np.subtract.outer(t, t)).astype(np.int64)
     found = []
-    for memory in np.geomspace(_SHORTEST, blocks * _LONGEST, _MEMORIES):
-        a = 1.0 / memory
-        # Means over blocks of exp(-|t|/memory); the sum over all lags is 1.
-        lags = memory * (np.cosh(a) - 1.0) * np.exp(-a * t)
-        lags[0] = 1.0 - memory * (1.0 - np.exp(-a))
-        covariance = lags[apart]
-        sizes, axes = np.linalg.eigh(inside.T @ covariance @ inside)
-        found.append(_Memory(sizes, axes.T @ inside.T, float(rule @ covariance @ rule)))
+    for turn in (0.0, *_OSCILLATORS):
+        for memory in np.geomspace(_SHORTEST, blocks * _LONGEST, _MEMORIES):
+            if 2 * math.pi * memory < _PERIOD * turn:
+                continue
+            # Means over blocks of Re(a exp(-z|t|)), of which the sum over all lags is Re(2 a/z).
+            z, a = complex(1.0, -turn) / memory, complex(1.0, -1.0 / turn if turn else 0.0)
+            lags = (a / z**2 * (np.cosh(z) - 1.0) * np.exp(-z * t)).real
+            lags[0] = (a / z * (1.0 - (1.0 - np.exp(-z)) / z)).real
+            covariance = (lags / (a / z).real)[apart]
+            sizes, axes = np.linalg.eigh(inside.T @ covariance @ inside)
+            prior = math.log(_RARER if turn else 1.0) - _SLOWER * math.log(memory / _SHORTEST)
+            found.append(_Process(sizes, axes.T @ inside.T, float(rule @ covariance @ rule), prior))
     return found, float(rule @ rule)
 
 
@@ -116,18 +127,20 @@ def _error(values: FloatArray, degree: int) -> tuple[float, FloatArray]:
         size *= 2
         blocks = _means(values, size)
     count = len(blocks)
-    memories, plain = _memories(count, degree)
-    logarithms, errors, more = [], [], np.expm1(_LOG_R)
-    for k, memory in enumerate(memories):
-        spectrum = 1.0 + more[:, None] * memory.sizes
-        level = ((memory.axes @ blocks) ** 2 / spectrum).sum(axis=1) / len(memory.sizes)
+    processes, plain = _processes(count, degree)
+    logarithms, errors = [], []
+    for process in processes:
+        log_r = _LOG_R[1.0 + np.expm1(_LOG_R) * process.sizes[-1] > _LOWEST]
+        more = np.expm1(log_r)
+        spectrum = 1.0 + more[:, None] * process.sizes
+        level = ((process.axes @ blocks) ** 2 / spectrum).sum(axis=1) / len(process.sizes)
         level = np.maximum(level, np.finfo(float).tiny)
-        longer = k / (_MEMORIES - 1) * math.log(count * _LONGEST / _SHORTEST)
-        likely = -0.5 * (len(memory.sizes) * np.log(level) + np.log(spectrum).sum(axis=1))
-        logarithms.append(likely - np.log1p((_LOG_R / _WIDTH) ** 2) - _SLOWER * longer)
-        errors.append(np.sqrt(level * (plain + more * memory.own)))
-    weights = np.exp(np.array(logarithms) - np.max(logarithms))
-    error = float((weights * errors).sum() / weights.sum())
+        likely = -0.5 * (len(process.sizes) * np.log(level) + np.log(spectrum).sum(axis=1))
+        logarithms.append(likely - np.log1p((log_r / _WIDTH) ** 2) + process.prior)
+        errors.append(np.sqrt(level * (plain + more * process.own)))
+    found = np.concatenate(logarithms)
+    weights = np.exp(found - found.max())
+    error = float(weights @ np.concatenate(errors) / weights.sum())
     return error * (size * count / len(values)) ** (0.5 + degree) * size**-degree, blocks
 
 

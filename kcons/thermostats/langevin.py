@@ -18,10 +18,12 @@ from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.program import Program, Row
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
+from kcons.thermostats.noise import fill_normal
 
-#: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, and the factor of
-#: the velocities; after them the masses for each coordinate, 0 for fixed atoms, and noise.
-HEAT, WARM, KEEP, MASSES = range(4)
+#: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, gamma and k_B T,
+#: whether something is added to noise in Python, the seed's halves, the number of the step, how often noise has been
+#: drawn in it, and how often it is in each; then masses and 1/sqrt(m) for each coordinate, 0 for fixed atoms; noise.
+HEAT, WARM, FRICTION, KT, ASIDE, SEED, NUMBER, PART, PARTS, MASSES = 0, 1, 2, 3, 4, 5, 7, 8, 9, 10
 
 
 class _Generator(threading.local):
@@ -88,7 +90,7 @@ class SeededBath(Interpreted):
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
 
     def depends_on(self, system: System, state: State) -> Any:
-        return self.thermal_energy
+        return self.thermal_energy, self.friction, self.seed
 
     def refuse_back(self, system: System, dt: float) -> None:
         """Raise `InputError` for a negative time step."""
@@ -186,12 +188,6 @@ def _geodesic_baoab(flight: tuple[float, ...], *, exact: bool = False) -> tuple[
     return Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project()
 
 
-class _Mix(Operation):
-    """v = keep v + noise, where noise is known."""
-
-    verb, meaning = "mix", "friction and noise"
-
-
 class _Measure(Operation):
     """The heat that has come in since."""
 
@@ -199,12 +195,12 @@ class _Measure(Operation):
 
 
 def listed_and_made(operations: tuple[Operation, ...], groups: tuple[str, ...] = ("",)) -> tuple[Any, Program]:
-    """Operations, and the program in which an exchange is made of projections and what is between them."""
+    """Operations, and the program in which an exchange is between projections, after which its heat is measured."""
     parts: list[Operation] = []
     for operation in operations:
         exchange = isinstance(operation, Exchange)
-        parts += [Project(), operation, _Mix(), Project(), _Measure()] if exchange else [operation]
-    return operations, Program(parts, {"mix": _mix, "measure": _measure}, groups)
+        parts += [Project(), operation, Project(), _Measure()] if exchange else [operation]
+    return operations, Program(parts, {"exchange": _exchange, "measure": _measure}, groups)
 
 
 _SUMS = {"reassoc", "contract", "nsz"}
@@ -220,13 +216,33 @@ def kinetic(v, masses):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _mix(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+def _exchange(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """Draw noise and mix it in; 1 where something has to be added to it before."""
+    n = v.size
+    roots, noise = numbers[MASSES + n : MASSES + 2 * n], numbers[MASSES + 2 * n : MASSES + 3 * n]
+    seed = (np.uint64(numbers[SEED]) << np.uint64(32)) | np.uint64(numbers[SEED + 1])
+    fill_normal(seed, np.uint64(numbers[NUMBER]), np.uint64(numbers[PART]), noise)
+    numbers[PART] += 1.0
+    if numbers[PART] == numbers[PARTS]:
+        numbers[PART] = 0.0
+        numbers[NUMBER] += 1.0
+    spread = math.sqrt(-math.expm1(-2 * numbers[FRICTION] * time) * numbers[KT])
+    for i in range(n):
+        noise[i] *= spread * roots[i]
+    if numbers[ASIDE] != 0.0:
+        return 1
+    _mix(v, time, numbers)
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def _mix(v, time, numbers):  # type: ignore[no-untyped-def]
+    """v = keep v + noise."""
     u, n = flat(v), v.size
-    noise, keep = numbers[MASSES + n :], numbers[KEEP]
+    noise, keep = numbers[MASSES + 2 * n :], math.exp(-numbers[FRICTION] * time)
     numbers[WARM] = kinetic(u, numbers[MASSES : MASSES + n])
     for i in range(n):
         u[i] = keep * u[i] + noise[i]
-    return 0
 
 
 @njit(cache=True, nogil=True)
@@ -238,34 +254,32 @@ def _measure(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-de
 
 
 class LangevinStep(Interpreter):
-    """Steps on their way, of which the noise is drawn in Python."""
+    """Steps on their way."""
 
     def __init__(self, system: System, start: State, dt: float, thermostat: Langevin, steps: int) -> None:
         heat = 0.0 if start.thermostat is None else float(start.thermostat[HEAT])
-        masses = system.moving_masses
-        numbers = np.concatenate(([heat, 0.0, 0.0], masses, masses))
-        super().__init__(system, start, dt, thermostat.listed(system)[1], steps, numbers)
+        program, masses = thermostat.listed(system)[1], system.moving_masses
+        aside, seed = system.motion.plan.driven or thermostat.conserve_momentum, divmod(thermostat.seed, 2**32)
+        parts = sum(row.name == "exchange" for row in program.rows)
+        head = heat, 0.0, thermostat.friction, thermostat.thermal_energy, aside, *seed, start.step + 1, 0, parts
+        numbers = np.concatenate((head, masses, system.root_weights.ravel(), masses))
+        super().__init__(system, start, dt, program, steps, numbers)
         self.thermostat = thermostat
 
     def exchange(self, row: Row, begun: bool) -> None:
-        """Draw the noise; what friction does not act on, velocities of targets and centre of mass, is added to it."""
-        system, thermostat, dt = self.system, self.thermostat, row.length * self.dt
-        keep = math.exp(-thermostat.friction * dt)
-        spread = math.sqrt(-math.expm1(-2 * thermostat.friction * dt) * thermostat.thermal_energy)
-        noise = self.numbers[MASSES + self.v.size :].reshape(self.v.shape)
-        wound((thermostat.seed, 0), self.number, row.number).standard_normal(out=noise)
-        noise *= spread * system.root_weights
-        self.numbers[KEEP] = keep
-        driven = system.motion.plan.driven
-        if not driven and not thermostat.conserve_momentum:
-            return
-        x, v, time = self.place(row.here), self.v, self.at(row.end)
-        kept = system.motion.project_velocities(x, np.zeros_like(v), time=time) if driven else np.zeros_like(v)
+        """What friction does not act on, velocities of targets and of the centre of mass, is added to the noise."""
+        system, thermostat, dt, v = self.system, self.thermostat, row.length * self.dt, self.v
+        noise = self.numbers[MASSES + 2 * v.size :].reshape(v.shape)
+        x, time = self.place(row.here), self.at(row.end)
+        kept = np.zeros_like(v)
+        if system.motion.plan.driven:
+            kept = system.motion.project_velocities(x, kept, time=time)
         if thermostat.conserve_momentum:
             directions = thermostat.directions(system, x, time)
             noise -= drift_velocity(noise, system.masses, directions)
             kept = kept + drift_velocity(v - kept, system.masses, directions)
-        noise += (1.0 - keep) * kept
+        noise += (1.0 - math.exp(-thermostat.friction * dt)) * kept
+        _mix(v, dt, self.numbers)
 
     def variables(self) -> FloatArray:
         if self.thermostat.friction > 0:

@@ -14,11 +14,10 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import Rattle, State, System
-from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.program import Program, Row
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4, Splitting
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import (
     AT_REST,
@@ -185,7 +184,7 @@ class NoseHooverChain(Interpreted):
         directions = open_directions(system.motion, state.positions, state.time)
         return momentum_share(system.masses, state.velocities, directions) > AT_REST
 
-    def turned(self, state: State) -> State:
+    def time_reversed(self, state: State) -> State:
         """With the velocities of the links turned round, as those of a state that was `reversed` are."""
         if not carried(state, 2 * self.length + 1, "this NoseHooverChain"):
             return state

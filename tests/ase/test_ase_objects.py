@@ -23,13 +23,7 @@ from ase.constraints import (
 from ase.io import read, write
 from ase.vibrations import Vibrations
 
-from kcons.ase import (
-    Constraints,
-    ConstraintsWithFixedAtoms,
-    constrain,
-    from_ase_constraints,
-    to_ase_constraints,
-)
+from kcons.ase import Constraints, ConstraintsWithFixedAtoms, constrain, from_ase_constraints, to_ase_constraints
 from kcons.constraints import (
     Angle,
     CenterOfMass,

@@ -24,17 +24,7 @@ from ase.md.langevin import Langevin
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import FIRE
-from ase_systems import (
-    FS,
-    Field,
-    Free,
-    loose_waters,
-    off,
-    rigid,
-    slip,
-    state,
-    water,
-)
+from ase_systems import FS, Field, Free, loose_waters, off, rigid, slip, state, water
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -45,13 +35,7 @@ from kcons.ase import (
     constrain,
     rigid_water,
 )
-from kcons.constraints import (
-    Angle,
-    CenterDistance,
-    Distance,
-    LinearVelocity,
-    Sphere,
-)
+from kcons.constraints import Angle, CenterDistance, Distance, LinearVelocity, Sphere
 from kcons.errors import (
     ContradictionError,
     ConvergenceError,
@@ -215,9 +199,6 @@ def test_a_cell_too_small_is_refused_before_it_is_set():
     assert held.engine(atoms).constraint_set.half_width == pytest.approx(3)
 
 
-# -- other ASE constraints beside ours, and input that is refused before anything is changed -------
-
-
 # -- company ----------------------------------------------------------------------------------------
 
 
@@ -266,61 +247,22 @@ def nan_at(atom):
     return atoms
 
 
-def with_masses(masses):
-    atoms = molecule("H2O")
-    atoms.set_masses(masses)
-    return atoms
-
-
-def boxed(length):
-    atoms = molecule("H2O")
-    atoms.set_cell([length] * 3)
-    atoms.pbc = True
-    return atoms
-
-
-def coincident():
-    atoms = molecule("H2O")
-    atoms.positions[1] = atoms.positions[0]
-    return atoms
-
-
-BAD = {
-    "nan position": (nan_at(1), Distance([0, 1]), InputError, "position of atom 1 is not finite"),
-    "unknown atom": (molecule("H2O"), Distance([0, 7]), InputError, "no atom 7"),
-    "zero mass": (with_masses([16, 0, 1]), Distance([0, 1]), InputError, "atom 1 has mass 0"),
-    "negative mass": (with_masses([-16, 1, 1]), Distance([0, 1]), InputError, "atom 0 has mass -16"),
-    "nan mass": (with_masses([16, np.nan, 1]), Distance([0, 1]), InputError, "atom 1 has mass nan"),
-    "coincident": (coincident(), Distance([0, 1]), SingularGeometryError, "atoms 0 and 1 coincide"),
-    "two lengths": (
-        molecule("H2O"),
-        [Distance([0, 1], 0.9), Distance([1, 0], 1.0)],
-        ContradictionError,
-        "different targets",
-    ),
-    "half the box": (boxed(2.5), Distance([1, 2], 1.5264), InputError, "half the box"),
-    "zero cell": (boxed(0.0), Distance([0, 1]), InputError, "cell"),
-    "not ours": (molecule("H2O"), [FixAtoms([0])], InputError, "from_ase_constraints"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_named(case):
-    atoms, rows, error, message = BAD[case]
+@pytest.mark.parametrize(
+    ("atoms", "rows", "error", "message"),
+    [
+        (nan_at(1), Distance([0, 1]), InputError, "position of atom 1 is not finite"),
+        (molecule("H2O"), Distance([0, 7]), InputError, "no atom 7"),
+        (Atoms("OH", np.eye(3)[:2], masses=[16, 0]), Distance([0, 1]), InputError, "atom 1 has mass 0"),
+        (Atoms("OH"), Distance([0, 1]), SingularGeometryError, "atoms 0 and 1 coincide"),
+        (Atoms("OH", np.eye(3)[:2], cell=[2.5] * 3, pbc=True), Distance([0, 1], 1.5), InputError, "half the box"),
+        (molecule("H2O"), [Distance([0, 1], 0.9), Distance([1, 0], 1.0)], ContradictionError, "different targets"),
+        (molecule("H2O"), [FixAtoms([0])], InputError, "from_ase_constraints"),
+    ],
+)
+def test_bad_input_is_named(atoms, rows, error, message):
     with pytest.raises(error, match=message):
         constrain(atoms, rows)
     assert atoms.constraints == []
-
-
-@pytest.mark.parametrize("rows", [[[0, 0]], [[-1, 0]], [[0.5, 1.5]], [[0, 1, 2]]])
-def test_bad_rows_are_refused_at_once(rows):
-    with pytest.raises(InputError):
-        Distance(rows)
-
-
-def test_bad_degenerate_option():
-    with pytest.raises(InputError, match="'convert' or 'raise'"):
-        Constraints(Distance([0, 1]), degenerate="ignore")
 
 
 def failing_positions():
@@ -354,22 +296,16 @@ def test_failing_position_hook_changes_nothing(case):
     atoms.set_positions(before + 0.01)
 
 
-@pytest.mark.parametrize("hook", ["adjust_momenta", "adjust_forces"])
-def test_failing_covector_hooks_change_nothing(hook):
+@pytest.mark.parametrize("hook", ["adjust_positions", "adjust_momenta", "adjust_forces"])
+def test_hooks_refuse_what_is_not_finite_or_of_another_shape(hook):
     atoms = molecule("H2O")
     held = constrain(atoms, rigid_water(atoms))
     values = np.ones((3, 3))
     values[1, 1] = np.nan
     asked = values.copy()
-    with pytest.raises(KconsError):
+    with pytest.raises(InputError, match=r"(position|momentum|force) of atom 1 is not finite"):
         getattr(held, hook)(atoms, values)
     assert np.array_equal(values, asked, equal_nan=True)
-
-
-@pytest.mark.parametrize("hook", ["adjust_positions", "adjust_momenta", "adjust_forces"])
-def test_wrong_shapes(hook):
-    atoms = molecule("H2O")
-    held = constrain(atoms, rigid_water(atoms))
     with pytest.raises(InputError, match=r"shape \(3, 3\)"):
         getattr(held, hook)(atoms, np.zeros((4, 3)))
 
@@ -381,20 +317,6 @@ def test_time_step_too_large_in_dynamics():
         VelocityVerlet(atoms, 60 * units.fs).run(50)
     assert off(atoms, held) <= 1e-13
     assert np.isfinite(atoms.get_momenta()).all()
-
-
-def test_nan_force_in_dynamics_is_an_error():
-    class Bad(Free):
-        def calculate(self, *args, **kwargs):
-            super().calculate(*args, **kwargs)
-            self.results["forces"][0, 0] = np.nan
-
-    atoms, _ = rigid(1)
-    atoms.calc = Bad()
-    before = atoms.positions.copy()
-    with pytest.raises(KconsError, match="not finite"):
-        VelocityVerlet(atoms, 1 * units.fs).run(1)
-    assert np.array_equal(atoms.positions, before)
 
 
 def test_a_second_object_of_kcons_says_how_to_make_one():
@@ -409,7 +331,9 @@ def test_a_second_object_of_kcons_says_how_to_make_one():
 
 
 class Settings(Field):
-    """A field whose stiffness `set` changes, without forgetting what it found, as calculators of ASE do."""
+    """A field whose stiffness `set` changes."""
+
+    discard_results_on_any_change = True
 
     def __init__(self, **settings):
         super().__init__()
@@ -488,7 +412,7 @@ def test_other_questions_to_the_calculator_change_nothing():
 def test_each_calculator_of_several_time_steps(changed):
     def made(atoms, fast, slow):
         return MultipleTimeSteps(
-            atoms, FS, fast=fast, slow=slow, temperature_K=300, friction=0.01 / FS, fast_steps=2, seed=1
+            atoms, FS, fast=fast, slow=slow, temperature_K=300, friction=0.01 / FS, fast_steps=2, rng=1
         )
 
     atoms, _ = water()

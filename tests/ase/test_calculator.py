@@ -96,7 +96,7 @@ def test_new_masses_and_settings_are_noticed():
     masses = atoms.get_masses() * np.linspace(1, 3, 9)
     for change, inner in (
         (lambda: atoms.set_masses(masses), LennardJones(sigma=1.0, rc=5.0)),
-        (lambda: calculator.inner.parameters.update(sigma=1.1), LennardJones(sigma=1.1, rc=5.0)),
+        (lambda: (calculator.inner.set(sigma=1.1), calculator.inner.reset()), LennardJones(sigma=1.1, rc=5.0)),
         (lambda: setattr(calculator, "inner", LennardJones(sigma=1.2, rc=5.0)), LennardJones(sigma=1.2, rc=5.0)),
         (lambda: setattr(calculator, "project", False), LennardJones(sigma=1.2, rc=5.0)),
     ):

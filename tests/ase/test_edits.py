@@ -151,15 +151,6 @@ def test_an_edit_in_a_new_cell_is_an_edit():
         run.run(1)
 
 
-def test_positions_wrapped_between_steps_are_no_edit():
-    atoms, held = dumbbells(6, side=6.0)
-    run = VelocityVerlet(atoms, FS)
-    run.attach(atoms.wrap)
-    kinetic = atoms.get_kinetic_energy()
-    run.run(50)
-    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-9) and off(atoms, held) <= 1e-12
-
-
 def test_berendsen_scales_atoms_in_each_step():
     atoms, held = dumbbells(6)
     pressure = {"pressure_au": units.bar, "taup": 100 * FS, "compressibility_au": 10 / units.GPa}

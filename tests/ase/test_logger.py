@@ -125,7 +125,7 @@ def test_several_time_steps_and_noise():
     draw_velocities(atoms, 300, rng=1)
     places, stiffness = atoms.calc.places, atoms.calc.stiffness
     parts = {"fast": Wells(0.99 * stiffness, places), "slow": Wells(0.01 * stiffness, places)}
-    dynamics = MultipleTimeSteps(atoms, 2 * step, **parts, temperature_K=300, friction=0.5 / step, fast_steps=2, seed=3)
+    dynamics = MultipleTimeSteps(atoms, 2 * step, **parts, temperature_K=300, friction=0.5 / step, fast_steps=2, rng=3)
     dynamics.run(50)
     found = []
     dynamics.attach(lambda: found.append((dynamics.get_temperature(), atoms.get_temperature())))

@@ -13,13 +13,7 @@ from ase.md.nose_hoover_chain import NoseHooverChainNVT
 from ase.md.npt import NPT
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase_systems import (
-    FS,
-    TEMPERATURE,
-    dumbbells,
-    off,
-    random,
-)
+from ase_systems import FS, TEMPERATURE, dumbbells, off, random
 
 from kcons import ConstraintSet
 from kcons.ase import constrain
@@ -36,11 +30,7 @@ REFUSED = {
         60,
         "3 steps in a row",
     ),
-    "NPT": (
-        lambda a: NPT(a, FS, temperature_K=TEMPERATURE, externalstress=0.0, ttime=50 * FS),
-        60,
-        "3 steps in a row",
-    ),
+    "NPT": (lambda a: NPT(a, FS, temperature_K=TEMPERATURE, externalstress=0.0, ttime=50 * FS), 60, "3 steps in a row"),
 }
 
 

@@ -7,7 +7,6 @@ import pickle
 import subprocess
 import sys
 
-import ase.constraints
 import numpy as np
 import pytest
 from ase import Atoms, units
@@ -30,13 +29,8 @@ from ase.constraints import (
 )
 from ase.db import connect
 from ase.io import read, write
-from ase.io.trajectory import Trajectory
 from ase.md.verlet import VelocityVerlet
-from ase_systems import (
-    loose_waters,
-    off,
-    rigid,
-)
+from ase_systems import loose_waters, off, rigid
 
 from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (
@@ -136,9 +130,6 @@ def test_unknown_ase_constraints_are_named(other):
         from_ase_constraints(atoms)
 
 
-# -- copies, slices, replicas and files carry rows and targets -------------------------------------
-
-
 # -- copies, slices, files --------------------------------------------------------------------------
 
 
@@ -228,16 +219,6 @@ def test_extxyz_drops_the_constraints(tmp_path):
     # Targets that were explicit can be given again; positions have 8 digits there.
     constrain(again, Distance([[0, 1], [1, 2]], [1.5, 1.4]), project=True)
     assert again.get_distance(0, 1) == pytest.approx(1.5, abs=1e-14)
-
-
-def test_constraint_object_round_trip():
-    held = sample().constraints[0]
-    data = held.todict()
-    assert data["name"] in ase.constraints.__all__
-    again = dict2constraint(data)
-    assert isinstance(again, Constraints)
-    assert again.todict() == data
-    assert held.copy().todict() == data
 
 
 #: What is held, and the object of ASE that holds the same; None where no single one does.
@@ -365,18 +346,6 @@ def test_copies_are_independent():
     part = atoms.copy()
     part.constraints[0].index_shuffle(part, [0, 1, 2])
     assert len(atoms.constraints[0].constraints[0].atoms) == 6
-
-
-def test_trajectory_written_during_dynamics(tmp_path):
-    atoms, _ = rigid(2)
-    with Trajectory(tmp_path / "md.traj", "w", atoms) as file:
-        dyn = VelocityVerlet(atoms, 1 * units.fs)
-        dyn.attach(file.write, interval=5)
-        dyn.run(10)
-    frames = read(tmp_path / "md.traj", index=":")
-    assert len(frames) == 3
-    attach(frames[-1])
-    assert np.array_equal(targets(frames[-1]), targets(atoms))
 
 
 def test_function_rows_are_left_out_of_files_with_a_warning(tmp_path):

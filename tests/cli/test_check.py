@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 
@@ -213,61 +212,37 @@ def command_in_shell(folder, name, where="", **options):
     return done.status, done.out, done.errors
 
 
-def test_in_a_process_of_its_own(folder):
-    """Where nothing is imported when its streams are made."""
-    found, out, errors = command_in_shell(folder, "bad.xtc", **PLAIN)
-    done = subprocess.run(
-        [sys.executable, "-m", "kcons", *map(str, words_of(folder, "bad.xtc"))],
-        capture_output=True,
-        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHONUTF8")} | PLAIN,
-    )
-    assert (done.returncode, done.stderr) == (found, errors.encode()) == (1, b"")
-    assert times(done.stdout) == times(out)
-
-
-def times(page):
-    """A page without what is measured."""
-    return re.sub(rb"[0-9.]+ s\b", b"s", page)
-
-
-@pytest.mark.parametrize(
-    "name,status,buffered", [("good.trr", 0, "1"), ("bad.xtc", 1, ""), ("short.xtc", 3, ""), ("none.xtc", 2, "")]
-)
+@pytest.mark.parametrize("name,status,buffered", [("bad.xtc", 1, "1"), ("none.xtc", 2, "")])
 def test_in_a_c_locale(folder, name, status, buffered):
     found, out, errors = command_in_shell(folder, name, **PLAIN, PYTHONUNBUFFERED=buffered)
     assert found == status and "Traceback" not in errors
-    out.decode("ascii")
+    page = out.decode("ascii")
     if status != 2:
-        assert b"steps of " in out and b" A " in out and not errors
+        assert "steps of " in page and "SOL3:OW?HW1" in page and not errors
         assert "Å" in (folder / f"out-{name}" / "check.txt").read_text(encoding="utf-8")
-    if status == 1:
-        assert b"SOL3:OW-HW1" in out
 
 
 @pytest.mark.parametrize(
     "name,status,buffered,where,errors_too",
     [
-        ("good.trr", 0, "", "| head -1", False),
         ("good.trr", 0, "1", "| head -1", False),
-        ("bad.xtc", 1, "1", "| true", False),
         ("short.xtc", 3, "", "| head -c 0", True),
-        ("good.trr", 0, "", "closed", False),
+        ("bad.xtc", 1, "", "closed", False),
     ],
 )
 def test_into_a_pipe_that_nobody_reads(folder, name, status, buffered, where, errors_too):
-    json_file = folder / f"out-{name}" / "check.json"
-    json_file.unlink(missing_ok=True)
-    for other in ("check.png", "check.txt"):
-        (folder / f"out-{name}" / other).unlink(missing_ok=True)
-    found, out, errors = command_in_shell(folder, name, where, errors_too=errors_too, PYTHONUNBUFFERED=buffered)
+    out = folder / f"out-{name}"
+    for other in report.FILES:
+        (out / other).unlink(missing_ok=True)
+    found, said, errors = command_in_shell(folder, name, where, errors_too=errors_too, PYTHONUNBUFFERED=buffered)
     assert found == status and not errors
-    assert out.count(b"\n") == (1 if "-1" in where else 0)
-    assert json.loads(json_file.read_text(encoding="utf-8"))["status"] in ("kept", "violated", "incomplete")
+    assert said.count(b"\n") == (1 if "-1" in where else 0)
+    known = json.loads((out / "check.json").read_text(encoding="utf-8"))["status"]
+    assert known == {0: "kept", 1: "violated", 3: "incomplete"}[status]
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_full_device_is_said_and_the_files_are_there(folder):
-    if not os.path.exists("/dev/full"):
-        pytest.skip("needs /dev/full")
     found, _, errors = command_in_shell(folder, "good.trr", "/dev/full")
     assert found == 2 and "No space left" in errors and "Traceback" not in errors and "Exception" not in errors
 
@@ -332,9 +307,6 @@ def test_hydrogens_without_a_bond_are_a_gap(tmp_path, capsys):
         told = "incomplete: no bond was found for 4 hydrogens, the first of which is H (atom 8)" in page
         assert told == (name == "cut")
     assert "give files with the cell" in json.loads((tmp_path / "cut" / "check.json").read_text())["gaps"][0]
-
-
-# -- picture ----------------------------------------------------------------------------------------
 
 
 def test_temperatures_of_configurations(folder, capsys, monkeypatch):

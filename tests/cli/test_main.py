@@ -9,68 +9,114 @@ from pathlib import Path
 
 import pytest
 
-from kcons.cli import main, plan
+from kcons.cli import main, systems
 
+ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 
 
-ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
 
 
 def run(*arguments):
     return main.main([str(a) for a in arguments])
 
 
-def test_plan_prints_clusters_rank_and_solver(capsys):
-    assert run("plan", "chain", "--size", 6) == 0
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("plan", "chain", "--size", 6), ("chain of 6 rigid bonds", "rank 6", "solver")),
+        ((), ("compare", "freeenergy", "warmup")),
+        (("--version",), ("kcons ",)),
+        pytest.param(("plan", ALANINE, "--constrain", "hangles"), ("HAngles: 30 distances",), marks=needs_openmm),
+    ],
+    ids=str,
+)
+def test_what_is_said(words, said, capsys):
+    assert run(*words) == 0
     text = capsys.readouterr().out
-    assert "chain of 6 rigid bonds" in text
-    assert "rank 6" in text
-    assert "solver" in text
+    assert all(each in text for each in said)
 
 
-def test_without_command_prints_help(capsys):
-    assert run() == 0
-    assert "compare" in capsys.readouterr().out
+@pytest.mark.parametrize("command", ["compare", "plan"])
+def test_list(command, capsys):
+    assert run(command, "--list") == 0
+    text = capsys.readouterr().out
+    for word in ("water", "chain-straight", "ethanol", "triple-pendulum", "slab", "rattle", "dop853"):
+        assert word in text
+    for word in ("isokinetic-notes", "nose-hoover", "langevin-halfway"):
+        assert f"  {word} " in text
+    for word in ("geodesic", "yoshida4", "blanes-moan6a", "projected-verlet", "projected-rk4", "baumgarte"):
+        (line,) = (line for line in text.splitlines() if line.startswith(f"  {word} "))
+        assert line.endswith("(only when named)")
 
 
-def test_version(capsys):
-    assert run("--version") == 0
-    assert capsys.readouterr().out.startswith("kcons ")
+#: What is wrong, and what is said of it.
+MISTAKES = [
+    ("compare", "name a test system: alanine"),
+    ("compare wat", "there is no test system 'wat'"),
+    ("plan wat", "there is no test system 'wat'"),
+    ("compare watr", "did you mean 'water'?"),
+    ("compare water --methods ratle", "did you mean 'rattle'?"),
+    ("warmup protein", "did you mean 'proteins'?"),
+    ("compare chain --methods shake", "there is no method 'shake'"),
+    ("compare chain --methods ,", "no method"),
+    ("compare chain --size 0", "at least one bond"),
+    ("compare chain --size 3 --dt 3", "does not divide the horizon"),
+    ("compare chain --size 3 --dt ,", "--dt is empty"),
+    ("compare chain --seed -1", "non-negative"),
+    ("compare chain --size 3 --budget -1", "positive number of seconds"),
+    ("compare chain --size 3 --out /dev/null/x", "/dev/null"),
+    ("compare chain --criterion drift --target-error 1e-3", "leave --criterion drift out"),
+    (f"plan {ALANINE} --constrain none", "none with kcons compare --forces"),
+]
+OF_MOLECULES = [
+    ("compare missing.pdb", "there is no file missing.pdb"),
+    (f"compare {ALANINE} --size 3", "leave --size out"),
+    (f"compare {ALANINE} --forcefield nowhere.xml", "force field nowhere.xml"),
+    (f"plan {ALANINE} --platform Abacus", "no platform 'Abacus'"),
+    ("compare chain --constrain hbonds", "not for 'chain'"),
+    ("compare alanine --add-hydrogens", "is for files"),
+]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["compare"], "name a test system: alanine"),
-        (["compare", "wat"], "there is no test system 'wat'"),
-        (["plan", "wat"], "there is no test system 'wat'"),
-        (["compare", "chain", "--methods", "shake"], "there is no method 'shake'"),
-        (["compare", "chain", "--methods", ","], "no method"),
-        (["compare", "chain", "--size", "0"], "at least one bond"),
-        (["compare", "chain", "--size", "3", "--dt", "3"], "does not divide the horizon"),
-        (["compare", "chain", "--size", "3", "--dt", ","], "--dt is empty"),
-        (["compare", "chain", "--seed", "-1"], "non-negative"),
-        (["compare", "chain", "--size", "3", "--budget", "-1"], "positive number of seconds"),
-        (["compare", "chain", "--size", "3", "--out", "/dev/null/x"], "/dev/null"),
-        (["plan", str(ALANINE), "--constrain", "none"], "none with kcons compare --forces"),
-    ],
+    ("words", "text"), [*MISTAKES, *(pytest.param(*each, marks=needs_openmm) for each in OF_MOLECULES)]
 )
-def test_mistakes_give_one_line_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert run(*arguments) == 2
+def test_mistakes_give_one_line_and_status_2(words, text, capsys, tmp_path):
+    assert run(*words.split()) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("kcons: ")]
-    assert len(lines) == 1
-    assert text in lines[0]
+    assert len(lines) == 1 and text in lines[0]
     assert not list(tmp_path.glob("**/compare.*"))
 
 
-@pytest.mark.parametrize("arguments", [["frobnicate"], ["compare", "chain", "--dt", "a,b"], ["compare", "--size", "x"]])
-def test_unreadable_arguments_leave_with_status_2(arguments, capsys):
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("comapre water", "did you mean 'compare'?"),
+        ("compare water --metods rattle", "did you mean '--methods'?"),
+        ("compare water --constrain hbond", "did you mean 'hbonds'?"),
+        ("check run.xtc --topology x --targts mean", "did you mean '--targets'?"),
+        ("frobnicate", "invalid choice"),
+        ("compare chain --dt a,b", "'a,b' is no list of numbers"),
+        ("compare --size x", "invalid int value"),
+    ],
+)
+def test_unreadable_arguments_leave_with_status_2(words, meant, capsys):
     with pytest.raises(SystemExit) as left:
-        run(*arguments)
-    assert left.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
+        run(*words.split())
+    assert left.value.code == 2 and meant in capsys.readouterr().err
+
+
+def test_what_is_like_nothing_has_no_suggestion(capsys):
+    assert run("compare", "qqqq") == 2
+    assert "did you mean" not in capsys.readouterr().err
+
+
+def test_commands_are_listed_with_their_parsers():
+    assert main.parser_of_all().commands["compare"].prog == "kcons compare"
 
 
 @pytest.mark.parametrize("place", ["taken", "taken/below"])
@@ -84,7 +130,7 @@ def test_interrupt(monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(plan, "test_system", stop)
+    monkeypatch.setattr(systems, "test_system", stop)
     assert run("plan", "chain") == 130
     assert capsys.readouterr().err == "kcons: interrupted\n"
 
@@ -98,60 +144,14 @@ def test_importing_the_command_imports_no_md_engine():
     assert result.stdout.strip() == "[]"
 
 
-# -- molecules in OpenMM ----------------------------------------------------------------------------
-
-
-@needs_openmm
-def test_plan_of_own_file(capsys):
-    assert run("plan", ALANINE, "--constrain", "hangles") == 0
-    assert "HAngles: 30 distances" in capsys.readouterr().out
-
-
-@needs_openmm
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("compare", "missing.pdb"), "there is no file missing.pdb"),
-        (("compare", ALANINE, "--size", "3"), "leave --size out"),
-        (("compare", ALANINE, "--forcefield", "nowhere.xml"), "force field nowhere.xml"),
-        (("plan", ALANINE, "--platform", "Abacus"), "no platform 'Abacus'"),
-        (("compare", "chain", "--constrain", "hbonds"), "not for 'chain'"),
-        (("compare", "alanine", "--add-hydrogens"), "is for files"),
-    ],
-)
-def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, text):
-    monkeypatch.chdir(tmp_path)
-    assert run(*arguments) == 2
-    assert text in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["chain", "--criterion", "drift", "--target-error", "1e-3"], "leave --criterion drift out"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else " ".join(value),
-)
-def test_criteria_that_do_not_fit(words, said, capsys):
-    assert run("compare", *words) == 2
-    assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "names"),
-    [
-        (["compare", "chain", "--methods", "rattle"], ["compare.csv", "compare.png", "compare.txt"]),
-        (["compare", "chain", "--criterion", "temperature"], ["compare.csv", "compare.png", "compare.txt"]),
-    ],
-    ids=lambda given: "-".join(given[:2]),
-)
-def test_results_of_others_are_not_overwritten(words, names, tmp_path, capsys):
+@pytest.mark.parametrize("criterion", [("--methods", "rattle"), ("--criterion", "temperature")], ids=str)
+def test_results_of_others_are_not_overwritten(criterion, tmp_path, capsys):
     """Before anything is measured."""
-    for name in names:
+    for name in ("compare.csv", "compare.png", "compare.txt"):
         other = tmp_path / name / name
         other.parent.mkdir()
         other.write_text("precious")
-        assert run(*words, "--out", other.parent) == 2
+        assert run("compare", "chain", *criterion, "--out", other.parent) == 2
         assert f"other files called {name}; give another folder (--out)" in capsys.readouterr().err
         assert [path.name for path in other.parent.iterdir()] == [name] and other.read_text() == "precious"
 

@@ -20,7 +20,6 @@ from kcons.comparison import (
     figure,
     rank,
     read_csv,
-    test_systems,
     text,
 )
 from kcons.comparison.averages import AVERAGES, choose_samplers, code, sample
@@ -84,7 +83,8 @@ def test_the_notes_convention_is_found_to_be_hot():
     """2K = 3N kT: configurations of eight dumbbells in a box have 3N/(g - 1) = 48/36 of the temperature."""
     fluid = fluids.dumbbells(8)
     box = replace(
-        test_systems.build("dumbbells", 8),
+        small("dumbbells"),
+        time_steps=(0.02, 0.01),
         constraint_set=fluid.constraint_set,
         positions=fluid.positions,
         velocities=thermal_velocities(fluid.system(), fluid.positions, fluid.thermal_energy, 1, zero_momentum=True),

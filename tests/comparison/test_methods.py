@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
-import beads as beads  # test systems of the tests alone
 import numpy as np
 import openmm
 import pytest
+import small_test_systems as small_test_systems  # one that moves
 from openmm import unit
 
 from kcons import steppers
@@ -126,7 +126,7 @@ def test_every_stepper_runs_dependent_rows_and_finds_the_trajectory(name):
     assert found.error.iloc[-1] < 1e-4
 
 
-@pytest.mark.parametrize("name", ["triple-pendulum", "rotor", "bead-rotating"])
+@pytest.mark.parametrize("name", ["triple-pendulum", "rotor", "breathing"])
 def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name):
     table, _ = errors(built(name), "dop853", "dop853-projected")
     free, held = (table[table.method == n].reset_index() for n in ("dop853", "dop853-projected"))

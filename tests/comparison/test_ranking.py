@@ -71,6 +71,18 @@ def test_costs_within_the_scatter_share_a_place():
     assert list(rank(made(*rows, margin=None)).table.place) == [1, 2, 3]  # 5 % at least
 
 
+def test_costs_are_times_or_force_evaluations():
+    """Forces that take no time stand for those that do; where there are none, the time of the step itself decides."""
+    rows = [row("rattle", 2.0, 1e-3, 2.0, evaluations=500), row("peer", 2.0, 1e-3, 9.0, evaluations=501)]
+    for about, cost, places in (
+        ({"forces": "springs"}, "seconds", [1, 2]),
+        ({"forces": "springs", "force_seconds": 1e-8}, "evaluations", [1, 1]),
+        ({"forces": "no forces", "force_seconds": 0.0}, "seconds", [1, 2]),
+    ):
+        found = rank(made(*rows, **about))
+        assert found.cost == cost and list(found.table.place) == places
+
+
 def test_an_error_that_is_asked_for():
     found = rank(made(*ROWS), limit=2e-4)
     assert list(found.table.method) == ["blanes"] and list(found.beyond.method) == ["rattle", "peer"]

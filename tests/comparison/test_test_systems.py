@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from small_test_systems import SMALL, end, small
 
 from kcons.comparison import Potential, add_system, compare, test_systems
-from kcons.comparison.test_systems import butane, chain, dumbbells, rotor, sphere, water
+from kcons.comparison.test_systems import butane, chain, rotor, sphere, water
 from kcons.comparison.test_systems.minimal import integrated, spin, turned
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.comparison.test_systems.potential import of_calculator
@@ -111,7 +111,7 @@ def test_time_steps_are_sorted_coarse_first():
     np.testing.assert_allclose(np.array(system.time_steps) / units.fs, [10.0, 5.0, 2.5])
 
 
-@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "bead-rotating"])
+@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "breathing"])
 def test_shortened_system_has_its_solution_at_its_own_horizon(name):
     half = small(name).shortened(2)
     assert half.horizon == small(name).horizon / 2
@@ -121,7 +121,7 @@ def test_shortened_system_has_its_solution_at_its_own_horizon(name):
 
 
 def test_a_moving_constraint_is_followed_in_time():
-    system = small("bead-rotating")
+    system = small("breathing")
     state = end(system, system.time_steps[-1])
     assert system.residuals(state.positions, state.velocities, system.horizon) < (1e-12, 1e-12)
     assert system.residuals(state.positions, state.velocities)[0] > 0.1
@@ -217,39 +217,6 @@ def test_cut_water_has_no_overlaps():
     system = test_systems.build("water", 20, forces="ase")
     assert apart(system)[::3, ::3][np.triu_indices(20, 1)].min() > 2.2
     assert system.potential.energy(system.positions) / 20 < -0.2  # eV a molecule; ice is near -0.6
-
-
-@pytest.mark.parametrize("size", [8, 20])
-def test_box_of_dumbbells(size):
-    system = test_systems.build("dumbbells", size, seed=3)
-    assert (system.n_atoms, system.motion.rank) == (2 * size, size)
-    assert max(system.residuals(system.positions, system.velocities)) < 1e-14
-    other = np.arange(2 * size)[:, None] // 2 != np.arange(2 * size) // 2
-    assert apart(system)[other].min() > 1.0  # no overlaps
-    x, direction = system.positions, np.random.default_rng(1).standard_normal(system.positions.shape)
-    slope = (system.potential.energy(x + 1e-6 * direction) - system.potential.energy(x - 1e-6 * direction)) / 2e-6
-    assert slope == pytest.approx(-np.sum(system.potential.forces(x) * direction), rel=1e-6)
-    # Forces do not see where the box begins, nor by which image an atom is given.
-    moved = x + system.cell * np.array([0.3, 2.0, -1.0])
-    np.testing.assert_allclose(system.potential.forces(moved), system.potential.forces(x), atol=1e-11)
-    reference = system.reference()
-    errors = [system.deviation(end(system, dt).positions, reference.positions) for dt in system.time_steps[1:]]
-    np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.1)
-    assert reference.error < 1e-4 * errors[-1]
-
-
-def test_forces_of_dumbbells_vanish_smoothly_at_the_cutoff():
-    evaluate = dumbbells._with_cutoff(13.0, 2.5)
-    for r, share in ((1.6, 1.0), (2.125, 0.5), (2.5 - 1e-3, 0.0), (2.5 + 1e-3, 0.0)):
-        # Partners of both atoms out of reach; the pair meets through the boundary.
-        energy, forces = evaluate(np.array([[12.0, 0, 0], [12.0, 6, 0], [12.0 + r, 0, 0], [12.0 + r, 0, 6]]))
-        assert energy == pytest.approx(share * 4 * (r**-12 - r**-6), abs=1e-13)
-        if share == 1.0:
-            assert forces[2, 0] == pytest.approx(24 * (2 * r**-13 - r**-7), rel=1e-13)
-        elif share == 0.0:
-            assert np.abs(forces).max() < 1e-9
-        np.testing.assert_array_equal(forces[0], -forces[2])
-        assert not forces[[1, 3]].any()
 
 
 @pytest.mark.parametrize("size", [1, 3])

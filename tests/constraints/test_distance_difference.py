@@ -2,48 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
 import pytest
-from ase import Atoms, units
+from ase import Atoms
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixInternals
 from scipy.optimize import minimize
 
 from kcons import ConstraintSet, Motion
-from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities, from_ase_constraints
-from kcons.constraints import Distance, DistanceDifference, FixedAtoms, Formula, from_dict
-from kcons.constraints.constraint_set import rows_like
-from kcons.errors import ImageError, InputError, SingularGeometryError
+from kcons.ase import constrain, from_ase_constraints
+from kcons.constraints import Distance, DistanceDifference, FixedAtoms
+from kcons.errors import ImageError, InputError
 
 #: Chlorine, hydrogen, bromine.
 TRANSFER = [[0, 1], [1, 2]]
 X = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 12.0]])  # 5 apart, then 12
 M = np.array([35.0, 1.0, 80.0])
-
-
-def test_value_gradient_and_curvature_by_hand():
-    row = DistanceDifference(TRANSFER, weights=[2.0, -1.0])
-    held = ConstraintSet(row, X, M)
-    assert held.measure(X) == pytest.approx([2 * 5 - 12], abs=1e-15)
-    expected = [[-1.2, -1.6, 0.0], [1.2, 1.6, 1.0], [0.0, 0.0, -1.0]]
-    assert held.jacobian(X).toarray().reshape(3, 3) == pytest.approx(np.array(expected), abs=1e-15)
-    # Across the first pair at speed 1: 2 * 1/5; across the second at speed 3: -9/12.
-    v = np.array([[0.8, -0.6, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    assert held.curvature(X, v) == pytest.approx([2 * 1 / 5 - 9 / 12], abs=1e-15)
-
-
-def test_it_holds_what_a_formula_holds():
-    text = "sqrt((x1-x2)**2+(y1-y2)**2+(z1-z2)**2) - 0.5*sqrt((x2-x3)**2+(y2-y3)**2+(z2-z3)**2)"
-    both = [DistanceDifference(TRANSFER, weights=[1.0, -0.5]), Formula(text, [[0, 1, 2]], target=None)]
-    first, second = (Motion(ConstraintSet(row, X, M), X) for row in both)
-    y = X + 0.2 * np.random.default_rng(1).normal(size=X.shape)
-    assert first.project_positions(y, X) == pytest.approx(second.project_positions(y, X), abs=1e-13)
-    f, v = np.random.default_rng(2).normal(size=(2, 3, 3))
-    v = first.project_velocities(X, v)
-    assert first.acceleration(X, v, f) == pytest.approx(second.acceleration(X, v, f), abs=1e-13)
 
 
 def test_the_nearest_point_is_that_of_a_minimizer():
@@ -64,56 +40,6 @@ def test_the_nearest_point_is_that_of_a_minimizer():
     )
     assert difference(found.ravel()) == pytest.approx(-4.0, abs=1e-12)
     assert found == pytest.approx(best.x.reshape(3, 3), abs=1e-6)
-
-
-def test_it_comes_back_from_its_data():
-    row = DistanceDifference([[[1, 0], [1, 2]], [[4, 3], [4, 5]]], [-0.5, 0.25], weights=[1.0, -2.0])
-    again = from_dict(json.loads(json.dumps(row.todict())))
-    x = np.random.default_rng(0).normal(size=(6, 3))
-    lengths = np.linalg.norm(x[[1, 1, 4, 4]] - x[[0, 2, 3, 5]], axis=1)
-    for item in (row, again, row.select([0, 1]), row.renumbered(np.arange(6))):
-        assert item.measure(x[item.atoms], 0.0) == pytest.approx(lengths[[0, 2]] - 2 * lengths[[1, 3]], abs=1e-14)
-        assert item.target.tolist() == [-0.5, 0.25]
-    assert row.select([1]).measure(x[row.select([1]).atoms], 0.0) == pytest.approx(lengths[2] - 2 * lengths[3])
-    held = ConstraintSet([Distance([[0, 1]]), row.with_target(None)], x, np.ones(6))
-    assert rows_like(held, DistanceDifference([[4, 3], [4, 5]], weights=[1.0, -2.0]), "d") == [2]
-    with pytest.raises(InputError, match="not among"):
-        rows_like(held, DistanceDifference([[4, 3], [4, 5]]), "d")
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: DistanceDifference([0, 1, 2]), "pairs of atoms"),
-        (lambda: DistanceDifference([[0.0, 1.0], [1.0, 2.0]]), "pairs of atoms"),
-        (lambda: DistanceDifference([]), "pairs of atoms"),
-        (lambda: DistanceDifference([[0, 1], [2, 2]]), "atom 2 twice"),
-        (lambda: DistanceDifference([[0, 1], [1, 0]]), "add the weights"),
-        (lambda: DistanceDifference([[0, 1]]), "give 1 finite number"),
-        (lambda: DistanceDifference(TRANSFER, weights=[1.0, 0.0]), "give 2 finite numbers"),
-        (lambda: DistanceDifference(TRANSFER, weights=[1.0, np.nan]), "give 2 finite numbers"),
-        (lambda: DistanceDifference([[[0, 1], [1, 2]], [[3, 4], [5, 6]]]), "rows 0 and 1 share atoms"),
-        (lambda: DistanceDifference([[0, -1], [1, 2]]), "negative"),
-        (lambda: from_dict(DistanceDifference(TRANSFER).todict() | {"slots": [[0, 1], [1, 3]]}), "do not belong"),
-        (lambda: from_dict(DistanceDifference(TRANSFER).todict() | {"slots": 3}), "slots are pairs"),
-        (lambda: from_dict(DistanceDifference(TRANSFER).todict() | {"weights": ["a", 1]}), "numbers"),
-        (lambda: ConstraintSet(DistanceDifference(TRANSFER, -1.0, weights=[1, 1]), X, M), "not positive"),
-    ],
-)
-def test_what_is_no_such_row_is_refused(make, words):
-    with pytest.raises(InputError, match=words):
-        make()
-
-
-def test_undefined_places_are_refused():
-    y = X.copy()
-    y[1] = y[2]
-    with pytest.raises(SingularGeometryError, match="atoms 1 and 2 of row 0"):
-        ConstraintSet(DistanceDifference(TRANSFER), y, M)
-    # |ab| + |bc| - |ac| is 0 on a line, and least there.
-    line = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
-    with pytest.raises(SingularGeometryError, match="vanishes"):
-        ConstraintSet(DistanceDifference([[0, 1], [1, 2], [0, 2]], weights=[1, 1, -1]), line, M)
 
 
 # -- periodic cells ----------------------------------------------------------------------------------------
@@ -217,31 +143,6 @@ def test_bondcombos_become_this_row_and_go_back():
     wanted = FixInternals.get_bondcombo(atoms, combos[1][1])
     assert other.target.tolist() == [3.0]
     assert other.measure(atoms.positions[other.atoms], 0.0) == pytest.approx([wanted], abs=1e-14)
-
-
-def test_a_run_keeps_it_and_its_kinetic_energy_is_that_of_the_degrees_of_freedom():
-    atoms = proton()
-    constrain(atoms, DistanceDifference(TRANSFER, -0.2), project=True)
-    draw_velocities(atoms, 100, rng=1)
-    dynamics = ConstrainedDynamics(atoms, 0.5 * units.fs)
-    before = atoms.get_total_energy()
-    dynamics.run(200)
-    assert atoms.get_distance(0, 1) - atoms.get_distance(1, 2) == pytest.approx(-0.2, abs=1e-12)
-    assert atoms.get_total_energy() == pytest.approx(before, abs=1e-4)
-    assert dynamics.degrees_of_freedom == 8
-
-
-def test_a_target_that_moves_carries_the_proton_over():
-    atoms = proton()
-    start = atoms.get_distance(0, 1) - atoms.get_distance(1, 2)
-    row = DistanceDifference(TRANSFER, lambda t: start + 0.05 * t)
-    dynamics = ConstrainedLangevin(
-        atoms, 0.5 * units.fs, temperature_K=50, friction=0.02 / units.fs, rng=2, constraints=[row]
-    )
-    dynamics.run(100)
-    now = atoms.get_distance(0, 1) - atoms.get_distance(1, 2)
-    assert now == pytest.approx(start + 0.05 * dynamics.get_time(), abs=1e-11)
-    assert now > start + 0.2
 
 
 def test_the_bonds_of_a_difference_may_change_when_it_is_restored():

@@ -134,6 +134,19 @@ class Judge:
         still = not rows.pinned.size or float(np.abs(found - start)[rows.pinned].max()) <= 64 * EPS * stored
         return bool(on_rows and still and outside <= limit and length <= 2 * np.linalg.norm(exact_way))
 
+    def place(
+        self, operation: str, found: Array, exact: Array, allowed: float, start: Array, at: Array, t: float, top: float
+    ) -> bool:
+        """Positions that are the oracle's, or another solution as of `other`; and on their rows."""
+        if float(np.abs(found - exact).max()) > allowed and self.other(found, exact, start, at, t, top):
+            return self.say(operation, "right", ANOTHER)
+        return self.compare(operation, found, exact, allowed) and self.on_rows(operation, found, exact, t, top)
+
+    def on_rows(self, operation: str, found: Array, exact: Array, t: float, top: float) -> bool:
+        off = np.abs(self.rows.value(found, t))
+        fine = bool(np.all(off <= 8 * self.rows.rounding(exact, top)))
+        return fine or self.say(operation, "silent", "off its rows", float(off.max()))
+
     def refusal(self, operation: str, error: Exception, link: float, solvable: bool = True) -> None:
         """Judge an error."""
         words = f"{type(error).__name__}: {' '.join(str(error).split())[:240]}"
@@ -278,16 +291,9 @@ class Judge:
             self.in_place(label, moved, images, here, t, links)
         if found is not None and not solvable:
             self.say(label + "project_positions", "refused", "no verdict")
-        elif (
-            found is not None
-            and self.other(found - images @ w.cell, exact, moved, w.x, t, _top(new, here))
-            and (float(np.abs(found - images @ w.cell - exact).max()) > allowed)
-        ):
-            self.say(label + "project_positions", "right", ANOTHER)
-        elif found is not None and self.compare(label + "project_positions", found - images @ w.cell, exact, allowed):
-            off = np.abs(rows.value(found - images @ w.cell, t))
-            if not np.all(off <= 8 * rows.rounding(exact, _top(new, here))):
-                self.say(label + "project_positions", "silent", "off its rows", float(off.max()))
+        elif found is not None:
+            placed = found - images @ w.cell
+            self.place(label + "project_positions", placed, exact, allowed, moved, w.x, t, _top(new, here))
         link = w.nearness(w.x)
         v, f = rng.normal(size=w.x.shape), rng.normal(size=w.x.shape)
         for name, call, exact_of, given in (
@@ -395,14 +401,7 @@ class Judge:
             # The foot of the perpendicular is asked for to a part in 1e9 of the way.
             allowed += 1e-9 * float(np.abs(exact - moved).max())
             placed = found - images @ w.cell
-            if float(np.abs(placed - exact).max()) > allowed and self.other(
-                placed, exact, moved, placed, 0.0, _top(start)
-            ):
-                self.say("restore_positions", "right", ANOTHER)
-            elif self.compare("restore_positions", found - images @ w.cell, exact, allowed):
-                off = np.abs(rows.value(found - images @ w.cell, 0.0))
-                if not np.all(off <= 8 * rows.rounding(exact, _top(start))):
-                    self.say("restore_positions", "silent", "off its rows", float(off.max()))
+            self.place("restore_positions", placed, exact, allowed, moved, placed, 0.0, _top(start))
 
     def steps(self) -> None:
         """A run in parts; between them an MD engine may choose other images, or another cell."""
@@ -420,24 +419,20 @@ class Judge:
             else [w.steps, 1]
         )
         winds = any(np.any(r.images) for r in rows.rows if r.images)
-        x, v = w.x, w.v
-        twin = [x + EPS * _top(self.x) * rng.choice([-1.0, 1.0], x.shape), v]
-        noise = rows.rounding(x, _top(self.x)) * rng.choice([-1.0, 1.0], len(rows.targets))
+        pair = Pair(self)
         done, largest, name = 0, _top(self.x), f"run {w.stepper}"
         for number, steps in enumerate(parts):
             if number and not w.drifting:
                 images, cell, state = self._between(state, images, cell, winds)
                 anchors[0] = w.anchors + images @ cell
-            self.done, link, doubtful = done, [w.nearness(x, cell, every=True)], [False]
+            self.done, link, doubtful = done, [w.nearness(pair.x, cell, every=True)], [False]
             try:
                 for _ in range(steps):
-                    t = done * w.dt
                     rows.ways.clear()
-                    x, v = advance(rows, w.stepper, x, v, t, w.dt, self._pull)
-                    near = w.nearness(x, cell, every=True)
+                    pair.first(w.stepper, done * w.dt)
+                    near = w.nearness(pair.x, cell, every=True)
                     doubtful.append(self.may_refuse(max(near, *link), cell))
-                    with rows.rounded(noise, EPS):
-                        twin = list(advance(rows, w.stepper, *twin, t, w.dt, self._pull))
+                    pair.second(w.stepper, done * w.dt)
                     done += 1
                     link.append(near)
                 solvable = True
@@ -461,17 +456,12 @@ class Judge:
             largest = max(largest, _top(state.positions))
             rounding = 64 * EPS * self.dependent[2] * largest
             room = ROOM * max(done, 1)
-            off_x, off_v = (float(np.abs(a - b).max()) for a, b in zip((x, v), twin, strict=True))
+            (x, v), (off_x, off_v) = (pair.x, pair.v), pair.apart()
             speed = float(np.abs(v).max())
             fine = self.compare(name, state.positions - images @ cell, x, room * off_x + rounding) and self.compare(
                 name, state.velocities, v, room * off_v + 64 * EPS * self.dependent[2] * speed
             )
-            if fine:
-                off = np.abs(rows.value(state.positions - images @ cell, done * w.dt))
-                fine = bool(np.all(off <= 8 * rows.rounding(x, largest)))
-                if not fine:
-                    self.say(name, "silent", "off its rows", float(off.max()))
-            if not fine:
+            if not (fine and self.on_rows(name, state.positions - images @ cell, x, done * w.dt, largest)):
                 return
         if not np.array_equal(cell, w.cell):
             self._use_cell(w.cell, w.x, w.images)
@@ -560,7 +550,7 @@ class Judge:
 
     def ase(self) -> None:
         """`constrain` and VelocityVerlet, with the atoms wrapped between two steps."""
-        w, rows, rng = self.w, self.rows, self.rng
+        w, rng = self.w, self.rng
         images = w.images
         calculator = Springs(w.springs, w.stored(w.anchors))
         atoms = Atoms("H" * len(w.x), positions=self.x, calculator=calculator)
@@ -569,9 +559,7 @@ class Judge:
         atoms.set_masses(w.masses)
         atoms.set_velocities(w.v)
         steps = 1 if w.placed.any() else int(rng.integers(1, 3))
-        x, v, link = w.x, w.v, w.nearness(w.x)
-        twin = [x + EPS * _top(self.x) * rng.choice([-1.0, 1.0], x.shape), v]
-        noise = rows.rounding(x, _top(self.x)) * rng.choice([-1.0, 1.0], len(rows.targets))
+        link, pair = w.nearness(w.x), Pair(self)
         dynamics = (VelocityVerlet if rng.random() < 0.6 else ConstrainedDynamics)(atoms, w.dt)
         name = f"ASE {type(dynamics).__name__}"
 
@@ -584,10 +572,9 @@ class Judge:
         for number in range(steps):
             solvable = True
             try:
-                x, v = advance(rows, "Rattle", x, v, 0.0, w.dt, self._pull)
-                with rows.rounded(noise, EPS):
-                    twin = list(advance(rows, "Rattle", *twin, 0.0, w.dt, self._pull))
-                link = max(link, w.nearness(x, every=True))
+                pair.first("Rattle", 0.0)
+                pair.second("Rattle", 0.0)
+                link = max(link, w.nearness(pair.x, every=True))
             except NoSolution:
                 solvable = False
             if number and self.periodic:
@@ -599,7 +586,7 @@ class Judge:
             if not self.attempt(name, lambda n=number: go(n), [], link, solvable) or not solvable:
                 return
             largest = _top(atoms.positions, self.x)
-            off_x, off_v = (float(np.abs(a - b).max()) for a, b in zip((x, v), twin, strict=True))
+            (x, v), (off_x, off_v) = (pair.x, pair.v), pair.apart()
             rounding = 64 * EPS * self.dependent[2] * largest
             room = ROOM * (number + 1)
             if not self.compare(name, atoms.positions - images @ w.cell, x, room * off_x + rounding):
@@ -607,6 +594,28 @@ class Judge:
             # ASE takes velocities from differences of positions.
             if not self.compare(name, atoms.get_velocities(), v, room * off_v + rounding / w.dt):
                 return
+
+
+class Pair:
+    """The oracle's motion, and a twin whose start and targets are rounded otherwise."""
+
+    def __init__(self, judge: Judge) -> None:
+        self.w, self.pull, rows, rng = judge.w, judge._pull, judge.w.rows, judge.rng
+        top = _top(judge.x)
+        self.x, self.v = self.w.x, self.w.v
+        self.twin = (self.x + EPS * top * rng.choice([-1.0, 1.0], self.x.shape), self.v)
+        self.noise = rows.rounding(self.x, top) * rng.choice([-1.0, 1.0], len(rows.targets))
+
+    def first(self, stepper: str, t: float) -> None:
+        self.x, self.v = advance(self.w.rows, stepper, self.x, self.v, t, self.w.dt, self.pull)
+
+    def second(self, stepper: str, t: float) -> None:
+        with self.w.rows.rounded(self.noise, EPS):
+            self.twin = advance(self.w.rows, stepper, *self.twin, t, self.w.dt, self.pull)
+
+    def apart(self) -> tuple[float, float]:
+        one, other = (self.x, self.v), self.twin
+        return float(np.abs(one[0] - other[0]).max()), float(np.abs(one[1] - other[1]).max())
 
 
 class Springs(Calculator):

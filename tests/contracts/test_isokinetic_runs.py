@@ -127,26 +127,6 @@ def test_force_evaluations():
 # -- bad input --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, "warm"])
-@pytest.mark.parametrize("item", ["thermal_energy", "kinetic_energy"])
-def test_temperatures_and_energies_must_be_positive(item, value):
-    with pytest.raises(InputError, match=f"{item} is .*give a positive number"):
-        Isokinetic(**{item: value})
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"order": 3}, "choose 2, 4 or 6"),
-        ({"convention": "g"}, "choose 'exact' or 'notes'"),
-        ({"thermal_energy": 1.0, "kinetic_energy": 1.0}, "not both"),
-    ],
-)
-def test_options_that_are_none(options, words):
-    with pytest.raises(InputError, match=words):
-        Isokinetic(**options)
-
-
 @pytest.mark.parametrize("speed", [0.0, 1e-160])
 def test_zero_velocity(speed):
     """H22: also where 2K underflows."""

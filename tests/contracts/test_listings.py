@@ -89,7 +89,6 @@ def test_every_public_stepper_is_here() -> None:
         "HamiltonianMonteCarlo",
         "ProjectedRungeKutta4",
         "ProjectedVerlet",
-        "State",
         "Stepper",
     }
 

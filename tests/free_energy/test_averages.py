@@ -66,7 +66,7 @@ def test_weights_mean_what_repetition_means():
 def test_the_beginning_can_be_left_out():
     rng = np.random.default_rng(5)
     x = ar1(rng, 4000, 0.5)[:, 0] + 20.0 * np.exp(-np.arange(4000) / 100)
-    with pytest.warns(UserWarning, match="worth 5.* independent ones"):
+    with pytest.warns(UserWarning, match="worth 1.* independent ones"):
         biased = weighted_mean(x)
     right = weighted_mean(x, equilibration=True)
     assert 200 <= right.start <= 1500 and right.n == 4000 - right.start

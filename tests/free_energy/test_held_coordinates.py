@@ -16,7 +16,7 @@ from kcons.constraints import (
     KnifeEdge,
     MovingTarget,
 )
-from kcons.errors import InputError, SingularGeometryError
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError
 from kcons.free_energy import HeldCoordinates
 
 N = 6
@@ -195,6 +195,19 @@ def test_multipliers_are_those_of_the_engine(case):
     wanted = np.zeros((constraint_set.n_rows, len(mine)))
     wanted[mine.rows, np.arange(len(mine))] = 1
     np.testing.assert_allclose(a @ along.T, wanted, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_many_samples_at_once_are_those_taken_alone(case):
+    constraint_set, coordinates, _ = held(case)
+    mine = HeldCoordinates(constraint_set, coordinates, CHAIN, bonds=[[0, 1], [1, 2], [2, 3]])
+    x, v, f = CHAIN + 0.05 * np.random.default_rng(2).normal(size=(3, 70, N, 3))
+    found = mine.samples(x, v, f, list(range(70)))
+    for one, each in zip(found, map(mine.sample, x, v, f, range(70)), strict=True):
+        np.testing.assert_allclose(np.hstack(one), np.hstack(each), rtol=1e-12, atol=1e-12)
+    x[66] = np.nan
+    with pytest.raises(NonFiniteError, match=r"positions of atom . are not finite at time 66"):
+        mine.samples(x, v, f, list(range(70)))
 
 
 def test_names_follow_the_mapping_and_not_the_set():

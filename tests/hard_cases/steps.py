@@ -21,7 +21,7 @@ from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, Rattle,
 
 
 def each_refused(calls: Mapping[str, Callable[[], float]]) -> Outcome:
-    """Every call must raise; those that do not give a number that shows what came of it."""
+    """Raise the first error if all calls raise one; else a check that fails for each call that was accepted."""
     accepted: list[Check] = []
     first: Exception | None = None
     for name, call in calls.items():

@@ -350,3 +350,24 @@ def test_velocities_are_put_back_when_a_later_solver_fails(fixed):
             motion.project_positions(new, x, velocities=v, dt=0.1, out=new)
         np.testing.assert_array_equal(new, before[0])
         np.testing.assert_array_equal(v, before[1])
+
+
+@pytest.mark.parametrize("free", [0, 20], ids=["all atoms", "few among many"])
+@pytest.mark.parametrize("of_the_set", [False, True])
+def test_a_cell_that_moves_the_image_of_a_fixed_atom_is_refused(free, of_the_set):
+    """No solver sees a row between fixed atoms: it was off by the change of the cell, and nothing was said."""
+    x = np.concatenate([[[0.5, 0, 0], [9.5, 0, 0], [8.5, 0, 0]], np.full((free, 3), 5.0)])
+    rows = [held.FixedAtoms([0, 1]), held.Distance([[0, 1], [1, 2]])]
+    whole = ConstraintSet(rows, x, np.ones(len(x)), cell=[10.0] * 3)
+    motion = Motion(whole, x)
+    for _ in range(2):
+        with pytest.raises(ContradictionError, match=r"#6 Distance\(0, 1\) lies between fixed atoms .* in this cell"):
+            if of_the_set:
+                whole.with_cell([11.0, 10, 10])
+                motion.project_velocities(x, x)
+            else:
+                motion.set_cell([11.0, 10, 10])
+        assert np.array_equal(motion.lattice[0], 10 * np.eye(3))
+        motion.certify(x)
+    motion.set_cell([10.0, 12, 11])
+    motion.certify(motion.project_positions(x + 0.01, x))

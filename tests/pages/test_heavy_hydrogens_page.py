@@ -1,4 +1,4 @@
-"""Heavy hydrogens at 4 fs: what temperature is reported, and what the committed runs say of configurations."""
+"""Heavy hydrogens at 4 fs: what temperature is reported, and that of configurations."""
 
 from __future__ import annotations
 
@@ -48,61 +48,13 @@ def test_a_harmonic_oscillator_has_the_frequency_of_its_spring(example):
     assert lowest * (1 - 1e-9) <= omega.min() <= omega.max() <= highest * (1 + 1e-9)  # differences of forces
 
 
-# -- the committed results --------------------------------------------------------------------------------
-
-
-def parts():
-    found = json.loads(RESULTS.read_text(encoding="utf-8"))
-    assert found["full"]
-    return found["parts"]
-
-
-def off(part, name, fs, key):
-    """What a mean is off the reference, in its unit, and the standard error of that."""
-    runs = {(run["name"], run["fs"]): run[key] for run in part["runs"]}
-    zero, this = runs["LangevinMiddleIntegrator", 1], runs[name, fs]
-    return this["mean"] - zero["mean"], math.hypot(this["error"], zero["error"])
-
-
-@pytest.mark.parametrize("constraints", ["HBonds", "AllBonds"])
-def test_configurations_of_langevin_at_4_fs_are_right(constraints):
-    part = parts()[constraints]
-    for key in ("bonds", "angles") if constraints == "HBonds" else ("angles",):
-        away, error = off(part, "kcons Langevin", 4, key)
-        assert abs(away) <= 3 * error
-    runs = {(run["name"], run["fs"]): run for run in part["runs"]}
-    run = runs["kcons Langevin", 4]
-    for key in ("half", "reported"):
-        assert abs(run[key]["mean"] - 300) <= 3 * run[key]["error"] < 5
-    assert runs["kcons NoseHooverMiddle", 4]["reported"]["mean"] == pytest.approx(part["expected"], abs=5)
-
-
-def test_a_chain_at_the_ends_of_steps_warms_configurations_and_one_in_the_middle_does_not():
-    part = parts()["HBonds"]
-    away, error = off(part, "kcons NoseHoover", 4, "angles")
-    assert away > 5 * error
-    away, error = off(part, "kcons NoseHooverMiddle", 4, "angles")
-    assert abs(away) <= 3 * error
-    # Bonds, which hardly couple to the rest, are sampled slowly by chains, those of OpenMM too.
-    ours, one = off(part, "kcons NoseHooverMiddle", 4, "bonds")
-    theirs, two = off(part, "NoseHooverIntegrator", 4, "bonds")
-    assert abs(ours - theirs) <= 3 * math.hypot(one, two)
-
-
-def test_rattle_drifts_no_more_than_verlet():
-    for part in parts().values():
-        ours, theirs = part["drift"]["kcons rattle"], part["drift"]["VerletIntegrator"]
-        assert abs(ours["slope"]) <= abs(theirs["slope"]) + 3 * math.hypot(ours["error"], theirs["error"])
-        assert ours["error"] < 0.02
-
-
 @pytest.mark.validation
 @pytest.mark.parametrize("name", ["kcons Langevin", "kcons NoseHooverMiddle"])
 def test_configurations_at_4_fs_anew(example, name):
-    """The committed run once more, half a minute."""
+    """Half a minute; against the means of the committed run at 1 fs."""
     system, x = example["alanine"]("HBonds")
     found = example["sample"](system, example["start_of"](system, x, 1, 5000), name, 0.004, 1000.0)
-    zero = parts()["HBonds"]["runs"][0]
+    zero = json.loads(RESULTS.read_text(encoding="utf-8"))["parts"]["HBonds"]["runs"][0]
     for key in ("bonds", "angles") if name == "kcons Langevin" else ("angles",):
         error = math.hypot(found[key]["error"], zero[key]["error"])
         assert abs(found[key]["mean"] - zero[key]["mean"]) <= 3 * error

@@ -11,9 +11,8 @@ import pytest
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, Custom, Dihedral, Distance, Sphere
-from kcons.solvers.called_solvers import WORDS, add, solve_positions, solve_tangents, words_of
+from kcons.solvers.called_solvers import pack_solver_tables, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.cluster_solver import Request
-from kcons.solvers.kernels.groups_of_eight import NO_LATTICE, NO_NUMBERS
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
@@ -28,6 +27,12 @@ def solvers(*, cell=None, inverse_masses=1 / MASSES) -> list[SparseRows | Single
     return [SparseRows(held, np.arange(5), inverse_masses), SingleRows(held, np.arange(5, 7), inverse_masses)]
 
 
+def tables_of(given, lattice=None):
+    tables = pack_solver_tables(given, np.zeros(0, np.int64), np.zeros((0, 3)))
+    set_lattice(tables, lattice)
+    return tables
+
+
 @pytest.mark.parametrize("which", [[0], [1], [0, 1]], ids=str)
 @pytest.mark.parametrize("cell", [None, np.diag([9.0, 9.5, 10.0])], ids=["open", "periodic"])
 def test_the_same_as_from_python(which, cell) -> None:
@@ -36,17 +41,15 @@ def test_the_same_as_from_python(which, cell) -> None:
     shift = 0.0 if cell is None or 1 in which else rng.integers(-1, 2, X.shape) @ cell
     x_ref, new = X + shift, new + shift
     chosen = [solvers(cell=cell)[k] for k in which]
-    lattice = NO_LATTICE if cell is None else ConstraintSet([*CHAIN], X, MASSES, cell=cell).lattice
-    words = words_of(chosen)
-    assert words.shape == (WORDS * len(which),)
+    lattice = ConstraintSet([*CHAIN], X, MASSES, cell=cell).lattice
+    tables = tables_of(chosen, lattice)
     place, speed, tangent = new.copy(), v.copy(), y.copy()
-    most = solve_positions(words, place, x_ref, speed, 50.0, NO_NUMBERS, lattice, cell is not None)
-    assert solve_tangents(words, tangent, x_ref, NO_NUMBERS, lattice, cell is not None)
+    most = packed_positions(place, x_ref, speed, 50.0, tables)
+    assert packed_tangents(x_ref, tangent, tables)
     found = []
     for solver in chosen:
-        given = Request(new, x_ref, None, None if cell is None else lattice, 0.0, 0.0, v, 50.0)
-        found.append(solver.positions(given).iterations)
-        assert solver.tangents(Request(y, x_ref, None, given.lattice)).converged
+        found.append(solver.positions(Request(new, x_ref, None, lattice, 0.0, 0.0, v, 50.0)).iterations)
+        assert solver.tangents(Request(y, x_ref, None, lattice)).converged
     assert most == max(found) > 1
     for one, other in ((place, new), (speed, v), (tangent, y)):
         np.testing.assert_array_equal(one, other)
@@ -57,23 +60,13 @@ def test_where_one_fails_nothing_has_changed(bad) -> None:
     new, v = X + 0.01, np.ones_like(X)
     new[bad] += [200.0, -300.0, 100.0]
     given = solvers()
-    words, kept = words_of(given), new.copy()
-    assert solve_positions(words, new, X, v, 50.0, NO_NUMBERS, NO_LATTICE, False) == -1
+    tables, kept = tables_of(given), new.copy()
+    assert packed_positions(new, X, v, 50.0, tables) == -1
     v[bad] = np.nan
     unlike = v.copy()
-    assert not solve_tangents(words, v, X, NO_NUMBERS, NO_LATTICE, False)
+    assert not packed_tangents(X, v, tables)
     np.testing.assert_array_equal(new, kept)
     np.testing.assert_array_equal(v, unlike)
-
-
-def test_solutions_are_added_times_a_factor() -> None:
-    given = solvers()
-    words, new, v = words_of(given), X + 0.01 * np.sin(np.arange(18.0)).reshape(6, 3), np.zeros_like(X)
-    before = new.copy()
-    solve_positions(words, new, X, v, 8.0, NO_NUMBERS, NO_LATTICE, False)
-    np.testing.assert_allclose(v, 8.0 * (new - before), atol=1e-14)
-    add(words, new, -1.0)
-    np.testing.assert_allclose(new, before, atol=1e-15)
 
 
 def test_python_functions_can_be_called_and_what_they_raise_is_kept() -> None:
@@ -86,12 +79,12 @@ def test_python_functions_can_be_called_and_what_they_raise_is_kept() -> None:
 
     held = ConstraintSet(Custom([[4]], function, lambda r: 2 * r), X, MASSES)
     solver = SingleRows(held, np.arange(1), 1 / MASSES)
-    words, new = words_of([solver]), X + 0.01
-    assert solve_positions(words, new, X, new, 0.0, NO_NUMBERS, NO_LATTICE, False) > 0
+    tables, new = tables_of([solver]), X + 0.01
+    assert packed_positions(new, X, new, 0.0, tables) > 0
     np.testing.assert_allclose(held.value(new), 0.0, atol=1e-13)
     broken.append(True)
     kept = new.copy()
-    assert solve_positions(words, new, X, new, 0.0, NO_NUMBERS, NO_LATTICE, False) == -1
+    assert packed_positions(new, X, new, 0.0, tables) == -1
     np.testing.assert_array_equal(new, kept)
     with pytest.raises(ZeroDivisionError, match="of its own"):
         solver.positions(Request(new, X))
@@ -111,6 +104,6 @@ def test_kernels_are_compiled_for_their_own_solver_only() -> None:
     solver = solvers()[0]
     x = X + 0.01
     solver.positions(Request(x, X))
-    words_of([solver])
-    for kernel in solver.kernels:
+    tables_of([solver])
+    for kernel in solver.kernels[:3]:
         assert isinstance(kernel, numba.core.registry.CPUDispatcher) and len(kernel.signatures) == 1

@@ -10,7 +10,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.sparse.step_control import MANY_ITERATIONS
+from kcons.solvers.tolerances import MANY_ITERATIONS
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.rank_revealing import RANK_TOLERANCE, damped, independent, least_norm, rank
+from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
+from kcons.solvers.tolerances import RANK_TOLERANCE
 
 
 def rows_at(angle, scale=1.0):

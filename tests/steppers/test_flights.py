@@ -23,7 +23,6 @@ from kcons.errors import ConvergenceError
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Fly
 from kcons.steppers.program import Program
-from kcons.steppers.stages.great_circles import GreatCircles
 
 
 def flown(system, state, h: float, *, exact: bool = False, flights: int = 1):
@@ -102,14 +101,11 @@ def test_flights_are_those_of_dense_algebra(make, h) -> None:
 
 
 @pytest.mark.parametrize("make", [skate, pivoting_skate, wheel])
-def test_velocity_rows_at_rest_go_through_the_compiled_stage(make) -> None:
-    system, state = make()
-    assert [solver.name for solver in system.motion.plan.solvers] == ["mixed"]
-    assert system.packed is not None
-    one = run(system, state, 0.02, 5)
-    slow = make()[0]
-    slow.__dict__["packed"] = None
-    other = run(slow, state, 0.02, 5)
+def test_velocity_rows_at_rest_go_through_the_kernels(make) -> None:
+    (system, state), (slow, _) = make(), make()
+    assert [solver.name for solver in system.motion.plan.solvers] == ["mixed"] and system.packed is not None
+    slow.packed = None
+    one, other = run(system, state, 0.02, 5), run(slow, state, 0.02, 5)
     np.testing.assert_allclose(one.positions, other.positions, rtol=0, atol=1e-14)
     np.testing.assert_allclose(one.velocities, other.velocities, rtol=0, atol=1e-13)
 
@@ -151,10 +147,10 @@ def test_great_circles_only_where_every_row_allows_them() -> None:
     growing = Sphere(0, [0, 0, 0], MovingTarget(lambda t: 1 + t, lambda t: 1.0, lambda t: 0.0))
 
     def circles(*rows):
-        return GreatCircles.of(system_of(rows, x, [1, 1, 1]).motion)
+        return system_of(rows, x, [1, 1, 1]).great_circles
 
-    assert circles(unit).atoms.tolist() == [0]
-    assert circles(unit, wide, FixedAtoms([2])).resting.tolist() == [2]
+    assert circles(unit)[:, 3].tolist() == [1, 0, 0]
+    assert circles(unit, wide, FixedAtoms([2]))[:, 3].tolist() == [1, 2, -1]
     for rows in ([FixedAtoms([2])], [growing], [unit, Distance([1, 2])], [unit, Sphere(0, [1, 1, 0], 1.0)], []):
         assert circles(*rows) is None
 

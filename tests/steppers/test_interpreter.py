@@ -1,4 +1,4 @@
-"""The interpreter: times, places far away, forces that are kept, programs of any operations, errors with their step."""
+"""The interpreter: steps in kernels and by the engine, one by one and many at once, their times, forces and errors."""
 
 from __future__ import annotations
 
@@ -8,30 +8,177 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stepper_systems import system_of
+from stepper_systems import rotor, system_of
 
-from kcons.constraints import Distance, Sphere
-from kcons.errors import ConvergenceError, ImageError, NonFiniteError
-from kcons.steppers import Geodesic, Rattle, Splitting, State, Suzuki4, System, run
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Angle, Custom, Distance, FixedAtoms, ImplicitSurface, MovingTarget, Plane, Sphere
+from kcons.errors import ConvergenceError, ImageError, InputError, KconsError, NonFiniteError
+from kcons.solvers.tolerances import MANY_ITERATIONS
+from kcons.steppers import (
+    BlanesMoan4,
+    BlanesMoan6,
+    Geodesic,
+    Rattle,
+    ReversibilityCheck,
+    Splitting,
+    State,
+    Suzuki4,
+    System,
+    run,
+)
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Project, drifts_of
 from kcons.steppers.program import Program
+from kcons.steppers.stages.packed_system import MOST_ROWS
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
-from tests.steppers.stages.test_packed_system import GROUPS, STEPPERS, molecules, springs
-from tests.steppers.test_splitting import assert_same, one_by_one
+from tests.steppers.held_systems import (
+    CELL,
+    GROUPS,
+    NAMES,
+    PAIRS,
+    SHAPE,
+    STEPPERS,
+    assert_same,
+    distance,
+    held_system,
+    mixed,
+    molecules,
+    one_by_one,
+    springs,
+    triangles,
+)
+
+ALL = pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+PIECEWISE = pytest.mark.parametrize("piecewise", [False, True], ids=["kernels", "engine"])
 
 
-def far(at: float) -> tuple[System, State]:
+# -- what is made -----------------------------------------------------------------------------------
+
+
+@ALL
+@pytest.mark.parametrize("name", NAMES)
+def test_steps_in_kernels_are_those_of_the_engine(stepper, name) -> None:
+    """Without a call of the engine; one by one and many at once to the last bit."""
+    (system, state), (other, _) = held_system(name), held_system(name, piecewise=True)
+    assert system.packed is not None and other.packed is None
+    calls = []
+    for call in ("project_positions", "project_velocities"):
+        setattr(system.motion, call, calls.append)
+    rounding = float(np.spacing(np.abs(state.positions).max()))
+    assert (state.remainder is not None) == ("far" in name)
+    for dt in (0.02, -0.01, 0.015):
+        following, expected = stepper.step(system, state, dt), stepper.step(other, state, dt)
+        assert distance(following, expected) <= 2e-14 + 8 * rounding
+        assert distance(following, state) > 1e-4
+        assert (following.remainder is None) == (expected.remainder is None) == ("far" not in name)
+        assert (following.forces is None) == (expected.forces is None)
+        if following.forces is not None:
+            np.testing.assert_allclose(following.forces, expected.forces, rtol=0, atol=1e-13 + 8 * rounding)
+        if following.remainder is not None:
+            there, here = (each.positions - state.positions + each.remainder for each in (following, expected))
+            assert np.abs(there - here).max() <= 2e-14
+        state = following
+    for dt, steps in ((0.02, 7), (-0.01, 2), (0.1 / 3, 11)):
+        expected = one_by_one(stepper, system, state, dt, steps)
+        found = stepper.march(system, state, dt, steps)
+        assert_same(found, expected)
+        assert found.step == state.step + steps
+        state = found
+    held = system.motion.constraint_set
+    if not held.n_rows:
+        return
+    assert not calls
+    x = state.positions
+    if state.remainder is not None:
+        x = x - x[0] + state.remainder
+    # Atoms of long chains are so far from the origin that the rounding of their positions is more.
+    assert np.all(np.abs(held.value(x)) <= np.maximum(held.tolerance(x, 0.0), 1e-14 * held.scale))
+    rates = held.jacobian(x) @ state.velocities.ravel()
+    assert np.abs(rates).max() <= 1e-13 * np.abs(state.velocities).max()
+    assert not state.velocities[system.motion.fixed_atoms].any()
+
+
+@pytest.mark.parametrize("name", ["hydrogens", "periodic", "far"])
+def test_a_march_by_the_engine_is_the_same_to_the_last_bit(name) -> None:
+    for stepper in (Rattle(), Suzuki4()):
+        system, state = held_system(name, piecewise=True)
+        assert_same(stepper.march(system, state, 0.02, 5), one_by_one(stepper, system, state, 0.02, 5))
+
+
+def test_what_is_left_to_the_engine() -> None:
+    def packed(*rows, x=SHAPE + 0.0, m=(16.0, 1.0, 1.0)):
+        return System(Motion(ConstraintSet(rows, x, np.array(m)), x)).packed is not None
+
+    lengths = np.linalg.norm(SHAPE[[0, 0, 1]] - SHAPE[[1, 2, 2]], axis=1)
+    moving = MovingTarget(lambda t: lengths + 0.1 * t)
+    assert packed() and packed(Distance(PAIRS)) and packed(Distance(PAIRS[:2])) and not packed(Distance(PAIRS, moving))
+    assert packed(Distance(PAIRS[:2]), FixedAtoms([0])) and packed(Distance([[0, 1]]), Angle([[1, 0, 2]]))
+    assert packed(Distance([[0, 1]]), Plane(2, [0, 0, 1.0]))
+    assert not packed(Distance([[0, 1]]), Plane(2, [0, 0, 1.0], MovingTarget(lambda t: 0.1 * t)))
+    wavy = ImplicitSurface([0, 2], lambda r: r[:, 2] ** 3 + r[:, 2], lambda r: (3 * r**2 + 1) * [0, 0, 1.0])
+    assert not packed(wavy)
+    many = np.arange(6.0 * (MOST_ROWS + 1)).reshape(-1, 3)
+    pairs, particles = np.arange(2 * MOST_ROWS + 2).reshape(-1, 2), np.arange(MOST_ROWS + 1)
+    for begin, known in ((0, False), (1, True)):
+        assert packed(Distance(pairs[begin:]), x=many, m=np.ones(len(many))) == known
+        assert packed(Sphere(particles[begin:], [0, 0, -9.0]), x=many, m=np.ones(len(many))) == known
+
+
+@ALL
+def test_energy_far_from_the_origin(stepper) -> None:
+    system, state = held_system("water far away")
+    end = run(system, state, 0.05, 50, stepper=stepper)
+    assert end.remainder is not None and not np.shares_memory(end.remainder, state.remainder)
+    assert system.kinetic_energy(end.velocities) == pytest.approx(system.kinetic_energy(state.velocities), rel=1e-13)
+
+
+def test_forces_that_depend_on_velocities() -> None:
+    """In kernels and by the engine; drifts first: two steps of half the length, whichever comes first."""
+
+    def force(x, v, t):
+        return springs(x, t) - 0.1 * v
+
+    (plain, state), (other, _) = molecules(*GROUPS), molecules(*GROUPS, piecewise=True)
+    system, by_engine = (System(each.motion, force, velocity_dependent=True) for each in (plain, other))
+    by_engine.packed = None
+    for stepper in (Rattle(), Suzuki4()):
+        assert distance(stepper.step(system, state, 0.05), stepper.step(by_engine, state, 0.05)) <= 1e-14
+    halves = run(system, state, 0.01, 8)
+    for splitting in (Splitting((1.0,), (0.5, 0.5)), Splitting((0.25, 0.5, 0.25), (0.5, 0.5))):
+        end = run(system, state, 0.02, 4, stepper=splitting)
+        np.testing.assert_allclose(end.positions, halves.positions, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(end.velocities, halves.velocities, rtol=0, atol=1e-13)
+        assert np.array_equal(end.forces, system.forces(end.positions, end.velocities, end.time, 0))
+
+
+def test_reports_show_iterations() -> None:
+    system, state = triangles()
+    end = Rattle().step(system, state, 0.05)
+    found = system.motion.report(end.positions, condition=False)
+    assert all(3 <= kind.iterations <= MANY_ITERATIONS for kind in found.kinds)
+
+
+def test_two_systems_of_one_motion_do_not_share_rooms() -> None:
+    system, state = mixed("angles")
+    other = System(system.motion, springs)
+    assert not np.shares_memory(system.packed.tables, other.packed.tables)
+    assert distance(Rattle().step(system, state, 0.02), Rattle().step(other, state, 0.02)) == 0.0
+
+
+# -- programs ---------------------------------------------------------------------------------------
+
+
+def pair_and_atom(at: float) -> tuple[System, State]:
     x = np.array([[0.0, 0.0, 0.0], [1.0 / 3.0, 0.2, 0.1], [2.0, 0.7, 0.3]]) + at
     system = system_of([Distance([[1, 2]])], x, np.ones(3))
     return system, system.initial_state(x, np.zeros_like(x))
 
 
-@pytest.mark.parametrize("packed", [True, False])
+@PIECEWISE
 @pytest.mark.parametrize("at", [0.0, 1e7])
-def test_a_step_of_no_operations_ends_where_it_began(at, packed) -> None:
-    system, state = far(at)
-    if not packed:
+def test_a_step_of_no_operations_ends_where_it_began(at, piecewise) -> None:
+    system, state = pair_and_atom(at)
+    if piecewise:
         system.packed = None
     assert (state.remainder is not None) == (at > 0)
     steps = Interpreter(system, state, 0.1, Program([]))
@@ -48,88 +195,29 @@ def test_a_step_of_no_operations_ends_where_it_began(at, packed) -> None:
     assert system.last is end and end.step == 1 and end.time == 0.1 and steps.made == 1
 
 
-@pytest.mark.parametrize("packed", [True, False])
-def test_times_within_a_step_are_exact(packed) -> None:
-    system, state = far(0.0)
-    if not packed:
+@PIECEWISE
+def test_times_within_a_step_are_exact(piecewise) -> None:
+    system, state = pair_and_atom(0.0)
+    if piecewise:
         system.packed = None
     seen: list[float] = []
     system.force = lambda x, t: seen.append(t) or np.zeros_like(x)
     state = State(state.positions, state.velocities, 1e8, time_remainder=3e-9)
     begin = system.with_forces(state)
-    seen.clear()
-    first, second = drifts_of((0.5, 0.5))
-    steps = Interpreter(system, begin, 1e-7, Program([first, Evaluate(), second, Evaluate()]), 2)
-    end = steps.through()
     half = state.later(1e-7)
     then = State(state.positions, state.velocities, half[0], time_remainder=half[1])
     middle, last = (s.time + (0.5e-7 + s.time_remainder) for s in (state, then))
-    assert seen == [middle, half[0], last, then.later(1e-7)[0]] and seen[0] > 1e8
-    assert (end.time, end.time_remainder) == then.later(1e-7)
+    first, second = drifts_of((0.5, 0.5))
+    program = [first, Evaluate(), second, Evaluate()]
+    for simple in (True, False):  # by the short way, and by the method
+        seen.clear()
+        kind = type("Steps", (Interpreter,), {"simple": simple})
+        end = kind(system, begin, 1e-7, Program(program), 2).through()
+        assert seen == [middle, half[0], last, then.later(1e-7)[0]] and seen[0] > 1e8
+        assert (end.time, end.time_remainder) == then.later(1e-7)
 
 
-@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
-def test_a_cell_that_the_force_function_changes(stepper) -> None:
-    """One by one and all at once, compiled and by the engine, with atoms of a molecule in different cells."""
-    cell = np.diag([19.0, 18.0, 17.0])
-    ends = []
-    for together, packed in ((True, True), (False, True), (False, False)):
-        system, state = molecules(*GROUPS, "triangles", cell=cell, pbc=True, scatter=True)
-        force = system.force
-
-        def press(x, t, force=force, motion=system.motion):
-            motion.set_cell((1.0 - 1e-3 * t) * cell)
-            return force(x, t)
-
-        system.force = press
-        if not packed:
-            system.packed = None
-        if together:
-            ends.append(stepper.march(system, state, 0.02, 6, check_every=0))
-        else:
-            ends.append(one_by_one(stepper, system, state, 0.02, 6))
-    assert_same(*ends[:2])
-    np.testing.assert_allclose(ends[2].positions, ends[0].positions, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(ends[2].velocities, ends[0].velocities, rtol=0, atol=1e-11)
-
-
-def test_a_march_ends_where_remainders_begin() -> None:
-    system, state = molecules(*GROUPS, force=None)
-    start = system.with_forces(State(state.positions, state.velocities + 40.0))
-    stepper = Rattle()
-    steps = stepper.begun(system, start, 0.02, 400)
-    end = steps.through()
-    assert 0 < steps.made < 400 and end.step == steps.made and end.remainder is not None
-    assert_same(end, one_by_one(stepper, system, start, 0.02, steps.made))
-    assert one_by_one(stepper, system, start, 0.02, steps.made - 1).remainder is None
-
-
-def test_drifts_first_with_forces_that_depend_on_velocities() -> None:
-    """Two steps of half the length, whichever comes first where they do not."""
-
-    def force(x, v, t):
-        return springs(x, t) - 0.1 * v
-
-    plain, state = molecules(*GROUPS)
-    system = System(plain.motion, force, velocity_dependent=True)
-    halves = run(system, state, 0.01, 8)
-    for splitting in (Splitting((1.0,), (0.5, 0.5)), Splitting((0.25, 0.5, 0.25), (0.5, 0.5))):
-        end = run(system, state, 0.02, 4, stepper=splitting)
-        np.testing.assert_allclose(end.positions, halves.positions, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(end.velocities, halves.velocities, rtol=0, atol=1e-13)
-        assert np.array_equal(end.forces, system.forces(end.positions, end.velocities, end.time, 0))
-
-
-@pytest.mark.parametrize("piecewise", [False, True])
-def test_forces_are_kept_where_no_drift_comes_after_them(piecewise) -> None:
-    system, state = molecules(*GROUPS, piecewise=piecewise)
-    for splitting, kept in ((Rattle(), True), (Splitting((1.0,), (0.5, 0.5)), False)):
-        end = splitting.march(system, state, 0.02, 3)
-        assert (end.forces is not None) == kept
-        assert not kept or np.array_equal(end.forces, springs(end.positions, 0.0))
-
-
-@pytest.mark.parametrize("piecewise", [False, True])
+@PIECEWISE
 def test_kicks_in_succession_and_before_other_operations(piecewise) -> None:
     """Each is taken once, whatever comes after it."""
     system, state = molecules(*GROUPS, piecewise=piecewise)
@@ -158,47 +246,11 @@ def test_methods_of_verbs_and_errors_get_the_number_of_the_step() -> None:
     system, state = molecules(*GROUPS)
     program = Program([Kick(0.25), Evaluate()], python=("evaluate",))
     program.rows.insert(0, program.rows[0]._replace(name="damp", verb=0, length=0.7, kick=0.0))
-    program.ends.insert(0, 0.0)
-    program.shown.insert(0, False)
-    program.flies.insert(0, False)
+    for table, value in ((program.ends, 0.0), (program.shown, False), (program.flies, False)):
+        table.insert(0, value)
     with pytest.raises(ImageError) as caught:
         Noted(system, state, 0.1, program, 5).through()
     assert caught.value.step == 3 and done == [("damp", 0.7)] * 3
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_a_force_that_is_not_finite_is_named(compiled) -> None:
-    def force(x, t):
-        f = springs(x, t)
-        if t > 0.01:
-            f[3, 1] = np.nan
-        return f
-
-    system, state = molecules(*GROUPS, force=force)
-    slowed = System(system.motion, force, friction=0.2)
-    if not compiled:
-        slowed.packed = None
-    with pytest.raises(NonFiniteError, match="non-finite force at step 1 on atom 3"):
-        run(slowed, state, 0.02, 3)
-
-
-@pytest.mark.parametrize("stepper", [Suzuki4(), Langevin(0.1, 0.3, 5)], ids=["Suzuki4", "Langevin"])
-def test_a_step_that_fails_in_a_march_leaves_the_start_and_names_row_and_step(stepper) -> None:
-    def force(x, t):
-        return 1e7 * (x - x.mean(axis=0)) if 0.085 < t < 0.095 else np.zeros_like(x)
-
-    errors = []
-    for piecewise in (False, True):
-        system, state = molecules("chain", force=force, piecewise=piecewise)
-        kept = state.copied()
-        with pytest.raises(ConvergenceError, match="time step too large") as caught:
-            stepper.march(system, state, 0.01, 30)
-        assert np.array_equal(state.positions, kept.positions) and np.array_equal(state.velocities, kept.velocities)
-        with pytest.raises(ConvergenceError) as alone:
-            one_by_one(stepper, system, state, 0.01, 30)
-        assert caught.value.step == alone.value.step > 8 and caught.value.row == alone.value.row is not None
-        errors.append((caught.value.step, caught.value.row))
-    assert errors[0] == errors[1]
 
 
 def test_programs_are_of_use_in_other_processes() -> None:
@@ -207,9 +259,117 @@ def test_programs_are_of_use_in_other_processes() -> None:
     system = system_of([Sphere(0, [0, 0, 0], 1.0)], x, [2.0], lambda x, t: -0.3 * x[:, ::-1])
     state = system.initial_state(x, [[0.0, 0.3, 0.1]])
     for stepper in (Geodesic(3), Geodesic(3, great_circles=False), Langevin(0.1, 0.3, 5)):
-        end = stepper.march(system, state, 0.1, 5)
         other = pickle.loads(pickle.dumps(stepper))
-        assert_same(other.march(system, state, 0.1, 5), end)
+        assert_same(other.march(system, state, 0.1, 5), stepper.march(system, state, 0.1, 5))
+
+
+# -- many steps at once -----------------------------------------------------------------------------
+
+
+def test_a_march_ends_where_remainders_begin() -> None:
+    system, state = molecules(*GROUPS, force=None)
+    start = system.with_forces(State(state.positions, state.velocities + 40.0))
+    steps = Rattle().begun(system, start, 0.02, 400)
+    end = steps.through()
+    assert 0 < steps.made < 400 and end.step == steps.made and end.remainder is not None
+    assert np.all(np.abs(end.remainder) <= np.spacing(np.abs(end.positions)))
+    assert_same(end, one_by_one(Rattle(), system, start, 0.02, steps.made))
+    assert one_by_one(Rattle(), system, start, 0.02, steps.made - 1).remainder is None
+    for stepper in (Rattle(), Suzuki4()):
+        assert_same(stepper.march(system, start, 0.02, 400), one_by_one(stepper, system, start, 0.02, 400))
+
+
+def test_who_looks_sees_what_steps_would_have_shown() -> None:
+    system, state = molecules(*GROUPS)
+    seen: list[State] = []
+    end = run(system, state, 0.02, 11, observers=[seen.append], every=3)
+    assert [s.step for s in seen] == [0, 3, 6, 9] and end.step == 11
+    for one in [*seen[1:], end]:
+        assert_same(one, one_by_one(Rattle(), system, state, 0.02, one.step))
+    kept = [(s.positions.copy(), s.velocities.copy()) for s in seen]
+    run(system, seen[-1], 0.02, 20)
+    for s, (x, v) in zip(seen, kept, strict=True):
+        assert np.array_equal(s.positions, x) and np.array_equal(s.velocities, v)
+
+
+@ALL
+def test_forces_that_know_the_time_and_reuse_their_array(stepper) -> None:
+    """What they were shown is never written to, nor is what they returned part of a state."""
+    seen: list[tuple[float, np.ndarray, np.ndarray]] = []
+    room = np.empty(molecules(*GROUPS)[1].positions.shape)
+
+    def force(x, t):
+        seen.append((t, x, x.copy()))
+        room[:] = springs(x, t) * (1.0 + 0.5 * np.sin(7.0 * t))
+        return room
+
+    system, state = molecules(*GROUPS, force=force)
+    state = State(state.positions, state.velocities, time=0.3)
+    expected = one_by_one(stepper, system, state, 0.02, 5)
+    times = [t for t, *_ in seen]
+    assert all(np.array_equal(x, copied) for _, x, copied in seen)
+    seen.clear()
+    found = stepper.march(system, state, 0.02, 5)
+    assert_same(found, expected)
+    assert [t for t, *_ in seen] == times and all(np.array_equal(x, copied) for _, x, copied in seen)
+    assert found.forces is None or not np.shares_memory(found.forces, room)
+
+
+def test_the_engine_is_asked_for_nothing_and_forces_are_not_copied() -> None:
+    system, state = molecules(*GROUPS)
+    state, force, made = system.with_forces(state), system.force, []
+    for call in ("project_positions", "project_velocities"):
+        setattr(system.motion, call, made.append)
+    step = type(system).accepted
+    system.accepted = lambda raw, number, copy: made.append((number, copy)) or step(system, raw, number, copy)
+    after = Rattle().march(system, state, 0.02, 8, check_every=0)
+    assert not made
+    # Forces of other kinds are taken as they come.
+    kinds = (np.ndarray.tolist, np.asfortranarray, lambda f: np.repeat(f, 2, axis=1)[:, ::2], np.float32, np.longdouble)
+    for kind in kinds:
+        made.clear()
+        system.force = lambda x, time, kind=kind: kind(force(x, time))
+        found = Rattle().march(system, state, 0.02, 8, check_every=0)
+        assert made == [(number, False) for number in range(1, 9)]
+        if kind is not np.float32:
+            assert_same(found, after)
+        else:
+            assert distance(found, after) < 1e-6
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.asfortranarray, lambda a: a[::-1].copy()[::-1]])
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4()], ids=repr)
+def test_starts_of_other_kinds_of_arrays(stepper, kind) -> None:
+    system, state = molecules(*GROUPS)
+    x, v = kind(state.positions), kind(state.velocities)
+    plain = system.with_forces(State(np.array(x, dtype=float, order="C"), np.array(v, dtype=float, order="C")))
+    strange = State(x, v, forces=kind(np.array(plain.forces)))
+    plain = replace(plain, forces=np.array(strange.forces, dtype=float, order="C"))
+    for march in (stepper.march, lambda *run: one_by_one(stepper, *run)):
+        assert_same(march(system, strange, 0.02, 5), march(system, plain, 0.02, 5))
+
+
+@PIECEWISE
+def test_forces_are_kept_where_no_drift_comes_after_them(piecewise) -> None:
+    system, state = molecules(*GROUPS, piecewise=piecewise)
+    for splitting, kept in ((Rattle(), True), (Splitting((1.0,), (0.5, 0.5)), False)):
+        end = splitting.march(system, state, 0.02, 3)
+        assert (end.forces is not None) == kept
+        assert not kept or np.array_equal(end.forces, springs(end.positions, 0.0))
+
+
+def test_steps_of_a_subclass_steppers_without_march_and_steps_of_zero() -> None:
+    class Halved(Rattle):
+        def step(self, system, state, dt):
+            return super().step(system, state, 0.5 * dt)
+
+    system, state = molecules(*GROUPS)
+    assert_same(run(system, state, 0.02, 6, stepper=Halved()), run(system, state, 0.01, 6))
+    checked = run(system, state, 0.02, 5, stepper=ReversibilityCheck(Rattle()))
+    assert_same(checked, run(system, state, 0.02, 5))
+    still = run(system, state, 0.0, 5)
+    assert np.array_equal(still.positions, state.positions) and still.step == 5
+    assert run(system, state, 0.02, 0) is state
 
 
 BATHS = [NoseHooverChain(0.1, 2.0, momentum="free"), Isokinetic(0.1, momentum="free"), Langevin(0.1, 0.3, 5)]
@@ -219,18 +379,14 @@ BATHS = [NoseHooverChain(0.1, 2.0, momentum="free"), Isokinetic(0.1, momentum="f
 def test_steps_that_go_on_are_those_that_begin_anew(stepper) -> None:
     """From the state that the last one ended in all is ready, as long as nothing has changed since."""
     system, state = molecules(*GROUPS, "triangles")
-    again, one = copy.deepcopy(stepper), state
-    begun = []
-    stepper = copy.deepcopy(stepper)
-    first = stepper.begun
+    again, stepper = copy.deepcopy(stepper), copy.deepcopy(stepper)
+    begun, first = [], stepper.begun
     stepper.begun = lambda *given: begun.append(1) or first(*given)
-    other = state
+    one = other = state
     for _ in range(4):
         one = stepper.step(system, one, 0.02)
-        other_system = molecules(*GROUPS, "triangles")[0]
-        other = again.step(other_system, replace(other, origin=None), 0.02)
+        other = again.step(molecules(*GROUPS, "triangles")[0], replace(other, origin=None), 0.02)
         assert_same(one, other)
-        assert one.thermostat is None or np.array_equal(one.thermostat, other.thermostat)
     assert len(begun) == 1
     # Another time step, a state that was changed, a force that fails on the way: all begin anew.
     assert stepper.step(system, one, 0.01).time == pytest.approx(one.time + 0.01)
@@ -251,9 +407,7 @@ def test_a_temperature_that_is_changed_between_steps_counts_at_once(make) -> Non
     state = one.step(system, state, 0.02)
     kept = state.copied()
     one.thermal_energy = other.thermal_energy = 0.3
-    after, expected = one.step(system, state, 0.02), other.step(system, replace(kept, origin=None), 0.02)
-    assert_same(after, expected)
-    assert np.array_equal(after.thermostat, expected.thermostat)
+    assert_same(one.step(system, state, 0.02), other.step(system, replace(kept, origin=None), 0.02))
 
 
 @pytest.mark.parametrize("make", [lambda: NoseHooverChain(0.1, 2.0), lambda: Isokinetic(0.1)])
@@ -268,15 +422,262 @@ def test_bodies_that_feel_nothing_are_noticed_also_where_steps_go_on(make) -> No
 
 
 def test_copies_of_a_system_begin_anew() -> None:
-    system, state = molecules(*GROUPS)
-    state = Rattle().step(system, state, 0.02)
-    for other, there in (copy.deepcopy((system, state)), pickle.loads(pickle.dumps((plain(system), state)))):
-        assert other.going is None
-        assert_same(Rattle().step(other, there, 0.02), Rattle().step(system, state, 0.02))
+    """What kernels are called by is an address: that of the copy's rows, which live as long as the copy."""
+    system, state = mixed("dihedral and a surface")
+    state = run(system, state, 0.01, 3)
+    end = Rattle().step(system, state, 0.02)
+    others = [copy.deepcopy((system, state)), pickle.loads(pickle.dumps((system, state)))]
+    del system
+    for other, there in others:
+        assert other.going is None and other.packed is not None
+        assert_same(Rattle().step(other, there, 0.02), end)
 
 
-def plain(system: System) -> System:
-    """Without a force function that is local to a test."""
-    other = copy.copy(system)
-    other.force = springs
-    return other
+# -- cells that change ------------------------------------------------------------------------------
+
+
+@ALL
+def test_a_cell_that_the_force_function_changes(stepper) -> None:
+    """One by one and all at once, compiled and by the engine, with atoms of a molecule in different cells."""
+    ends = []
+    for together, piecewise in ((True, False), (False, False), (False, True)):
+        system, state = molecules(*GROUPS, "triangles", cell=CELL, pbc=True, scatter=True, piecewise=piecewise)
+        force = system.force
+
+        def press(x, t, force=force, motion=system.motion):
+            motion.set_cell((1.0 - 1e-3 * t) * CELL)
+            return force(x, t)
+
+        system.force = press
+        if together:
+            ends.append(stepper.march(system, state, 0.02, 6, check_every=0))
+        else:
+            ends.append(one_by_one(stepper, system, state, 0.02, 6))
+    assert_same(*ends[:2])
+    np.testing.assert_allclose(ends[2].positions, ends[0].positions, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[2].velocities, ends[0].velocities, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("where", [0, 1], ids=["given", "held"])
+def test_a_cell_that_is_changed_in_either_set_is_seen(where) -> None:
+    """Before a step, and by the force function in the middle of a march."""
+    cell = np.diag([9.0, 8.0, 7.0])
+    apart = np.random.default_rng(0).integers(-1, 2, size=(33, 3))
+    (system, state), (other, _) = (triangles(cell=cell, pbc=True, piecewise=p) for p in (False, True))
+    for each in (system, other):
+        each.motion.set_cell(1.05 * cell, True)
+    moved = State(state.positions + apart * 1.05 * np.diag(cell), state.velocities)
+    assert distance(BlanesMoan4().step(system, moved, 0.05), BlanesMoan4().step(other, moved, 0.05)) <= 1e-13
+
+    system, state = triangles(cell=cell, pbc=True)
+    force, calls = system.force, []
+
+    def press(x, time):
+        calls.append(time)
+        if len(calls) == 4:
+            system.motion.sources[where].with_cell(1.001 * cell)
+        return force(x, time)
+
+    system.force = press
+    found = Rattle().march(system, State(state.positions + apart * np.diag(cell), state.velocities), 0.02, 9)
+    held = system.motion.constraint_set
+    assert np.abs(held.value(found.positions, 0.0)).max() <= 1e-13
+    held.with_cell(cell)
+    assert np.abs(held.value(found.positions, 0.0)).max() > 1e-3
+
+
+# -- errors -----------------------------------------------------------------------------------------
+
+
+def outcome(stepper, system, state, dt):
+    """The state after a step, or its error, with the start as it was."""
+    before = state.positions.copy(), state.velocities.copy()
+    try:
+        return stepper.step(system, state, float(dt))
+    except KconsError as error:
+        return error
+    finally:
+        assert np.array_equal(state.positions, before[0]) and np.array_equal(state.velocities, before[1])
+
+
+#: Name -> system; the first four have Distances alone.
+WITHOUT_SOLUTION = {
+    "groups": (molecules, *GROUPS),
+    "chain": (molecules, "chain"),
+    "longer": (molecules, "longer"),
+    "triangle and more": (molecules, "triangles", "methyl"),
+    "triangles": (triangles,),
+    **{name: (mixed, name) for name in ("two surfaces", "angles", "dihedral and a surface", "distances apart")},
+}
+
+
+@pytest.mark.parametrize("name", WITHOUT_SOLUTION)
+def test_steps_without_solution_are_the_engines(name) -> None:
+    """The same error, for the same row, after which a usual step is what it would have been."""
+    taken = failed = 0
+    make, *given = WITHOUT_SOLUTION[name]
+    (system, state), (other, _) = (make(*given, force=None, piecewise=p) for p in (False, True))
+    held, engine, calls = system.motion.constraint_set, system.motion.project_positions, []
+    system.motion.project_positions = lambda *a, **k: calls.append(1) or engine(*a, **k)
+    many = make is triangles
+    steps = np.geomspace(0.5, 8.0, 20) if many else [0.5, 20.0] if name == "longer" else np.geomspace(0.5, 20.0, 6)
+    for stepper in STEPPERS if make is not mixed else (Rattle(), Suzuki4(), BlanesMoan4()):
+        for dt in steps:
+            calls.clear()
+            one, two = outcome(stepper, system, state, dt), outcome(stepper, other, state, dt)
+            if isinstance(two, State) and isinstance(one, State):
+                allowed = np.maximum(held.tolerance(one.positions, 0.0), 1e-13)
+                assert np.all(np.abs(held.value(one.positions)) <= allowed)
+                assert not many or distance(one, two) <= 1e-10
+                taken += bool(calls) if many else 1
+            elif isinstance(one, KconsError) and isinstance(two, KconsError):
+                assert type(one) is type(two) and one.row == two.row and one.atoms == two.atoms and one.step == 1
+                assert ("held dihedral" if one.singular else "time step too large") in str(one)
+                failed += 1
+            else:
+                assert not many
+            assert distance(stepper.step(system, state, 0.02), stepper.step(other, state, 0.02)) <= 2e-14
+    assert taken >= 3 and failed >= 3
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4()], ids=repr)
+def test_a_march_of_steps_that_the_kernels_leave_to_the_engine(stepper) -> None:
+    """Steps so long that Newton's method takes many iterations, among shorter ones."""
+    system, state = triangles(force=None)
+    project, calls, found = system.motion.project_positions, [], 0
+    system.motion.project_positions = lambda *a, **k: calls.append(1) or project(*a, **k)
+    for dt in np.geomspace(0.3, 5.0, 30):
+        calls.clear()
+        try:
+            expected = one_by_one(stepper, system, state, float(dt), 4)
+        except KconsError as error:
+            with pytest.raises(type(error)) as raised:
+                stepper.march(system, state, float(dt), 4)
+            assert raised.value.step == error.step and str(raised.value) == str(error)
+            continue
+        found += bool(calls)
+        assert_same(stepper.march(system, state, float(dt), 4), expected)
+    assert found
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4(), Langevin(0.1, 0.3, 5)], ids=lambda each: type(each).__name__)
+def test_a_step_that_fails_in_a_march_leaves_the_start_and_names_row_and_step(stepper) -> None:
+    """A push in one step that leads too far in the next."""
+
+    def force(x, t):
+        return 1e7 * (x - x.mean(axis=0)) if 0.085 < t < 0.095 else np.zeros_like(x)
+
+    errors = []
+    for piecewise in (False, True):
+        system, state = molecules("chain", force=force, piecewise=piecewise)
+        kept, seen = state.copied(), []
+        marches = (
+            lambda: stepper.march(system, state, 0.01, 30),  # noqa: B023
+            lambda: one_by_one(stepper, system, state, 0.01, 30),  # noqa: B023
+            lambda: run(system, state, 0.01, 30, stepper=stepper, observers=[seen.append], every=4),  # noqa: B023
+        )
+        for march in marches:
+            with pytest.raises(ConvergenceError, match="time step too large") as caught:
+                march()
+            errors.append((caught.value.step, caught.value.row))
+            assert_same(state, kept)
+        assert [s.step for s in seen] == list(range(0, errors[-1][0], 4))
+    assert len(set(errors)) == 1 and errors[0][0] > 8 and errors[0][1] is not None
+
+
+@ALL
+@pytest.mark.parametrize(
+    ("wrong", "kind", "message"),
+    [
+        (np.nan, NonFiniteError, "non-finite force at step 4 on atom 2"),
+        (np.inf, NonFiniteError, "non-finite force at step 4 on atom 2"),
+        (None, InputError, r"returned shape \(3,\) at step 4"),
+    ],
+)
+def test_errors_name_the_step(stepper, wrong, kind, message) -> None:
+    def force(x, t):
+        f = springs(x, t)
+        # The last of its times at which forces are asked for lies in the fourth step for all steppers.
+        if t > 3.05 * 0.02:
+            if wrong is None:
+                return np.zeros(3)
+            f[2, 1] = wrong
+        return f
+
+    texts = []
+    for piecewise in (False, True):
+        system, state = molecules(*GROUPS, force=force, piecewise=piecewise)
+        before = state.positions.copy(), state.velocities.copy()
+        for march in (stepper.march, lambda *run: one_by_one(stepper, *run)):
+            with pytest.raises(kind, match=message) as raised:
+                march(system, state, 0.02, 9)
+            texts.append(str(raised.value))
+        assert np.array_equal(state.positions, before[0]) and np.array_equal(state.velocities, before[1])
+    assert len(set(texts)) == 1
+
+
+@ALL
+@PIECEWISE
+def test_forces_that_are_wrong_from_the_first(stepper, piecewise) -> None:
+    """Those that the state carries, those of any call of the first step, with friction, too."""
+    system, state = molecules(*GROUPS, piecewise=piecewise)
+    bad = np.zeros_like(state.positions)
+    bad[2, 1] = np.inf
+    if stepper.kick_first:
+        with pytest.raises(NonFiniteError, match="non-finite force at step 1 on atom 2"):
+            stepper.step(system, State(state.positions, state.velocities, forces=bad), 0.01)
+    calls: list[float] = []
+    force = lambda x, t: calls.append(t) or (bad if len(calls) > 1 else springs(x, t))  # noqa: E731
+    slowed = System(system.motion, force, friction=0.2)
+    if piecewise:
+        slowed.packed = None
+    with pytest.raises(NonFiniteError, match="non-finite force at step 1 on atom 2"):
+        run(slowed, state, 0.02, 3, stepper=stepper)
+
+
+@PIECEWISE
+def test_numbers_that_overflow(piecewise) -> None:
+    alone = (np.arange(34) == 33)[:, None]  # the free atom, of which the engine knows nothing
+    system, state = triangles(ions=1, force=None, piecewise=piecewise)
+    for stepper in (Rattle(), BlanesMoan6()):
+        with pytest.raises(NonFiniteError, match="non-finite position at step 1 on atom 33"):
+            stepper.step(system, State(state.positions, alone * np.full(3, 1.7e308)), 10.0)
+    system, state = triangles(ions=1, force=lambda x, t: alone * np.full(3, 1e308), piecewise=piecewise)
+    start = State(state.positions, alone * np.full(3, 1.797e308), forces=np.zeros((34, 3)))
+    with pytest.raises(NonFiniteError, match="non-finite velocity at step 1 on atom 33"):
+        Rattle().step(system, start, 1.0)
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), BlanesMoan4()], ids=repr)
+@pytest.mark.parametrize("march", [False, True], ids=["steps", "march"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_what_a_python_row_raises_once_is_not_lost(stepper, march, error) -> None:
+    """An interrupt comes in any call, of positions or velocities, and the next one would go well."""
+    left = 0
+
+    def function(r):
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise error
+        return float(r[0] @ r[0])
+
+    x = np.array([[1.0, 0.2, 0.1]])
+    system = System(Motion(ConstraintSet(Custom([[0]], function, lambda r: 2 * r), x, [1.0]), x), springs)
+    assert system.packed is not None
+    state = system.initial_state(x, [[0.0, 0.1, 0.0]], project=True)
+    for calls in range(1, 40, 3):
+        left, kept = calls, state.copied()
+        with pytest.raises(error):
+            if march:
+                stepper.march(system, state, 0.01, 12)
+            else:
+                run(system, state, 0.01, 12, stepper=stepper)
+        assert distance(state, kept) == 0.0
+    assert np.abs(system.motion.constraint_set.value(stepper.step(system, state, 0.01).positions)).max() < 1e-13
+
+
+def test_a_time_step_that_is_no_number() -> None:
+    system, state = rotor()
+    with pytest.raises(InputError, match="dt is nan"):
+        run(system, state, float("nan"), 3)

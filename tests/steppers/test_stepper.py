@@ -1,13 +1,15 @@
-"""What every stepper promises: purity, failure, reversal, invariance; running; the reversibility check."""
+"""What every stepper does: what it states, purity, errors, time steps, invariance; runs; steps taken back."""
 
 from __future__ import annotations
 
+import itertools
 import pickle
 
 import numpy as np
 import pytest
 from stepper_systems import (
     EVERY,
+    PROJECTED,
     SYMMETRIC,
     gravity,
     growing_rod,
@@ -17,11 +19,14 @@ from stepper_systems import (
 )
 
 from kcons.constraints import Angle, Distance
-from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, ReversibilityError, UnsupportedError
 from kcons.steppers import (
     Baumgarte,
+    Geodesic,
     ProjectedRungeKutta4,
     ProjectedVerlet,
+    Rattle,
+    ReversibilityCheck,
     State,
     System,
     run,
@@ -77,17 +82,12 @@ def springs(x: np.ndarray, t: float) -> np.ndarray:
 
 
 @ALL
-def test_declared_properties(stepper) -> None:
+def test_what_it_states_and_documents(stepper) -> None:
     declared = stepper.order, stepper.reversible, stepper.symplectic, stepper.force_evaluations
     assert declared == DECLARED[repr(stepper)]
-
-
-@ALL
-def test_documentation_says_what_it_is_not_for(stepper) -> None:
     documentation = type(stepper).__doc__
     assert "Not " in documentation, "what it may not be used with"
-    assert f"order {stepper.order}" in documentation.lower()
-    assert "force evaluation" in documentation
+    assert f"order {stepper.order}" in documentation.lower() and "force evaluation" in documentation
     assert "eversible" in documentation and "ymplectic" in documentation
 
 
@@ -142,10 +142,11 @@ def test_step_is_pure(stepper) -> None:
 
 
 @ALL
-def test_a_calculator_may_reuse_its_array(stepper) -> None:
-    buffer = np.zeros((4, 3))
+def test_a_calculator_may_reuse_its_array_and_keep_what_it_is_given(stepper) -> None:
+    buffer, kept = np.zeros((4, 3)), []
 
     def force(x, t):
+        kept.append((x, x.copy()))
         np.copyto(buffer, springs(x, t))
         return buffer
 
@@ -153,18 +154,6 @@ def test_a_calculator_may_reuse_its_array(stepper) -> None:
     a, b = run(one, start, 0.05, 5, stepper=stepper), run(other, start, 0.05, 5, stepper=stepper)
     assert np.array_equal(a.positions, b.positions) and np.array_equal(a.velocities, b.velocities)
     assert a.forces is None or not np.shares_memory(a.forces, buffer)
-
-
-@ALL
-def test_a_calculator_may_keep_what_it_is_given(stepper) -> None:
-    kept: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def force(x, t):
-        kept.append((x, x.copy()))
-        return springs(x, t)
-
-    system, state = molecule(force)
-    run(system, state, 0.05, 3, stepper=stepper)
     assert all(np.array_equal(x, copy) for x, copy in kept)
 
 
@@ -216,21 +205,23 @@ def test_non_finite_force_names_step_and_atom(stepper, value) -> None:
 
 
 @ALL
-@pytest.mark.parametrize("damage", [lambda f: f[:3], lambda f: f.ravel(), lambda f: f[:, :2], lambda f: 0.0])
-def test_wrong_force_shape_names_the_step(stepper, damage) -> None:
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        *(
+            (damage, r"shape .* at step 3; it must return \(4, 3\)")
+            for damage in (lambda f: f[:3], np.ravel, lambda f: 0.0)
+        ),
+        *((lambda f, value=value: value, "force function") for value in ("text", [[1, 2], [3]], None)),
+    ],
+    ids=["rows", "flat", "number", "text", "ragged", "none"],
+)
+def test_wrong_forces_name_the_step(stepper, damage, message) -> None:
     system, state = molecule(breaks_at(3, damage))
     seen: list[State] = []
-    with pytest.raises(InputError, match=r"shape .* at step 3; it must return \(4, 3\)"):
+    with pytest.raises(InputError, match=message):
         run(system, state, 0.05, 10, stepper=stepper, observers=[seen.append])
     assert seen[-1].step == 2 and np.isfinite(seen[-1].positions).all()
-
-
-@ALL
-@pytest.mark.parametrize("value", ["text", [[1, 2], [3]], None], ids=["text", "ragged", "none"])
-def test_forces_that_are_no_numbers(stepper, value) -> None:
-    system, state = rotor(force=lambda x, t: value)
-    with pytest.raises(InputError, match="force function"):
-        stepper.step(system, state, 0.05)
 
 
 @ALL
@@ -268,23 +259,17 @@ def test_too_large_a_step_raises_and_changes_nothing(stepper) -> None:
 
 
 @ALL
-@pytest.mark.parametrize("dt", [np.nan, np.inf, -np.inf])
-def test_bad_time_step(stepper, dt) -> None:
+def test_steps_of_no_number_and_of_zero(stepper) -> None:
     system, state = molecule()
     before = copies(state)
-    with pytest.raises(InputError, match="time step"):
-        stepper.step(system, state, dt)
+    for dt in (np.nan, np.inf, -np.inf):
+        with pytest.raises(InputError, match="time step"):
+            stepper.step(system, state, dt)
+    for dt in (0.0, -0.0):
+        after = stepper.step(system, state, dt)
+        assert np.array_equal(after.positions, state.positions) and np.array_equal(after.velocities, state.velocities)
+        assert after.time == state.time and after.step == state.step + 1
     assert_untouched(state, before)
-
-
-@ALL
-@pytest.mark.parametrize("dt", [0.0, -0.0])
-def test_zero_step_changes_nothing(stepper, dt) -> None:
-    system, state = molecule()
-    after = stepper.step(system, state, dt)
-    assert np.array_equal(after.positions, state.positions)
-    assert np.array_equal(after.velocities, state.velocities)
-    assert after.time == state.time and after.step == state.step + 1
 
 
 @REVERSIBLE
@@ -323,45 +308,27 @@ def test_opposite_velocities_lead_back(stepper) -> None:
 
 
 @ALL
-def test_order_of_atoms_does_not_matter(stepper) -> None:
+def test_order_of_atoms_orientation_place_and_moving_frame_do_not_matter(stepper) -> None:
     system, start = molecule()
+    end = run(system, start, 0.02, 100, stepper=stepper)
     new = np.array([2, 0, 3, 1])  # atom new[i] of the old order is atom i of the new one
-    place = np.argsort(new)
-    x = start.positions[new]
+    place, x = np.argsort(new), start.positions[new]
     rows = [Angle([place[[0, 1, 2]]]), Distance([place[[1, 2]], place[[0, 1]]])]
     other = system_of(rows, x, system.masses[new], springs)
-    a = run(system, start, 0.02, 100, stepper=stepper)
     b = run(other, other.initial_state(x, start.velocities[new]), 0.02, 100, stepper=stepper)
-    assert np.abs(a.positions[new] - b.positions).max() <= 1e-12
-    assert np.abs(a.velocities[new] - b.velocities).max() <= 1e-12
+    assert np.abs(end.positions[new] - b.positions).max() <= 1e-12
+    assert np.abs(end.velocities[new] - b.velocities).max() <= 1e-12
 
-
-@ALL
-def test_orientation_and_place_do_not_matter(stepper) -> None:
-    system, start = molecule()
     turn, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
     turn *= np.linalg.det(turn)
-    there = start.positions @ turn.T + [3.0, -2.0, 5.0]
-    other, _ = molecule()
-    a = run(system, start, 0.02, 100, stepper=stepper)
-    b = run(other, other.initial_state(there, start.velocities @ turn.T), 0.02, 100, stepper=stepper)
-    assert np.abs(a.positions @ turn.T + [3.0, -2.0, 5.0] - b.positions).max() <= 1e-12
-    assert np.abs(a.velocities @ turn.T - b.velocities).max() <= 1e-12
+    shift, drift = np.array([3.0, -2.0, 5.0]), np.array([0.3, -0.2, 0.1])
+    there = molecule()[0].initial_state(start.positions @ turn.T + shift, start.velocities @ turn.T)
+    b = run(molecule()[0], there, 0.02, 100, stepper=stepper)
+    assert np.abs(end.positions @ turn.T + shift - b.positions).max() <= 1e-12
+    assert np.abs(end.velocities @ turn.T - b.velocities).max() <= 1e-12
 
-
-@ALL
-def test_moving_frame_does_not_matter(stepper) -> None:
-    system, start = molecule()
-    drift = np.array([0.3, -0.2, 0.1])
-    moving = system.initial_state(start.positions, start.velocities + drift)
-    a, b = run(system, start, 0.02, 100, stepper=stepper), run(system, moving, 0.02, 100, stepper=stepper)
-    assert np.abs(a.positions + 2.0 * drift - b.positions).max() <= 1e-12
-
-
-# -- run --------------------------------------------------------------------------------------------
-
-
-# -- the reversibility check ------------------------------------------------------------------------
+    b = run(system, system.initial_state(start.positions, start.velocities + drift), 0.02, 100, stepper=stepper)
+    assert np.abs(end.positions + 2.0 * drift - b.positions).max() <= 1e-12
 
 
 def test_reprs_build_the_stepper_again() -> None:
@@ -378,3 +345,72 @@ def test_gravity_alone_is_exact() -> None:
     for stepper in EVERY:
         end = run(system, start, 0.25, 8, stepper=stepper)
         assert np.abs(end.positions - (x + 2.0 * start.velocities + [0, 0, -2.0])).max() <= 1e-14, stepper
+
+
+# -- the check of reversibility --------------------------------------------------------------------------
+
+
+@REVERSIBLE
+def test_check_passes_good_steps_and_changes_nothing(stepper) -> None:
+    system, start = molecule()
+    checked = ReversibilityCheck(stepper)
+    a, b = run(system, start, 0.02, 50, stepper=checked), run(system, start, 0.02, 50, stepper=stepper)
+    assert np.array_equal(a.positions, b.positions)
+    assert (checked.order, checked.symplectic) == (stepper.order, stepper.symplectic)
+    assert checked.force_evaluations == 2 * stepper.force_evaluations
+
+
+class Drifting(Rattle):
+    """Claims to be reversible and loses a little speed."""
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        after = super().step(system, state, dt)
+        return State(after.positions, after.velocities * (1 - 1e-7), after.time, None, after.step)
+
+
+def test_check_finds_a_stepper_that_is_not_reversible() -> None:
+    system, state = rotor()
+    state = State(state.positions, state.velocities, step=6)
+    before = copies(state)
+    with pytest.raises(ReversibilityError, match="step 7 is not reversible: taken back, atom") as caught:
+        ReversibilityCheck(Drifting()).step(system, state, 0.1)
+    assert caught.value.step == 7 and 1e-8 < caught.value.residual < 1e-6
+    assert_untouched(state, before)
+    ReversibilityCheck(Drifting(), tolerance=1e-5).step(system, state, 0.1)
+
+
+def test_check_finds_forces_with_a_memory() -> None:
+    """As by neighbour lists that are out of date: not a function of the positions."""
+    counter = itertools.count()
+    system, state = rotor(force=lambda x, t: -x * (1 + 1e-4 * next(counter)))
+    with pytest.raises(ReversibilityError, match="not reversible"):
+        run(system, state, 0.1, 10, stepper=ReversibilityCheck(Rattle()))
+
+
+def test_check_reports_a_step_that_cannot_be_taken_back() -> None:
+    class OneWay(Rattle):
+        def step(self, system: System, state: State, dt: float) -> State:
+            if dt < 0:
+                raise ConvergenceError("no way back", residual=0.5, row=0, atoms=[0, 1])
+            return super().step(system, state, dt)
+
+    system, state = rotor()
+    with pytest.raises(ReversibilityError, match="step 1 cannot be taken back: no way back") as caught:
+        ReversibilityCheck(OneWay()).step(system, state, 0.1)
+    assert caught.value.atoms == (0, 1) and caught.value.step == 1
+
+
+def test_check_refuses_schemes_that_are_not_reversible_and_bad_tolerances() -> None:
+    for stepper in PROJECTED:
+        with pytest.raises(UnsupportedError, match="use Rattle, Geodesic, a Composition or a RungeKuttaNystrom"):
+            ReversibilityCheck(stepper)
+    for tolerance in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="tolerance"):
+            ReversibilityCheck(Rattle(), tolerance)
+
+
+def test_check_works_far_from_the_origin_and_at_rest() -> None:
+    system, state = rotor(omega=1.0, offset=1e6)
+    run(system, state, 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
+    system, state = rotor(omega=0.0)
+    run(system, state, 0.05, 3, stepper=ReversibilityCheck(Rattle()))

@@ -15,7 +15,7 @@ from ase.calculators.tip3p import TIP3P
 
 from kcons.ase import Constraints, constrain, draw_velocities, rigid_water
 from kcons.constraints import Angle, Distance
-from kcons.solvers.kernels.groups_of_eight import POSITION_TOLERANCE
+from kcons.solvers.tolerances import NEWTON_TOLERANCE
 
 FS = units.fs
 TEMPERATURE = 300.0
@@ -144,12 +144,12 @@ def off(atoms, held) -> float:
 def unavoidable(atoms, length) -> float:
     """What `off` may be of held distances up to `length`, however well they are solved.
 
-    The solver accepts POSITION_TOLERANCE of a length. Storing rounds each coordinate of both atoms by half a unit in
+    The solver accepts NEWTON_TOLERANCE of a length. Storing rounds each coordinate of both atoms by half a unit in
     the last place, sqrt(3) units along a bond at most. Measuring rounds three differences, their squares, two sums and
     a root, 3.5 units of 2^-53 at most; so did the solver when it measured.
     """
     stored = np.sqrt(3) * np.spacing(np.abs(atoms.positions).max())
-    return float(stored + (POSITION_TOLERANCE + 7 * 2.0**-53) * length)
+    return float(stored + (NEWTON_TOLERANCE + 7 * 2.0**-53) * length)
 
 
 def slip(atoms, held) -> float:

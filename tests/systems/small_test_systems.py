@@ -2,10 +2,36 @@
 
 from importlib.util import find_spec
 
-import beads as beads  # test systems of the tests alone
+import numpy as np
 
-from kcons.comparison import test_systems
+from kcons import ConstraintSet
+from kcons.comparison import add_system, test_systems
+from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.system import BARE, TestSystem
+from kcons.constraints import MovingTarget, Sphere
 from kcons.steppers import State, System, run
+
+
+def breathing(size, seed):
+    """A spherical pendulum whose length breathes: what moves by itself."""
+    swing = MovingTarget(lambda t: 1 + 0.2 * np.sin(t), lambda t: 0.2 * np.cos(t), lambda t: -0.2 * np.sin(t))
+    x, masses = np.array([[0.6, 0.0, -0.8]]), np.ones(1)
+    return TestSystem(
+        name="breathing",
+        title="spherical pendulum whose length breathes",
+        constraint_set=ConstraintSet(Sphere(0, np.zeros(3), swing), x, masses),
+        positions=x,
+        velocities=np.array([[0.12, 0.9, -0.16]]),
+        potential=Potential(uniform_field(masses), "uniform field"),
+        symbols=["X"],
+        horizon=4.0,
+        time_steps=(0.1, 0.05, 0.025, 0.0125),
+        tolerances=(1e-3, 1e-6, 1e-9),
+        units=BARE,
+    )
+
+
+add_system("breathing", breathing, "a pendulum whose length breathes", unit="pendulum", only=True)
 
 #: Test systems that are stored reference cases, solved with 45 digits in minimal coordinates or closed form.
 STORED = {
@@ -16,9 +42,6 @@ STORED = {
     "pendulum": "A03_planar_pendulum_179p9deg",
     "double-pendulum": "A04_double_pendulum",
     "triple-pendulum": "A04_triple_pendulum",
-    "bead-ellipse": "A08_bead_vertical_ellipse",
-    "bead-rotating": "A08_bead_rotating_ellipse",
-    "bead-torus": "A08_torus_geodesic",
 }
 
 #: Molecules with forces of OpenMM that are too large, see tests/comparison/test_files.py.

@@ -8,7 +8,7 @@ from kcons.steppers import (
     State,
     System,
 )
-from kcons.steppers.adaptive.extrapolation import _Table
+from kcons.steppers.extrapolation import _Table
 
 
 def end_of(scheme: Extrapolation, system: System, state: State, until: float) -> State:

@@ -44,12 +44,6 @@ def swirling(x: Array, t: float = 0.0) -> Array:
     return repelling(x) + np.cross([0.3, 0.1, 1.0], x - x.mean(axis=0))
 
 
-def repelling_potential(x: Array, t: float = 0.0) -> float:
-    d = x[:, None] - x[None, :]
-    r2 = (d * d).sum(-1)[np.triu_indices(len(x), 1)]
-    return float(np.exp(-r2).sum())
-
-
 def quartic(x: Array, t: float = 0.0) -> Array:
     return -(x**3)
 
@@ -99,10 +93,6 @@ def integrated(system: System, state: State, end: float) -> tuple[Array, Array]:
 def springs(x, t):
     """Each atom in a harmonic well of its own strength, and an attraction of neighbouring molecules."""
     return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
-
-
-def far_springs(x, t):
-    return springs(x - 1e6, t)
 
 
 def molecules(name="dumbbells", n=11, *, ions=0, at=0.0, force=springs, **options) -> tuple[System, State]:

@@ -30,9 +30,11 @@ def two_state(rng, n, memory):
     return np.cumprod(np.where(turns, -1, 1)) * rng.choice([-1, 1])
 
 
-def swinging(rng, n, period, memory):
-    keep = math.exp(-1 / memory)
-    return lfilter([1.0], [1.0, -2 * keep * math.cos(2 * math.pi / period), keep**2], rng.standard_normal(2 * n))[n:]
+def oscillator(rng, n, memory, turn):
+    """Amplitudes fade as exp(-t/memory), with `turn` radians in one memory; 0 is critical damping."""
+    keep, before = math.exp(-1 / memory), 12 * int(memory) + 50
+    noise = rng.standard_normal(n + before)
+    return lfilter([1.0], [1.0, -2 * keep * math.cos(turn / memory), keep**2], noise)[before:]
 
 
 #: Each spans 20 of its slowest times or more.
@@ -46,7 +48,14 @@ SERIES = {
     "rarely seen states": lambda rng: rng.standard_normal(4000) + 0.1 * two_state(rng, 4000, 100.0),
     "fast and slow": lambda rng: fading(rng, 4000, 3.0)[:, 0] + math.sqrt(0.2) * two_state(rng, 4000, 100.0),
     "states alone": lambda rng: rng.standard_normal(400) + two_state(rng, 400, 20.0),
-    "swings": lambda rng: swinging(rng, 2000, 10.0, 20.0),
+    "sum of memories": lambda rng: sum(
+        f * fading(rng, 4000, m)[:, 0] for f, m in ((1.0, 3.0), (1.0, 20.0), (0.5, 120.0))
+    ),
+    "many swings": lambda rng: oscillator(rng, 2000, 20.0, 4 * math.pi),
+    "underdamped": lambda rng: oscillator(rng, 2000, 50.0, 2.0),
+    "underdamped for a twentieth": lambda rng: oscillator(rng, 2000, 100.0, 3.0),
+    "critically damped": lambda rng: oscillator(rng, 2000, 50.0, 0.0),
+    "critically damped, long": lambda rng: oscillator(rng, 2000, 20.0, 0.0),
     "smooth": lambda rng: gaussian_filter1d(rng.standard_normal(300), 5.0)[50:-50],
 }
 
@@ -61,10 +70,30 @@ def scatter(found, expected=0.0):
 @pytest.mark.parametrize("name", SERIES, ids=lambda name: name.replace(" ", "-"))
 def test_errors_are_as_large_as_they_say(name):
     rng = np.random.default_rng(1)
-    series = [SERIES[name](rng) for _ in range(600)]
+    series = [SERIES[name](rng) for _ in range(500)]
     assert 0.9 <= scatter([mean(values) for values in series]) <= 1.15
     for values in series[:3]:
         assert weighted_mean(values).error[0] == pytest.approx(mean(values).error, rel=1e-9)
+
+
+@pytest.mark.validation
+@pytest.mark.filterwarnings("ignore:.*independent ones")
+@pytest.mark.parametrize("span", [20, 40, 100])
+@pytest.mark.parametrize("n", [400, 3000])
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 10.0])
+def test_errors_of_oscillators(turn, n, span):
+    """`span` memories in a run, or of the integral of its correlations, which is twice as long at critical damping."""
+    rng = np.random.default_rng(10)
+    series = [oscillator(rng, n, n / span / (1 if turn else 2), turn) for _ in range(1500)]
+    assert 0.9 <= scatter([mean(values) for values in series]) <= 1.15
+
+
+@pytest.mark.validation
+@pytest.mark.filterwarnings("ignore:.*independent ones")
+@pytest.mark.parametrize("name", SERIES, ids=lambda name: name.replace(" ", "-"))
+def test_errors_of_many_runs(name):
+    rng = np.random.default_rng(11)
+    assert 0.9 <= scatter([mean(SERIES[name](rng)) for _ in range(2000)]) <= 1.15
 
 
 @pytest.mark.filterwarnings("ignore:.*independent ones")

@@ -18,6 +18,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import CalculatorError
 
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray]]
+#: Name of the potential of systems on which no forces act.
+NO_FORCES = "no forces"
 
 
 class Potential:
@@ -83,6 +85,11 @@ class Potential:
         self.seconds += clock() - start
         self.evaluations += 1
         self._last, self._energy, self._forces = np.array(x, dtype=float), float(energy), np.asarray(forces, float)
+
+
+def no_forces() -> Potential:
+    """The potential of a system on which no forces act."""
+    return Potential(lambda x: (0.0, np.zeros_like(x)), NO_FORCES)
 
 
 def uniform_field(masses: FloatArray, gravity: float = 1.0) -> Evaluate:

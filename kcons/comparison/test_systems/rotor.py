@@ -10,7 +10,7 @@ import numpy as np
 
 from kcons.comparison.test_systems.minimal import integrated, spin, turned
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
-from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.potential import no_forces
 from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Distance
@@ -60,7 +60,7 @@ def build(size: int, seed: int, *, start: str = "rotor") -> TestSystem:
         constraint_set=ConstraintSet(Distance(PAIRS), POSITIONS, MASSES),
         positions=POSITIONS,
         velocities=v,
-        potential=Potential(lambda x: (0.0, np.zeros_like(x)), "no forces"),
+        potential=no_forces(),
         symbols=["X"] * len(MASSES),
         horizon=horizon,
         time_steps=(0.1, 0.05, 0.025, 0.0125),

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
-from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.potential import Potential, no_forces, uniform_field
 from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import REDUCED, Reference, TestSystem
 from kcons.constraints import Sphere
@@ -64,7 +64,7 @@ def build(size: int, seed: int, *, gravity: float = 0.0, near_top: bool = False)
         constraint_set=ConstraintSet(spheres, x, masses),
         positions=x,
         velocities=v,
-        potential=Potential(uniform_field(masses, gravity), "uniform field" if gravity else "no forces"),
+        potential=Potential(uniform_field(masses, gravity), "uniform field") if gravity else no_forces(),
         symbols=["X"] * size,
         horizon=8.0 if near_top else 4.0,
         time_steps=(0.2, 0.1, 0.05, 0.025),

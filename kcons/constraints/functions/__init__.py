@@ -2,5 +2,5 @@
 
 - `custom`: functions in Python, or compiled by Numba
 - `expressions`: formulas read, differentiated and written as code
-- `formula`, `velocity_formula`: rows that are formulas
+- `formula`: rows that are formulas
 """

@@ -1,139 +1,83 @@
-"""Coordinates given by Python functions: implicit surfaces and any collective variable."""
+"""Rows given by Python functions, or by functions that Numba has compiled."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from functools import cache
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, TAKES_TIME, atom_array, check_call, lent, numbers, positive
+from kcons.constraints.arguments import (
+    ANY,
+    LENGTH,
+    TAKES_TIME,
+    Duration,
+    FloatArray,
+    atom_column,
+    check_call,
+    lent,
+    numbers,
+    positive,
+    unit,
+)
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
     WRONG,
-    FloatArray,
     Target,
     contradiction,
+    exact_step,
     first_derivative,
     first_derivative_4,
     nearest_image,
     second_derivative,
 )
+from kcons.constraints.velocity import VelocityRows
 from kcons.errors import InputError
+
+__all__ = ["Custom", "CustomVelocity", "ImplicitSurface"]
 
 _FLOAT = np.dtype(np.float64)
 #: Places of a first derivative, in steps, and the weights of the values there.
 _PLACES = (1, -1, 2, -2)
 _DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
 
+_Length: TypeAlias = Annotated[float | None, LENGTH, positive]
+_Period: TypeAlias = Annotated[float | None, ANY, positive]
 
-class FunctionRows(Constraint):
-    """Rows whose coordinate and gradient are Python functions.
 
-    What is not given is taken by central differences: the gradient from four values a coordinate, order four, at steps
-    of 1e-3 `length` (about eleven digits if the function varies on the scale of `length`); the curvature from four
-    gradients along v in the same way, or without these from eight values along v, order eight, at steps of `length`/50
-    (about ten digits); time derivatives by eighth-order formulas with step `time_step`.
-    """
+class PythonRows(Constraint, base=True):
+    """Rows of functions, called once a row; what is not given is taken by differences."""
 
     held = ANY
-    kind = RowKind.FUNCTION
-    #: Whether the functions take one row at a time.
-    by_row: ClassVar[bool] = True
-    functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
-
-    def __init__(
-        self,
-        atoms: ArrayLike,
-        function: Callable[..., Any],
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        target: Target,
-        time_dependent: bool,
-        time_derivatives: Callable[..., Any] | None,
-        length: float | None,
-        time_step: float,
-    ) -> None:
-        super().__init__(atoms, target)
-        for name, given in (("function", function), ("gradient", gradient)):
-            if not callable(given) and (given is not None or name == "function"):
-                raise InputError(f"{self.family}: {name} must be a function, not {given!r:.60}", item=name)
-        timed = bool(time_dependent) or time_derivatives is not None
-        last = ("t",) if timed else ()
-        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME)
-        check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
-        check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
-        check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
-        if length is not None:
-            positive(length, f"{self.family}: length")
-        self.function = function
-        self.gradient_function = gradient
-        self.hessian_vector = hessian_vector
-        self.time_derivatives = time_derivatives
-        self.time_dependent = timed
-        self.length = length
-        self.time_step = positive(time_step, f"{self.family}: time_step")
+    time_dependent: bool
+    length: Any
 
     @property
     def moving(self) -> bool:
         return super().moving or self.time_dependent
 
-    @abstractmethod
-    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        """Results of a user's function for all rows, shape (n_rows, *shape)."""
+    @property
+    def called(self) -> tuple[Any, ...]:
+        """The functions that kernels call where Numba has compiled all of them: value and gradient, or coefficients."""
+        raise NotImplementedError
+
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        """Gradient, or coefficients, of row `k` alone, shape (width, 3), at an `r` that cannot be changed."""
+        raise NotImplementedError
 
     def _time(self, time: float) -> tuple[float, ...]:
         return (time,) if self.time_dependent else ()
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return self._call(self.function, "function", (), r, *self._time(time))
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        if self.gradient_function is None:
-            return self._differenced_gradient(r, time)
-        return self._call(self.gradient_function, "gradient", (self.width, 3), r, *self._time(time))
-
-    def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
-        step, slope = 1e-3 * self._length(r), np.empty(r.shape)
-        for a, i in np.ndindex(self.width, 3):
-            along = np.zeros((self.width, 3))
-            along[a, i] = 1.0
-            slope[:, a, i] = self._slope(r, along, step, time)
-        return slope
-
-    def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
-        """Differenced change of the value along a direction of unit length."""
-        return first_derivative_4(
-            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
-        )
-
-    def row_value(self, k: int, r: FloatArray, time: float) -> float:
-        """Value of row `k` alone at `r`, shape (width, 3), which cannot be written to; for kernels."""
-        found = self.function(r, time) if self.time_dependent else self.function(r)
-        # Of Python and of NumPy.
-        return found if isinstance(found, float) else float(self._checked(found, k, "function", ()))
-
-    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
-        """Gradient of row `k` alone, shape (width, 3); for kernels."""
-        if self.gradient_function is None:
-            return self._differenced_row(k, r, time)
-        found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
-        return np.asarray(self._checked(found, k, "gradient", r.shape))
-
-    def _differenced_row(self, k: int, r: FloatArray, time: float) -> FloatArray:
-        """`_differenced_gradient` of one row, without arrays of rows, whose price would be that of the function."""
-        step = 1e-3 * float(self._length(r[None])[0])
-        # Four places a coordinate, of which the function may keep what it sees.
-        displaced = r + step * _along(self.width)
-        displaced.setflags(False)  # type: ignore[call-arg]
-        values = np.array([self.row_value(k, place, time) for place in displaced])
-        if self.period is not None:
-            values = nearest_image(values - values[0], self.period)
-        return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
+    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
+        """Results of a user's function for all rows, shape (n_rows, *shape)."""
+        out = np.empty((self.n_rows, *shape))
+        for k in range(self.n_rows):
+            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
+            out[k] = self._checked(found, k, name, shape)
+        return out
 
     def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
         """What a function returned for row `k`, as float64 of that shape."""
@@ -150,6 +94,120 @@ class FunctionRows(Constraint):
             )
         return found
 
+
+class Custom(PythonRows):
+    """Any function of the positions of a few atoms, called once a row.
+
+    What is not given is taken by central differences: the gradient from four values a coordinate, order four, at steps
+    of 1e-3 `length` (about eleven digits if the function varies on the scale of `length`); the curvature from four
+    gradients along v in the same way, or without these from eight values along v, order eight, at steps of `length`/50
+    (about ten digits); time derivatives by eighth-order formulas with step `time_step`. What is given is compared with
+    differences when the row is put into a set.
+
+    Parameters
+    ----------
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row.
+    function : callable
+        ``function(r) -> float`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``.
+    gradient : callable, optional
+        ``gradient(r) -> (width, 3)``; with `time_dependent`, ``(r, t)``. Where Numba has compiled it and the function,
+        kernels call both without Python.
+    hessian_vector : callable, optional
+        ``hessian_vector(r, v) -> (width, 3)``, the Hessian of q times v; with `time_dependent`, ``(r, v, t)``.
+    target : float, array_like, callable of time, MovingTarget or None
+        Value held; None takes the initial one.
+    time_dependent : bool
+        Whether the functions take the time as their last argument.
+    time_derivatives : callable, optional
+        ``(r, v, t) -> (dq/dt, 2 (d2q/dr dt) . v + d2q/dt2)``, two floats.
+    translation_invariant : bool
+        Whether only differences of positions count; then minimum images apply in periodic cells.
+    period : float, optional
+        Period of the value, such as 2 pi.
+    length : float, optional
+        Length over which the function varies; by default the spread of the atoms of the row, 1 for one atom.
+    time_step : float
+        Step of the time differences: about 1/50 of the time over which the function changes.
+    """
+
+    functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
+    kind = RowKind.FUNCTION
+    singular = "{row}: value and gradient must be finite, and the gradient not zero; move the atoms"
+
+    def __init__(
+        self,
+        atoms: ArrayLike,
+        function: Callable[..., Any],
+        gradient: Callable[..., Any] | None = None,
+        hessian_vector: Callable[..., Any] | None = None,
+        target: Target = None,
+        time_derivatives: Callable[..., Any] | None = None,
+        *,
+        time_dependent: bool = False,
+        translation_invariant: bool = False,
+        period: _Period = None,
+        length: _Length = None,
+        time_step: Duration = 0.02,
+    ) -> None:
+        super().__init__(atoms, target)
+        self.time_dependent = bool(time_dependent) or time_derivatives is not None
+        last = ("t",) if self.time_dependent else ()
+        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME, needed=True)
+        check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
+        check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
+        check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
+        self.function, self.gradient_function = function, gradient
+        self.hessian_vector, self.time_derivatives = hessian_vector, time_derivatives
+        self.translation_invariant, self.period = bool(translation_invariant), period
+        self.length, self.time_step = length, time_step
+
+    @property
+    def called(self) -> tuple[Any, ...]:
+        return self.function, self.gradient_function
+
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        return self.measure(r, time), self.gradient(r, time)
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        return self._call(self.function, "function", (), r, *self._time(time))
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        if self.gradient_function is None:
+            return self._differenced_gradient(r, time)
+        return self._call(self.gradient_function, "gradient", (self.width, 3), r, *self._time(time))
+
+    def row_value(self, k: int, r: FloatArray, time: float) -> float:
+        """Value of row `k` alone at `r`, shape (width, 3), which cannot be written to; for kernels."""
+        found = self.function(r, time) if self.time_dependent else self.function(r)
+        # Of Python and of NumPy.
+        return found if isinstance(found, float) else float(self._checked(found, k, "function", ()))
+
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        if self.gradient_function is None:
+            displaced, step = _displaced(r[None], self._length(r[None]))
+            values = np.array([self.row_value(k, place, time) for place in lent(displaced[:, 0])])
+            return self._differences(values[:, None], step)[0]
+        found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
+        return np.asarray(self._checked(found, k, "gradient", r.shape))
+
+    def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
+        displaced, step = _displaced(r, self._length(r))
+        return self._differences(np.array([self.measure(places, time) for places in displaced]), step)
+
+    def _differences(self, values: FloatArray, step: FloatArray) -> FloatArray:
+        """Gradients from the values at the places of `_displaced`, shape (12 width, n)."""
+        if self.period is not None:
+            values = nearest_image(values - values[0], self.period)
+        slope = np.tensordot(_DIFFERENCE, values.reshape(4, 3 * self.width, -1), 1) / step
+        return np.ascontiguousarray(slope.T).reshape(-1, self.width, 3)
+
+    def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
+        """Differenced change of the value along a direction of unit length."""
+        return first_derivative_4(
+            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
+        )
+
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         if self.hessian_vector is None:
             return self._differenced_curvature(r, v, time)
@@ -157,20 +215,19 @@ class FunctionRows(Constraint):
         return _contract(product, v)
 
     def _differenced_curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        speed = np.sqrt(_contract(v, v))
+        speed, start, length = np.sqrt(_contract(v, v)), np.zeros(self.n_rows), self._length(r)
         along = v / np.where(speed > 0, speed, 1.0)[:, None, None]
         if self.gradient_function is None:
-            step = 0.02 * self._length(r)
-            bend = second_derivative(
-                lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
-            )
-            return bend * speed**2
-        slope = first_derivative_4(
-            lambda s: _contract(self.gradient(r + s[:, None, None] * along, time), along),
-            np.zeros(self.n_rows),
-            1e-3 * self._length(r),
-        )
-        return slope * speed**2
+
+            def value(s: FloatArray) -> FloatArray:
+                return self.measure(r + s[:, None, None] * along, time)
+
+            return second_derivative(value, start, 0.02 * length, self.period) * speed**2
+
+        def slope(s: FloatArray) -> FloatArray:
+            return _contract(self.gradient(r + s[:, None, None] * along, time), along)
+
+        return first_derivative_4(slope, start, 1e-3 * length) * speed**2
 
     def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         if not self.time_dependent:
@@ -184,14 +241,10 @@ class FunctionRows(Constraint):
         mixed = first_derivative(lambda t: _contract(self.gradient(r, t), v), time, h) if v.any() else 0.0
         return rate, 2 * mixed + second
 
-    def scale(self, time: float = 0.0) -> FloatArray:
-        # The unit of the function is unknown: the set takes the size of the positions.
-        return np.zeros(self.n_rows)
-
     def _length(self, r: FloatArray) -> FloatArray:
         """Length over which the coordinate varies: as given, the spread of the atoms, or 1."""
         if self.length is not None:
-            return np.full(self.n_rows, self.length)
+            return np.full(len(r), self.length)
         if self.width == 1:
             return np.ones(len(r))
         apart = r - r.mean(axis=1, keepdims=True)
@@ -199,64 +252,63 @@ class FunctionRows(Constraint):
         return np.where(spread > 0, spread, 1.0)
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        super().check(r, time, first_row)
         if self.n_rows == 0:
             return
-        value, slope = self.measure(r, time), self.gradient(r, time)
-        size = np.sqrt(_contract(slope, slope))
-        self.refuse_singular(
-            ~(np.isfinite(value) & np.isfinite(size) & (size > 0)),
-            first_row,
-            lambda k, row: (
-                f"{row}: value {value[k]:g} and norm of the gradient {size[k]:g} at atoms "
-                f"{self.atoms[k, :6].tolist()}; the gradient must be finite and not zero. Move the atoms, or use "
-                "another coordinate"
-            ),
-        )
         # A wrong derivative would give wrong motion without any other sign.
+        slope, length = self.gradient(r, time), self._length(r)
+        size = np.sqrt(_contract(slope, slope))
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
-        length = self._length(r)
-        difference = self._slope(r, along, 1e-3 * length, time)
+        found = self._slope(r, along, 1e-3 * length, time)
+        remedy = "correct it, or give the length over which the function varies (length=...)"
         if self.gradient_function is None:
             finer = self._slope(r, along, 0.5e-3 * length, time)
             self.refuse_singular(
-                ~(np.abs(finer - difference) <= WRONG * size),
+                ~(np.abs(finer - found) <= WRONG * size),
                 first_row,
                 lambda k, row: (
                     f"{row}: differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
-                    f"gradient, {difference[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
+                    f"gradient, {found[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
                     "Move the atoms, give the length over which it varies (length=...), or its gradient"
                 ),
             )
         else:
-            self._compare("gradient", _contract(slope, along), difference, size, first_row, (r, slope, time))
+
+            def worst(k: int) -> str:
+                other = self._differenced_gradient(r, time)[k]
+                a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - other))), other.shape)
+                return (
+                    f"gradient gives {slope[k, a, i]:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}, but "
+                    f"differences of the function give {other[a, i]:.6g}; {remedy}"
+                )
+
+            given = _contract(slope, along)
+            self.refuse_input(~(np.abs(given - found) <= WRONG * size), first_row, worst, "gradient")
         if self.hessian_vector is not None:
-            curvature = self._differenced_curvature(r, along, time)
-            self._compare(
-                "hessian_vector",
-                self.curvature(r, along, time),
-                curvature,
-                np.abs(curvature) + size / length,
+            given, bent = self.curvature(r, along, time), self._differenced_curvature(r, along, time)
+            self.refuse_input(
+                ~(np.abs(given - bent) <= WRONG * (np.abs(bent) + size / length)),
                 first_row,
+                lambda k: (
+                    f"hessian_vector gives {given[k]:.6g} along a test direction, but differences of the function give "
+                    f"{bent[k]:.6g}; {remedy}"
+                ),
+                "hessian_vector",
             )
         if self.time_derivatives is not None:
             self._check_time_derivatives(r, along, time, first_row)
 
     def _check_time_derivatives(self, r: FloatArray, v: FloatArray, time: float, first_row: int) -> None:
-        still = np.zeros_like(r)
-
-        def rate(t: float) -> FloatArray:
-            return self.time_terms(r, still, t)[0]
-
-        def second(t: float) -> FloatArray:
-            return self.time_terms(r, still, t)[1]
+        def terms(t: float, speed: float = 0.0) -> tuple[FloatArray, FloatArray]:
+            return self.time_terms(r, speed * v, t)
 
         for name, given, function, period in (
-            ("dq/dt", rate, lambda t: self.measure(r, t), self.period),
-            ("d2q/dt2", second, rate, None),
+            ("dq/dt", lambda t: terms(t)[0], lambda t: self.measure(r, t), self.period),
+            ("d2q/dt2", lambda t: terms(t)[1], lambda t: terms(t)[0], None),
             (
                 "(d2q/dr dt) . v",
-                lambda t: (self.time_terms(r, v, t)[1] - second(t)) / 2,
+                lambda t: (terms(t, 1.0)[1] - terms(t)[1]) / 2,
                 lambda t: _contract(self.gradient(r, t), v),
                 None,
             ),
@@ -271,35 +323,9 @@ class FunctionRows(Constraint):
                     atoms=self.atoms[found.number].tolist(),
                 )
 
-    def _compare(
-        self,
-        name: str,
-        given: FloatArray,
-        found: FloatArray,
-        size: FloatArray,
-        first_row: int,
-        components: tuple[FloatArray, FloatArray, float] | None = None,
-    ) -> None:
-        """Refuse what differences contradict; of a gradient, with `components`, the worst of these is named."""
 
-        def said(k: int) -> str:
-            one, other, where = given[k], found[k], "along a test direction"
-            if components is not None:
-                r, slope, time = components
-                differenced = self._differenced_gradient(r, time)[k]
-                a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - differenced))), slope[k].shape)
-                one, other = slope[k, a, i], differenced[a, i]
-                where = f"for {'xyz'[i]} of its atom {self.atoms[k, a]}"
-            return (
-                f"{name} gives {one:.6g} {where}, but differences of the function give {other:.6g}; correct it, or "
-                "give the length over which the function varies (length=...)"
-            )
-
-        self.refuse_input(~(np.abs(given - found) <= WRONG * size), first_row, said, name)
-
-
-class ImplicitSurface(FunctionRows):
-    """Atoms on a surface given by a function, q = function(r); the surface is q = 0.
+class ImplicitSurface(Custom):
+    """Atoms on a surface given by a function of all of them at once, q = function(r); the surface is q = 0.
 
     Parameters
     ----------
@@ -307,31 +333,15 @@ class ImplicitSurface(FunctionRows):
         The atoms; each is one row.
     function : callable
         ``function(r) -> (n_rows,)`` for positions of shape (n_rows, 3); with `time_dependent`, ``(r, t)``.
-    gradient : callable, optional
-        ``gradient(r) -> (n_rows, 3)``; with `time_dependent`, ``(r, t)``. Without it the function is differenced: see
-        `length`.
-    hessian_vector : callable, optional
-        ``hessian_vector(r, v) -> (n_rows, 3)``, the Hessian of q times v; with `time_dependent`,
-        ``(r, v, t)``. Without it the gradient is differenced along v: see `length`.
+    gradient, hessian_vector, time_derivatives : callable, optional
+        As for `Custom`, for all atoms: ``gradient(r) -> (n_rows, 3)``, ``hessian_vector(r, v) -> (n_rows, 3)``, and
+        ``time_derivatives(r, v, t)`` gives two arrays of shape (n_rows,).
     target : float, array_like, callable of time, MovingTarget or None
         Level held: 0 by default, None for the level each atom starts on.
-    time_dependent : bool
-        Whether the surface moves, and the functions take the time as their last argument.
-    time_derivatives : callable, optional
-        ``(r, v, t) -> (dq/dt, 2 (d2q/dr dt) . v + d2q/dt2)``, two arrays of shape (n_rows,). Without it
-        function and gradient are differenced in time, order eight, with step `time_step`.
+    time_dependent, time_step
+        As for `Custom`.
     length : float, optional
-        Length over which the surface bends (a radius); 1 by default. Differences are taken at 1e-3 of it
-        and leave about eleven digits of the curvature.
-    time_step : float
-        Step of the time differences: about 1/50 of the time over which the surface moves.
-
-    Raises
-    ------
-    InputError
-        Results of the wrong shape; when put into a set, a gradient or Hessian that contradicts the function.
-    SingularGeometryError
-        When put into a set, a gradient that is zero or not finite.
+        Length over which the surface bends (a radius); 1 by default.
 
     Examples
     --------
@@ -348,9 +358,7 @@ class ImplicitSurface(FunctionRows):
     True
     """
 
-    family = "ImplicitSurface"
     row_width = 1
-    by_row = False
 
     def __init__(
         self,
@@ -362,18 +370,21 @@ class ImplicitSurface(FunctionRows):
         *,
         time_dependent: bool = False,
         time_derivatives: Callable[..., Any] | None = None,
-        length: float | None = None,
-        time_step: float = 0.02,
+        length: _Length = None,
+        time_step: Duration = 0.02,
     ) -> None:
-        column = atom_array(atoms, self.family).reshape(-1, 1)
-        super().__init__(
-            column, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
-        )
+        given: dict[str, Any] = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
+        column = atom_column(atoms, self.family)
+        super().__init__(column, function, gradient, hessian_vector, target, time_derivatives, **given)
 
     @property
     def kind(self) -> RowKind:  # type: ignore[override]
         """Kernels take rows one by one, and only what knows a single row can be asked for one."""
         return RowKind.FUNCTION if self.n_rows == 1 else RowKind.INTERPRETED
+
+    @property
+    def called(self) -> tuple[Any, ...]:
+        return (None,)
 
     def row_value(self, k: int, r: FloatArray, time: float) -> float:
         return float(self.measure(r[None], time)[0])
@@ -382,8 +393,7 @@ class ImplicitSurface(FunctionRows):
         return np.asarray(self.gradient(r[None], time)[0])
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        flat = [lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments]
-        found = function(*flat)
+        found = function(*(lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
         if name == "time_derivatives":
             found = np.stack([np.broadcast_to(numbers(part, name), (self.n_rows,)) for part in found], axis=-1)
         result = numbers(found, f"ImplicitSurface: {name}")
@@ -397,81 +407,126 @@ class ImplicitSurface(FunctionRows):
         return result.reshape(self.n_rows, *shape)
 
 
-class Custom(FunctionRows):
-    """Any function of the positions of a few atoms, called once a row.
+class CustomVelocity(PythonRows, VelocityRows):
+    """A row whose coefficients are a function, called once a row.
 
     Parameters
     ----------
     atoms : array_like of int, shape (n_rows, width) or (width,)
         Atoms of each row.
-    function : callable
-        ``function(r) -> float`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``.
-    gradient : callable, optional
-        ``gradient(r) -> (width, 3)``; with `time_dependent`, ``(r, t)``. Without it the function is differenced, order
-        four, at steps of 1e-3 `length`: about eleven digits. Where Numba has compiled it and the function, kernels call
-        both without Python.
-    hessian_vector : callable, optional
-        ``hessian_vector(r, v) -> (width, 3)``; with `time_dependent`, ``(r, v, t)``. Without it the
-        gradient is differenced along v, as above.
-    target : float, array_like, callable of time, MovingTarget or None
-        Value held; None takes the initial one.
+    coefficients : callable
+        ``coefficients(r) -> (width, 3)`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``. It must
+        depend on nothing else. Where Numba has compiled it, kernels call it without Python.
+    derivative : callable, optional
+        ``derivative(r, v) -> (width, 3)``, the time derivative of the coefficients along the motion; with
+        `time_dependent`, ``(r, v, t)``, and the explicit time derivative included. Without it the coefficients
+        are differenced along the motion, order four: about eleven digits.
+    target : float, array_like, callable of time, or MovingTarget
+        What the row is held at, 0 by default.
     time_dependent : bool
         Whether the functions take the time as their last argument.
-    time_derivatives : callable, optional
-        ``(r, v, t) -> (dq/dt, 2 (d2q/dr dt) . v + d2q/dt2)``, two floats. Without it function and
-        gradient are differenced in time, order eight, with step `time_step`.
     translation_invariant : bool
         Whether only differences of positions count; then minimum images apply in periodic cells.
-    period : float, optional
-        Period of the value, such as 2 pi.
-    length : float, optional
-        Length over which the function varies; by default the spread of the atoms of the row, 1 for one atom.
-    time_step : float
-        Step of the time differences.
-
-    Raises
-    ------
-    InputError
-        Results of the wrong shape; when put into a set, a gradient or Hessian that contradicts the function.
-    SingularGeometryError
-        When put into a set, a gradient that is zero or not finite.
+    length, time_step : float
+        Differences are taken at steps of at most 1e-3 `length`, and, with `time_dependent`, of `time_step`.
     """
 
-    family = "Custom"
+    singular = "{row}: the coefficients are zero or not finite; move the atoms"
+    functions: ClassVar[tuple[str, ...]] = ("coefficients", "derivative")
 
     def __init__(
         self,
         atoms: ArrayLike,
-        function: Callable[..., Any],
-        gradient: Callable[..., Any] | None = None,
-        hessian_vector: Callable[..., Any] | None = None,
-        target: Target = None,
-        time_derivatives: Callable[..., Any] | None = None,
+        coefficients: Callable[..., Any],
+        derivative: Callable[..., Any] | None = None,
+        target: Target = 0.0,
         *,
         time_dependent: bool = False,
         translation_invariant: bool = False,
-        period: float | None = None,
-        length: float | None = None,
-        time_step: float = 0.02,
+        length: Annotated[float, LENGTH, positive] = 1.0,
+        time_step: Duration = 1e-3,
     ) -> None:
-        super().__init__(
-            atoms, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
-        )
+        super().__init__(atoms, target)
+        last = ("t",) if time_dependent else ()
+        check_call("CustomVelocity: coefficients", coefficients, ("r", *last), TAKES_TIME, needed=True)
+        check_call("CustomVelocity: derivative", derivative, ("r", "v", *last), TAKES_TIME)
+        self.coefficients = coefficients
+        self.derivative = derivative
+        self.time_dependent = bool(time_dependent)
         self.translation_invariant = bool(translation_invariant)
-        self.period = None if period is None else positive(period, "Custom: period")
+        self.length = length
+        self.time_step = time_step
 
-    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        out = np.empty((self.n_rows, *shape))
+    @property
+    def called(self) -> tuple[Any, ...]:
+        return (self.coefficients,)
+
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        shape = (self.width, 3)
+        return np.zeros(self.n_rows), self._call(self.coefficients, "coefficients", shape, r, *self._time(time))
+
+    def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        found = self.coefficients(lent(r), *self._time(time))
+        return np.asarray(self._checked(found, k, "coefficients", (self.width, 3)))
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        bent = [self._changes(k, r[k], v[k], time) for k in range(self.n_rows)]
+        return _contract(np.array(bent).reshape(v.shape), v)
+
+    def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        """Rate of the coefficients of row `k` along v."""
+        if self.derivative is not None:
+            found = self.derivative(lent(r), lent(v), *self._time(time))
+            return np.asarray(self._checked(found, k, "derivative", r.shape))
+        speed = float(np.sqrt(np.sum(v * v)))
+        if speed == 0:
+            return np.zeros_like(r)
+        step = 1e-3 * self.length / speed
+        if self.time_dependent:
+            step = exact_step(min(step, self.time_step), time)
+        return first_derivative_4(lambda s: self.row_gradient(k, r + s * v, time + s), 0.0, step)
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        super().check(r, time, first_row)
+        if self.derivative is None:
+            return
+        # A wrong derivative would give wrong motion without any other sign.
+        along = self.length * unit(np.random.default_rng(0).normal(size=(self.width, 3)), "along")
         for k in range(self.n_rows):
-            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
-            out[k] = self._checked(found, k, name, shape)
-        return out
+            self._check_derivative(k, r[k], along, 0.01, time, first_row)
+            if self.time_dependent:
+                self._check_derivative(k, r[k], np.zeros_like(along), self.time_step, time, first_row)
+
+    def _check_derivative(
+        self, k: int, r: FloatArray, v: FloatArray, time_step: float, time: float, first_row: int
+    ) -> None:
+        found = contradiction(
+            lambda s: self._changes(k, r + s * v, v, time + s),
+            lambda s: self.row_gradient(k, r + s * v, time + s),
+            0.0,
+            time_step,
+        )
+        if found is not None:
+            atom, axis = divmod(found.number, 3)
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: derivative gives {found.given:.6g} for {'xyz'[axis]} of its "
+                f"atom {self.atoms[k, atom]}, but differences of the coefficients give {found.found:.6g}; correct it, "
+                "or leave it out",
+                item="derivative",
+                atoms=self.atoms[k].tolist(),
+            )
 
 
 @cache
 def _along(width: int) -> FloatArray:
-    """Displacements of `_PLACES` by coordinates, shape (12 width, width, 3)."""
-    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, width, 3)
+    """Displacements of `_PLACES` by coordinates, shape (12 width, 1, width, 3)."""
+    return np.concatenate([place * np.eye(3 * width) for place in _PLACES]).reshape(-1, 1, width, 3)
+
+
+def _displaced(r: FloatArray, length: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where a function is taken for its gradient at `r`, shape (n, width, 3), and the steps, shape (n,)."""
+    step = 1e-3 * length
+    return r + step[:, None, None] * _along(r.shape[1]), step
 
 
 def _contract(a: FloatArray, b: FloatArray) -> FloatArray:

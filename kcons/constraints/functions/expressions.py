@@ -1,7 +1,8 @@
 """Formulas as code: what is written is checked, differentiated by SymPy, and kept in a file.
 
-Formulas come from files of others, too. So names are those of a list, and length, depth, numbers, powers and the size
-of the second derivatives are bounded before SymPy sees anything: it would compute 9**9**9 to the last digit.
+Formulas come from files of others, too. So names are those of a list, and length, depth and the size of the second
+derivatives are bounded before SymPy sees anything. It sees numbers as they are computed with, in double precision: it
+would find 9**9**9 to the last digit.
 
 The file is a module of functions on plain numbers, or on arrays of one number a row: value and gradient, and what
 accelerations need; of a formula that is linear in the velocities its coefficients, and what these need. It lies where
@@ -17,7 +18,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -32,18 +33,15 @@ from kcons.errors import InputError, UnsupportedError
 
 #: Characters of a formula, levels of its tree (a sum of n terms has n), and parts of its second derivatives.
 MAX_LENGTH, MAX_DEPTH, MAX_PARTS = 10_000, 200, 20_000
-#: Largest number in a formula or made of its numbers, and largest power that is a number.
-MAX_NUMBER, MAX_POWER = 1e300, 1000
-
 #: Functions of formulas: name -> the one of NumPy; of the same name in SymPy, but for those below.
 FUNCTIONS: dict[str, Any] = {
     **{name: getattr(np, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
     **{f"a{name[3:]}": getattr(np, name) for name in ("arcsin", "arccos", "arctan", "arctan2")},
     "abs": np.abs,
 }
-_NUMBER = f"has a number above {MAX_NUMBER:g}", "multiply it by a small number, or write it in other units"
-_POWER = f"has a power above {MAX_POWER}", "give a smaller one"
 _IN_SYMPY = {"abs": "Abs"}
+#: What a sum that vanishes may be off by, beside its parts, at places where these are of order one.
+_SAME = 1e-9
 _COORDINATE = re.compile(r"[xyz]([1-9][0-9]{0,5})")
 _SPEED = re.compile(r"v[xyz]([1-9][0-9]{0,5})")
 _OPERATIONS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
@@ -105,8 +103,8 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                         item=name,
                     )
             case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-                if not value <= MAX_NUMBER:
-                    raise _too_large(formula, *_NUMBER)
+                if not value <= sys.float_info.max:
+                    raise _too_large(formula, "has a number that is too large", "write it in other units")
             case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
                 pass
             case ast.BinOp(op=operation) if type(operation) in _OPERATIONS:
@@ -120,10 +118,9 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                     f"and functions{hint}",
                     item="formula",
                 )
-    _check_numbers(formula, tree)
     if _parts(tree)[2] > MAX_PARTS:
         raise _too_large(formula, f"has second derivatives of more than {MAX_PARTS} parts")
-    return tree, found
+    return _with_numbers(formula, tree), found
 
 
 def _too_large(
@@ -147,24 +144,23 @@ def _is_number(tree: ast.expr) -> bool:
     return not any(isinstance(node, ast.Name) and node.id not in (*FUNCTIONS, "pi") for node in ast.walk(tree))
 
 
-def _check_numbers(formula: str, tree: ast.expr) -> None:
-    """Refuse parts without names whose value is no number in bounds, and powers of powers that are out of bounds."""
+def _with_numbers(formula: str, tree: ast.expr) -> ast.expr:
+    """The tree with the values of parts that have no names; `InputError` where one of them is no number."""
+    if isinstance(tree, ast.Constant):
+        return tree
+    if not _is_number(tree):
+        for field, part in ast.iter_fields(tree):
+            if field == "args":
+                setattr(tree, field, [_with_numbers(formula, each) for each in part])
+            elif isinstance(part, ast.expr) and field != "func":
+                setattr(tree, field, _with_numbers(formula, part))
+        return tree
     known = {**FUNCTIONS, "pi": np.float64(np.pi), "": np.float64}
-    left = [(tree, 1.0)]
-    while left:
-        node, power = left.pop()
-        if _is_number(node):
-            what = undefined_part(node, known)
-            if what is not None:
-                raise InputError(
-                    f"Formula: {what} in {formula!r:.200}; give numbers with a finite value", item="formula"
-                )
-            continue
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and _is_number(node.right):
-            power *= max(abs(evaluated(node.right, known)), 1.0)
-            if power > MAX_POWER:
-                raise _too_large(formula, *_POWER)
-        left.extend((child, power) for child in _operands(node))
+    what = undefined_part(tree, known)
+    if what is not None:
+        raise InputError(f"Formula: {what} in {formula!r:.200}; give numbers with a finite value", item="formula")
+    with np.errstate(all="ignore"):
+        return ast.copy_location(ast.Constant(float(evaluated(tree, known))), tree)
 
 
 def _operands(tree: ast.expr) -> list[ast.expr]:
@@ -204,7 +200,7 @@ def _parts(tree: ast.expr) -> tuple[int, int, int]:
 def evaluated(tree: ast.expr, names: dict[str, Any]) -> Any:
     """The value of a tree, with numbers or symbols for names and functions.
 
-    ``names[""]`` makes constants, and ``names["**"]``, if it is there, powers.
+    ``names[""]`` makes constants, and ``names["**"]``, if it is there, exponents that are constants.
     """
     match tree:
         case ast.Constant(value=value):
@@ -217,7 +213,8 @@ def evaluated(tree: ast.expr, names: dict[str, Any]) -> Any:
         case ast.Call(func=ast.Name(id=name), args=args):
             return names[name](*(evaluated(each, names) for each in args))
         case ast.BinOp(left=left, op=operation, right=right):
-            a, b = evaluated(left, names), evaluated(right, names)
+            exponent = isinstance(operation, ast.Pow) and isinstance(right, ast.Constant) and "**" in names
+            a, b = evaluated(left, names), evaluated(right, {**names, "": names["**"]} if exponent else names)
             match operation:
                 case ast.Add():
                     return a + b
@@ -227,7 +224,7 @@ def evaluated(tree: ast.expr, names: dict[str, Any]) -> Any:
                     return a * b
                 case ast.Div():
                     return a / b
-            return names["**"](a, b) if "**" in names else a**b
+            return a**b
     raise AssertionError(ast.dump(tree))
 
 
@@ -305,7 +302,7 @@ class Code:
         ``row(r, p, t, out)`` for `kcons.solvers.sparse.row_functions`, to be compiled.
     first : callable
         Value and gradient of all rows: of the coordinates, the time and the parameters, an array each. Of velocities
-        their coefficients.
+        of where a flight ends: of the coordinates in its middle, the way, the time and the parameters.
     second : callable
         v^T (d2q/dr2) v, dq/dt and 2 (d2q/dr dt) . v + d2q/dt2, of the coordinates, the velocities, the time and the
         parameters. Of velocities v . (d coefficients/dt).
@@ -394,7 +391,9 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
             return repr(math.pi)
 
         def _print_Integer(self, expr: Any) -> str:
-            return str(expr.p) if abs(expr.p) < 2**53 else repr(float(expr))
+            if abs(expr.p) < 2**53:
+                return str(expr.p)
+            return repr(float(expr)) if abs(expr.p) < 2**1023 else repr(math.copysign(1e308, expr.p))
 
         def _print_Rational(self, expr: Any) -> str:
             return f"{self._print_Integer(sympy.Integer(expr.p))}/{self._print_Integer(sympy.Integer(expr.q))}"
@@ -404,7 +403,7 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
     speeds = [f"v{name}" for name in axes]
     symbols = {name: sympy.Symbol(name, real=True) for name in (*axes, *speeds, *parameters, "t")}
     functions = {name: getattr(sympy, _IN_SYMPY.get(name, name)) for name in FUNCTIONS}
-    value = _bounded(formula, tree, {**functions, **symbols, "pi": sympy.pi})
+    value = sympy.sympify(evaluated(tree, {**functions, **symbols, "pi": sympy.pi, "": sympy.Float, "**": _exponent}))
     t = symbols["t"]
     steep = [value.diff(symbols[name]) for name in axes]
     slope = [value.diff(symbols[name]) for name in speeds] if linear else steep
@@ -416,7 +415,8 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
     second = [bend, value.diff(t), 2 * along.diff(t) + value.diff(t, 2)]
     if linear:
         moving = [symbols[name] for name in speeds]
-        rest = 0 if _vanishes_at_rest(tree, width, parameters) else value.subs(dict.fromkeys(moving, 0))
+        rest = value.subs(dict.fromkeys(moving, 0))
+        rest = sympy.S.Zero if _is_zero([rest], value) else rest
         if rest != 0 or any(part.has(*moving) for part in slope):
             raise InputError(
                 f"VelocityFormula: {formula!r} is not a sum of velocities times functions of the positions and the time"
@@ -424,7 +424,7 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
                 item="formula",
             )
         second = [bend + along.diff(t)]
-    invariant = width > 1 and _is_invariant(tree, width, parameters)
+    invariant = width > 1 and all(_is_zero(steep[k::3], None) for k in range(3))
 
     def function(name: str, arguments: Sequence[str], results: Sequence[Any]) -> str:
         smooth = [part.replace(sympy.DiracDelta, lambda *_: sympy.S.Zero) for part in results]  # beside kinks of abs
@@ -434,126 +434,54 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
         return "\n".join([f"def {name}({', '.join(arguments)}):", *lines, f"    return ({shown},)\n"])
 
     # Of velocities: of where a flight ends, see `kcons.solvers.sparse.row_functions`.
-    used = "flight" if linear else "first"
+    ends = [part + bent / 2 for part, bent in zip(slope, steep, strict=True)] if linear else slope
     places = [f"r[{k}]" for k in range((6 if linear else 3) * width)] + ["t"]
     places += [f"p[{k}]" for k in range(len(parameters))]
-    row = ["def row(r, p, t, out):", f"    found = {used}({', '.join(places)})"]
+    row = ["def row(r, p, t, out):", f"    found = first({', '.join(places)})"]
     row += [f"    out[{k}] = found[{k}]" for k in range(3 * width + 1)]
     names = ", ".join(sorted({*FUNCTIONS, "copysign"} - {"abs"}))
     head = f"# Written by kcons for {formula!r}.\nfrom math import {names}\n\nimport numba\n"
     flags = '@numba.njit(fastmath={"contract", "arcp", "nsz"}, error_model="numpy")'
-    ahead = [part + bent / 2 for part, bent in zip(slope, steep, strict=True)]
-    flight = flags + "\n" + function("flight", [*axes, *speeds, "t", *parameters], [value, *ahead])
     return "\n\n".join(
         [
             head,
             f"INVARIANT, MOVING = {invariant}, {value.has(t)}",
-            flags + "\n" + function("first", [*axes, "t", *parameters], slope if linear else [value, *slope]),
-            *([flight] if linear else []),
+            flags + "\n" + function("first", [*axes, *(speeds if linear else []), "t", *parameters], [value, *ends]),
             function("second", [*axes, *speeds, "t", *parameters], second),
             "\n".join(row) + "\n",
         ]
     )
 
 
-def _bounded(formula: str, tree: ast.expr, names: dict[str, Any]) -> Any:
-    """A formula in SymPy, with exact numbers, which are put in when it is known how large they become."""
+def _exponent(value: float) -> Any:
+    """A power that is a number: whole ones and halves are written as such."""
     import sympy
 
-    exact: dict[Any, Any] = {}
-
-    def constant(value: float) -> Any:
-        symbol = sympy.Symbol(f"number {value!r}", positive=True)
-        exact[symbol] = sympy.Rational(value) if 2 * value == int(2 * value) else sympy.Float(value)
-        return symbol if value else sympy.S.Zero
-
-    value = sympy.sympify(evaluated(tree, {**names, "": constant}))
-    rough = {symbol: sympy.Float(float(number)) for symbol, number in exact.items()}
-    # exp(3*log(x)) is a power with numbers only, and a power of a power only without them.
-    for power in value.atoms(sympy.Pow) | value.xreplace(rough).atoms(sympy.Pow):
-        base, exponent = (part.xreplace(rough) if part.free_symbols <= exact.keys() else None for part in power.args)
-        if exponent is not None and abs(exponent.evalf()) > MAX_POWER:
-            raise _too_large(formula, *_POWER)
-        if base is not None and exponent is not None and abs((base**exponent).evalf()) > MAX_NUMBER:
-            raise _too_large(formula, *_NUMBER)
-    value = value.xreplace(exact)
-    if any(max(abs(number.p), number.q) > MAX_NUMBER for number in value.atoms(sympy.Rational)):
-        raise _too_large(formula, *_NUMBER)
-    return value
+    return sympy.Rational(value) if abs(value) <= 1000 and 2 * value == int(2 * value) else sympy.Float(value)
 
 
-# -- what is true everywhere ------------------------------------------------------------------------
+def _is_zero(parts: Sequence[Any], size: Any) -> bool:
+    """Whether a sum vanishes everywhere, whatever the signs of what is in ``abs``; `size` is what it is small beside.
 
-#: Digits that formulas are compared with, what they may differ by, and the largest logarithm of a value.
-_DIGITS, _SAME, _LARGEST = 100, 1e-60, 1e5
-
-
-class _Places:
-    """Values of a formula at random places, near and far, with many digits.
-
-    Two formulas that agree at all of them are the same. Multiplying out, which would show it too, has no bound. For
-    what is in ``abs`` both signs are tried, since a place where it changes may be anywhere.
+    Where SymPy does not see it, it is found at random places, complex ones, where all functions are defined.
     """
+    import sympy
 
-    def __init__(self, tree: ast.expr, width: int, parameters: Sequence[str]) -> None:
-        import mpmath
+    def free(part: Any) -> Any:
+        return part.replace(sympy.sign, lambda inner: sympy.Symbol(f"sign of {inner}")).replace(
+            sympy.DiracDelta, lambda *_: sympy.S.Zero
+        )
 
-        self._numbers = mpmath.MPContext()
-        self._numbers.dps = _DIGITS
-        self.axes = [f"{axis}{atom}" for atom in range(1, width + 1) for axis in "xyz"]
-        self.speeds = [f"v{name}" for name in self.axes]
-        self._tree, self._names = tree, [*self.axes, *self.speeds, *parameters, "t"]
-        self._functions = {name: getattr(self._numbers, name) for name in FUNCTIONS if name != "abs"}
-        for name in ("exp", "sinh", "cosh"):
-            function = self._functions[name]
-            self._functions[name] = lambda value, function=function: self._bounded(value) and function(value)
-
-    def __iter__(self) -> Iterator[tuple[dict[str, Any], Any, np.random.Generator]]:
-        """Numbers by name, a function that evaluates the formula with such numbers, and a generator."""
-        rng = np.random.default_rng(0)
-        for scale in np.logspace(-3, 6, 10).repeat(3):
-            place = {name: self._numbers.mpf(scale * rng.normal()) for name in self._names}
-            signs = rng.choice([-1, 1], 1 + sum(isinstance(node, ast.Call) for node in ast.walk(self._tree))).tolist()
-            yield place, lambda given, signs=signs: self._value(given, iter(signs)), rng
-
-    @staticmethod
-    def _bounded(logarithm: Any) -> bool:
-        """Refuse what would take all memory, such as a power of a power of a power."""
-        if abs(logarithm) > _LARGEST:
-            raise OverflowError
+    parts = [free(part) for part in parts]
+    total = sum(parts, sympy.S.Zero)
+    if total == 0:
         return True
-
-    def _value(self, place: dict[str, Any], signs: Iterator[int]) -> Any:
-        """The value there; None where it has none."""
-        known = {**self._functions, "abs": lambda value: next(signs) * value, "pi": self._numbers.pi}
-        known |= {"**": lambda base, power: self._bounded(power * self._numbers.log(base)) and base**power}
-        try:
-            found = evaluated(self._tree, {**known, **place, "": self._numbers.mpf})
-        except (ValueError, TypeError, ArithmeticError):  # atan2 of complex numbers, 0 as a divisor, log(0)
-            return None
-        return found if self._numbers.isfinite(found) else None
-
-
-def _is_invariant(tree: ast.expr, width: int, parameters: Sequence[str]) -> bool:
-    """Whether a common shift of all atoms changes nothing."""
-    places, seen = _Places(tree, width, parameters), 0
-    for place, value, rng in places:
-        shift = dict(zip("xyz", rng.normal(size=3).tolist(), strict=True))
-        size = max(abs(place[name]) for name in places.axes)
-        here, there = value(place), value(place | {name: place[name] + size * shift[name[0]] for name in places.axes})
-        if here is None or there is None:
-            continue
-        seen += 1
-        if abs(there - here) > _SAME * max(abs(here), abs(there)):
-            return False
-    return seen > 5
-
-
-def _vanishes_at_rest(tree: ast.expr, width: int, parameters: Sequence[str]) -> bool:
-    """Whether a formula is zero where all velocities are."""
-    places = _Places(tree, width, parameters)
-    for place, value, _ in places:
-        moving, still = value(place), value(place | dict.fromkeys(places.speeds, 0 * place["t"]))
-        if moving is not None and still is not None and abs(still) > _SAME * max(abs(moving), 1):
-            return False
-    return True
+    beside = parts if size is None else [size]
+    names = sorted(set().union(*(part.free_symbols for part in [*parts, *beside])), key=str)
+    function = sympy.lambdify(names, [total, *beside], "numpy")
+    places = np.random.default_rng(0).normal(size=(len(names), 40, 2)) @ [1.0, 1.0j]
+    with np.errstate(all="ignore"):
+        found, *others = (np.broadcast_to(np.asarray(part, dtype=complex), 40) for part in function(*places))
+        near = np.abs(found) <= _SAME * sum(np.abs(other) for other in others)
+    seen = np.isfinite(found) & np.isfinite(sum(others))
+    return bool(seen.sum() > 5 and near[seen].all())

@@ -1,19 +1,30 @@
-"""Rows that are formulas of the coordinates of their atoms."""
+"""Rows that are formulas of the coordinates of their atoms, or of these and linear in the velocities."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from keyword import iskeyword
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, MD_UNITS, atom_array, numbers, out_of_range, positive, without_units
+from kcons.constraints.arguments import (
+    ANY,
+    MD_UNITS,
+    FloatArray,
+    atom_array,
+    numbers,
+    out_of_range,
+    positive,
+    without_units,
+)
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part, width_of
-from kcons.constraints.target import FloatArray, Target
+from kcons.constraints.target import Target
 from kcons.errors import InputError
+
+__all__ = ["Formula", "VelocityFormula"]
 
 
 class Formula(Constraint):
@@ -57,7 +68,6 @@ class Formula(Constraint):
     (1, True)
     """
 
-    family = "Formula"
     held = ANY
     kind = RowKind.FUNCTION
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
@@ -72,7 +82,7 @@ class Formula(Constraint):
         parameters: Mapping[str, ArrayLike] | None = None,
         target: Target = 0.0,
         *,
-        period: float | None = None,
+        period: Annotated[float | None, ANY, positive] = None,
     ) -> None:
         if not isinstance(parameters, Mapping | None):
             raise InputError(
@@ -81,7 +91,7 @@ class Formula(Constraint):
             )
         given = dict(parameters or {})
         self.formula, self.names = formula, list(given)
-        self.period = None if period is None else positive(period, "Formula: period")
+        self.period = period
         for name in self.names:
             if not isinstance(name, str):
                 raise InputError(
@@ -108,12 +118,9 @@ class Formula(Constraint):
             if wrong is not None:
                 raise InputError(f"Formula: parameter {name!r} is {wrong[1]}", item=name)
             columns.append(np.broadcast_to(column, (self.n_rows,)))
-        self._keep_values(np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
+        self.per_row = {"values": (len(columns),)}  # type: ignore[misc]
+        self._keep(values=np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
         self.translation_invariant = self.code().invariant
-
-    def _keep_values(self, values: ArrayLike) -> None:
-        self.per_row = {"values": (len(self.names),)}  # type: ignore[misc]
-        self._keep(values=values)
 
     def code(self) -> Code:
         """What is computed of the formula."""
@@ -123,10 +130,9 @@ class Formula(Constraint):
     def moving(self) -> bool:
         return super().moving or self.code().moving
 
-    def _arguments(self, time: float, *arrays: FloatArray) -> list[Any]:
-        """Coordinates one by one, the time and the parameters, an array of one number a row each."""
-        columns = [column for array in arrays for column in array.reshape(self.n_rows, -1).T]
-        return [*columns, time, *self.values.T]
+    @property
+    def row(self) -> Callable[[Any, Any, Any, Any], None]:  # type: ignore[override]
+        return self.code().row
 
     def _plain(self, function: Callable[..., tuple[float, ...]], time: float, *arrays: FloatArray) -> FloatArray | None:
         """What a function of plain numbers gives for a single row, a row each; None where it is undefined."""
@@ -137,30 +143,26 @@ class Formula(Constraint):
             return None
         return None if found.dtype.kind == "c" else found[:, None]
 
-    def _first(self, r: FloatArray, time: float) -> FloatArray:
-        """Value and gradient, shape (1 + 3 width, n_rows)."""
+    def _both(
+        self, plain: Callable[..., Any], function: Callable[..., Any], time: float, *arrays: FloatArray
+    ) -> Sequence[FloatArray]:
+        """Results of `function` for all rows, an array of one number a row each; of a single row by `plain` numbers."""
         if self.n_rows == 1:
-            plain = self._plain(self.code().plain_first, time, r)
-            if plain is not None:
-                return plain
+            alone = self._plain(plain, time, *arrays)
+            if alone is not None:
+                return alone  # type: ignore[return-value]
+        columns = [column for array in arrays for column in array.reshape(self.n_rows, -1).T]
         with np.errstate(all="ignore"):
-            found = self.code().first(*self._arguments(time, r))
-        return np.array(np.broadcast_arrays(*found, np.zeros(self.n_rows))[:-1], dtype=np.float64)
+            found = function(*columns, time, *self.values.T)
+        return [np.broadcast_to(np.asarray(part, dtype=np.float64), (self.n_rows,)) for part in found]
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return self._first(r, time)[0]
-
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        return np.ascontiguousarray(self._first(r, time)[1:].T).reshape(r.shape)
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        code = self.code()
+        value, *slope = self._both(code.plain_first, code.first, time, *([r] if self.holonomic else [r, 0.0 * r]))
+        return np.array(value), np.array(slope).T.reshape(r.shape).copy()
 
     def _second(self, r: FloatArray, v: FloatArray, time: float) -> Sequence[FloatArray]:
-        if self.n_rows == 1:
-            plain = self._plain(self.code().plain_second, time, r, v)
-            if plain is not None:
-                return list(plain)
-        with np.errstate(all="ignore"):
-            found = self.code().second(*self._arguments(time, r, v))
-        return tuple(np.broadcast_to(np.asarray(part, dtype=np.float64), (self.n_rows,)) for part in found)
+        return self._both(self.code().plain_second, self.code().second, time, r, v)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         return self._second(r, v, time)[0]
@@ -173,28 +175,18 @@ class Formula(Constraint):
         _, rate, mixed = self._second(r, v, time)
         return rate, mixed
 
-    def scale(self, time: float = 0.0) -> FloatArray:
-        # The unit of the formula is unknown: the set takes the size of the positions.
-        return np.zeros(self.n_rows)
-
     def parameters(self) -> FloatArray:
         return self.values
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        value, slope = self.measure(r, time), self.gradient(r, time)
-        size = np.linalg.norm(slope.reshape(self.n_rows, -1), axis=1)
-
-        def said(k: int, row: str) -> str:
-            axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
-            numbers = dict(zip([*axes, "t", *self.names], [*r[k].ravel(), time, *self.values[k]], strict=True))
-            numbers |= {f"v{axis}": 1.0 for axis in axes}
-            part = undefined_part(self.code().tree, {**FUNCTIONS, **numbers, "pi": np.float64(np.pi), "": np.float64})
-            what = part or f"its gradient is {'zero' if size[k] == 0 else 'not finite'}"
-            return f"{row}, {self.formula!r}: {what} at the start; move the atoms, or write another formula"
-
-        self.refuse_singular(~(np.isfinite(value) & np.isfinite(size) & (size > 0)), first_row, said)
+    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
+        axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
+        numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
+        numbers |= {f"v{axis}": 1.0 for axis in axes}
+        what = undefined_part(self.code().tree, {**FUNCTIONS, **numbers, "pi": np.float64(np.pi), "": np.float64})
+        if what is None:
+            flat = not self.select([k]).gradient(r[None], time).any()
+            what = f"its gradient is {'zero' if flat else 'not finite'}"
+        return f"{row}, {self.formula!r}: {what} at the start; move the atoms, or write another formula"
 
     @classmethod
     def restored(cls, data: Mapping[str, Any]) -> Self:
@@ -214,3 +206,54 @@ class Formula(Constraint):
         item = cls(data["formula"], data["atoms"], parameters, data["target"], **period)
         item.units = data.get("units")
         return item
+
+
+class VelocityFormula(Formula):
+    """A formula that is linear in the velocities of a few atoms (nonholonomic), differentiated exactly and compiled.
+
+    Parameters
+    ----------
+    formula : str
+        As for `Formula`, with vx1, vy1, vz1 for the velocity of the first atom of a row, vx2, ...: a sum of velocities,
+        each times a function of coordinates, time and parameters.
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row, as many as the formula names; (n_rows,) where it names one.
+    parameters : mapping of str to float or array_like of shape (n_rows,), optional
+        Numbers by name, one for all rows or one for each.
+    target : float, array_like, callable of time, or MovingTarget
+        What the sum is held at, 0 by default.
+
+    Raises
+    ------
+    InputError
+        As `Formula`; a formula that is not linear in the velocities.
+    SingularGeometryError
+        When put into a set: coefficients that are all zero, or not finite.
+    UnsupportedError
+        SymPy is not installed.
+
+    Examples
+    --------
+    A bead whose velocity has a given angle with the radius, seen in the plane:
+
+    >>> spiral = VelocityFormula("x1*vy1 - y1*vx1 - c*(x1*vx1 + y1*vy1)", 0, {"c": 2.0})
+    >>> spiral.holonomic, spiral.moving
+    (False, False)
+    """
+
+    holonomic = False
+    kind = RowKind.VELOCITY
+    shared: ClassVar[tuple[str, ...]] = ("formula", "names")
+    of_speeds = True
+
+    def __init__(
+        self,
+        formula: str,
+        atoms: ArrayLike,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        target: Target = 0.0,
+    ) -> None:
+        super().__init__(formula, atoms, parameters, 0.0 if target is None else target)
+
+    def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        return np.zeros(self.n_rows), np.zeros(self.n_rows)

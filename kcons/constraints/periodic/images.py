@@ -177,7 +177,7 @@ def find_images(
     _accept_small_pieces(tables, n_atoms, half_width)
     if not tables or all(table.plain_at_once for table in tables):
         return given, None
-    ties = [item for item in ties if item.family == "Distance" and not item.moving and item.n_rows]
+    ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
     others = [_Links(_unmarked(item), 0, x, lattice, half_width, time) for item in ties]
     held = [t for t in [*tables, *others] if t.held]
     keys = np.sort(np.concatenate([t.keys(n_atoms)[t.short] for t in held] or [np.zeros(0, np.int64)]))
@@ -227,7 +227,7 @@ class _Links:
         nearest = minimum_image(raw, lattice)
         self.lengths = np.linalg.norm(nearest, axis=2)
         #: Held at one length for good.
-        self.held = item.family == "Distance" and not item.moving
+        self.held = item.holds_length and not item.moving
         self.whole: BoolArray = np.zeros(item.n_rows, np.bool_)
         self.unsure: BoolArray = np.zeros(item.n_rows, np.bool_)
         self.windings = np.zeros((item.n_rows, item.width, 3), np.int64)
@@ -396,7 +396,7 @@ def _tree(
     length = np.concatenate([o[1] for o in offered])
     held, distance = (
         np.concatenate([np.full(len(o[2]), kind) for kind, o in zip(kinds, offered, strict=True)])
-        for kinds in ([t.held for t in tables], [t.item.family == "Distance" for t in tables])
+        for kinds in ([t.held for t in tables], [t.item.holds_length for t in tables])
     )
     unknown = np.isnan(length)
     apart = x[pair[unknown, 1]] - x[pair[unknown, 0]]
@@ -441,14 +441,12 @@ def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: 
             break
         first += item.n_rows
     atoms = [int(a) for a in pair]
-    what = (
-        f"target {length:g}" if item.family == "Distance" else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
-    )
+    what = f"target {length:g}" if item.holds_length else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
     raise InputError(
         f"row {row}, {item.row_name(row - first)}: {what} is not shorter than half the box ({half_width:g}), and no "
         "shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
         "the atoms so that neighbours in the row are neighbours in space",
-        item="target" if item.family == "Distance" else "positions",
+        item="target" if item.holds_length else "positions",
         atoms=atoms,
     )
 

@@ -81,7 +81,7 @@ class InCell:
         """
         before = self.lattice
         self._set_cell(cell, pbc)
-        if self.lattice is None or all(c.family == "Distance" and not c.moving for c in self.constraints if c.relative):
+        if self.lattice is None or all(c.holds_length and not c.moving for c in self.constraints if c.relative):
             return
         if before is not None and self.images is not None and np.any(self.images.loose >= 0):
             change = np.linalg.norm(self.lattice[0] - before[0], axis=1) / np.linalg.norm(before[0], axis=1)
@@ -162,7 +162,7 @@ class InCell:
         if before is not None:
             self.refuse_other_images(positions, before, None)
         for item, start in zip(self.constraints, self.starts, strict=False):
-            if not item.relative or item.family == "Distance" or item.n_rows == 0:
+            if not item.relative or item.holds_length or item.n_rows == 0:
                 continue
             length = np.linalg.norm(minimum_image(np.diff(positions[item.atoms], axis=1), self.lattice), axis=2)
             if item.whole is not None:
@@ -214,7 +214,7 @@ class InCell:
         """Longest constant distance that was shorter than half the box at set-up, and its row."""
         longest, row = 0.0, 0
         for item, start in zip(self.constraints, self.starts, strict=False):
-            if item.family != "Distance" or item.moving or item.n_rows == 0:
+            if not item.holds_length or item.moving or item.n_rows == 0:
                 continue
             lengths = item.target_at(0.0) if item.whole is None else np.where(item.whole, 0.0, item.target_at(0.0))
             if lengths.max() > longest:
@@ -241,7 +241,7 @@ class InCell:
     @cached_property
     def placed(self) -> IntArray | None:
         """Atoms of `images` at which rows with a place in space look, but for `FixedAtoms`; None if there are none."""
-        rows = [c.atoms.ravel() for c in self.constraints if not c.relative and c.family != "FixedAtoms"]
+        rows = [c.atoms.ravel() for c in self.constraints if not c.relative and not c.fixes_atoms]
         if self.images is None or not rows:
             return None
         found = np.intersect1d(self.images.atoms, np.concatenate(rows))

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -45,20 +45,12 @@ _STARTS = (0.3, 0.1)
 
 @dataclass(frozen=True)
 class Axis:
-    """One coordinate.
-
-    Attributes
-    ----------
-    low, length : float
-        Where it begins, and its range; its period if it is periodic.
-    periodic : bool
-    coefficients : int
-        Of u': 1 for the same length everywhere, or 4 and more.
-    """
+    """One coordinate: where it begins, and its range; its period if it is periodic."""
 
     low: float
     length: float
     periodic: bool
+    #: Of u': 1 for the same length everywhere, or 4 and more.
     coefficients: int = 1
 
     def design(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -117,22 +109,11 @@ Asked: TypeAlias = tuple[Points, Sequence[int]]
 
 
 class GradientProcess:
-    """What is known of a free energy from gradients at points.
+    """What is known of a free energy from gradients (n, d) at points, with covariances (n, d, d) of their errors.
 
-    Parameters
-    ----------
-    points : Points
-    gradients : ndarray, shape (n, d)
-    covariances : ndarray, shape (n, d, d)
-        Of the errors of each gradient.
-    axes : sequence of Axis
-    parameters : ndarray, shape (1 + number of coefficients,)
-        Logarithms of the amplitude, and of u' in units of the range.
-    trends : sequence of bool
-        Whether the free energy may also grow by a constant slope along a coordinate.
-    rotation : float
-        Size, relative to the gradient, of a field beside it whose components know nothing of each other: how far the
-        vectors are from being any gradient.
+    `parameters` are logarithms of the amplitude, and of u' in units of the range; `trends` says along which coordinates
+    the free energy may also grow by a constant slope; `rotation` is the size, relative to the gradient, of a field
+    beside it whose components know nothing of each other: how far the vectors are from being any gradient.
     """
 
     def __init__(
@@ -146,8 +127,7 @@ class GradientProcess:
         rotation: float = 0.0,
     ) -> None:
         self.points, self.gradients, self.covariances = points, gradients, covariances
-        self.axes, self.parameters, self.trends = axes, parameters, trends
-        self._rotation = rotation
+        self.axes, self.parameters, self.trends, self._rotation = axes, parameters, trends, rotation
         # Gradients that vanish within their errors may be as large as these.
         squares = gradients**2 + np.diagonal(covariances, axis1=1, axis2=2)
         self._size = max(float(np.sqrt(g.mean())) * axis.length for g, axis in zip(squares.T, axes, strict=True)) or 1.0
@@ -158,6 +138,11 @@ class GradientProcess:
         noise = np.einsum("ipq,ij->piqj", covariances, np.eye(n)).reshape(n * d, n * d)
         self._root = cholesky(self._prior(parameters) + noise, lower=True, check_finite=False)
         self._weights = cho_solve((self._root, True), gradients.T.ravel(), check_finite=False)
+
+    def changed(self, **what: Any) -> GradientProcess:
+        """The same with other trends, or another rotation."""
+        seen = (self.points, self.gradients, self.covariances, self.axes, self.parameters)
+        return GradientProcess(*seen, **{"trends": self.trends, **what})
 
     def log_likelihood(self) -> float:
         """Of the gradients seen."""
@@ -248,27 +233,17 @@ class Learned:
     The most likely ones alone would be too sure of what they do not know. So means and covariances are averaged over
     two points for each eigenvector of the curvature of the likelihood (a cubature of third order: Arasaratnam and
     Haykin, IEEE Trans. Automat. Contr. 54, 1254 (2009)), with the weights that their own likelihoods give them.
-
-    Parameters
-    ----------
-    best : GradientProcess
-        Of the most likely hyperparameters.
-    others : sequence of GradientProcess
-    weights : ndarray, shape (len(others),)
-        Their sum is 1.
     """
 
     def __init__(self, best: GradientProcess, others: Sequence[GradientProcess], weights: FloatArray) -> None:
+        #: Of the most likely hyperparameters; others, and weights of these whose sum is 1.
         self.best, self.others, self.weights = best, others, weights
 
     def closed(self) -> Learned:
         """The same without constant slopes."""
-
-        def without(process: GradientProcess) -> GradientProcess:
-            seen = (process.points, process.gradients, process.covariances)
-            return GradientProcess(*seen, process.axes, process.parameters, [False] * len(process.axes))
-
-        return Learned(without(self.best), [without(each) for each in self.others], self.weights)
+        free = [False] * len(self.best.axes)
+        best, *others = (process.changed(trends=free) for process in (self.best, *self.others))
+        return Learned(best, others, self.weights)
 
     def mean(self, x: FloatArray, components: Sequence[int]) -> FloatArray:
         """Of `posterior` alone, shape (components, n)."""

@@ -229,18 +229,7 @@ def _consistency(process: GradientProcess) -> Consistency:
     if len(process.axes) == 1:
         return Consistency(0.0, 1.0)
 
-    def likelihood(rotation: float) -> float:
-        return GradientProcess(
-            process.points,
-            process.gradients,
-            process.covariances,
-            process.axes,
-            process.parameters,
-            process.trends,
-            rotation,
-        ).log_likelihood()
-
-    found = [likelihood(float(size)) for size in _ROTATIONS]
+    found = [process.changed(rotation=float(size)).log_likelihood() for size in _ROTATIONS]
     best = int(np.argmax(found))
     gain = 2 * (found[best] - process.log_likelihood())
     # The size cannot be negative: chance has it at 0 half of the time.
@@ -272,9 +261,9 @@ def _checked(
     turns = tuple(None if p is None else positive(p, "periods") for p in turns)
     for j, period in enumerate(turns):
         spread = float(np.ptp(places[:, j]))
-        if not spread > 0 or (period is not None and spread > period * (1 + 1e-9)):
-            reason = (
-                "all windows are at one value of" if not spread > 0 else "windows are further apart than the period in"
-            )
+        reason = "" if spread > 0 else "all windows are at one value of"
+        if period is not None and spread > period * (1 + 1e-9):
+            reason = "windows are further apart than the period in"
+        if reason:
             raise InputError(f"{reason} coordinate {j}; check the units, or leave it out", item="x")
     return places, forces, covariances, turns

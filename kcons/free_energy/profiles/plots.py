@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,11 +24,9 @@ _BAND, _POINTS = 2.0, 61
 
 
 def _axes(rows: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
     for each in axes:
         each.grid(True, alpha=0.3)
@@ -38,12 +36,7 @@ def _axes(rows: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
 def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "energy", title: str = "") -> Figure:
     """The free energy with two standard errors above; below, what it was made of: mean forces of the windows.
 
-    Parameters
-    ----------
-    profile : Profile
-    coordinate, energy : str
-        What the axes say.
-    title : str
+    `coordinate` and `energy` are what the axes say.
     """
     figure, (above, below) = _axes(2, (6.4, 6.0))
     low, high = profile.F - _BAND * profile.error, profile.F + _BAND * profile.error
@@ -55,17 +48,9 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
     above.legend(fontsize=8)
     slope = np.gradient(profile.F, profile.x)
     below.plot(profile.x, slope, color=_BLUE, linewidth=1.0, label="slope of F")
-    below.errorbar(
-        profile.windows,
-        profile.mean_forces + profile.added_slope(profile.windows),
-        _BAND * profile.mean_force_errors,
-        color=_RED,
-        linestyle="none",
-        marker="o",
-        markersize=4,
-        capsize=2,
-        label="windows",
-    )
+    forces = profile.mean_forces + profile.added_slope(profile.windows)
+    how: dict[str, Any] = {"color": _RED, "fmt": "o", "markersize": 4, "capsize": 2, "label": "windows"}
+    below.errorbar(profile.windows, forces, _BAND * profile.mean_force_errors, **how)
     below.axhline(0.0, color=_GREY, linewidth=0.8)
     below.set(xlabel=coordinate, ylabel=f"dF/dx / ({energy}/unit of x)")
     below.legend(fontsize=8)
@@ -103,13 +88,7 @@ def plot_surface(surface: Surface, *, coordinates: tuple[str, str] = ("x", "y"),
 def plot_works(forward: ArrayLike, backward: ArrayLike | None, found: Pulled, *, energy: str = "energy") -> Figure:
     """Histograms of W of forward pulls and of -W of backward pulls: they cross at the difference of free energy.
 
-    Parameters
-    ----------
-    forward, backward : array_like
-        What `pull_free_energy` was given.
-    found : Pulled
-        What it gave.
-    energy : str
+    Works are those that `pull_free_energy` was given; `found` is what it gave.
     """
     figure, (axes,) = _axes(1, (6.4, 4.2))
     works = [("W forward", numbers(forward, "forward"), _BLUE)]

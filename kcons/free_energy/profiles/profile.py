@@ -58,20 +58,16 @@ class _Windows:
     @cached_property
     def learned(self) -> Learned:
         """Gaussian processes that need not close."""
-        axis = Axis(
-            float(self.x[0]),
-            self.end - float(self.x[0]),
-            self.period is not None,
-            _COEFFICIENTS if len(self.x) >= _MANY else 1,
-        )
+        low, many = float(self.x[0]), len(self.x) >= _MANY
+        axis = Axis(low, self.end - low, self.period is not None, _COEFFICIENTS if many else 1)
         return learn(self.x[:, None], self.f[:, None], self.e[:, None, None] ** 2, [axis], [True])
 
     @cached_property
-    def learned_closed(self) -> Learned:
+    def _learned_closed(self) -> Learned:
         return self.learned.closed()
 
     def process(self, closed: bool) -> Learned:
-        return self.learned_closed if closed else self.learned
+        return self._learned_closed if closed else self.learned
 
     def spline(self, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
         """Integrals from the first window, and their covariance."""
@@ -136,35 +132,25 @@ class Profile:
 
     def __str__(self) -> str:
         """A line for each window, and how far the free energy reaches."""
-        low, high = (int(f(self.F)) for f in (np.argmin, np.argmax))
+        low, high = self.x[np.argmin(self.F)], self.x[np.argmax(self.F)]
         own = np.array([self.difference(self.zero, x) for x in self.windows])
-        columns = (self.windows, self.mean_forces, self.mean_force_errors, *own.T)
-        rows = [
-            f"{x:10.4f} {f:11.4f} +- {e:<9.4f} {F:10.4f} +- {dF:.4f}" for x, f, e, F, dF in zip(*columns, strict=True)
-        ]
-        rise = self.difference(self.x[low], self.x[high])
-        return "\n".join(
-            [
-                f"{'window':>10} {'dF/dx':>11}{'':13} {'F':>10}",
-                *rows,
-                f"from {self.x[low]:.4g} to {self.x[high]:.4g} F rises by {rise.value:.4g} +- {rise.error:.2g}",
-            ]
-        )
+        columns = zip(self.windows, self.mean_forces, self.mean_force_errors, *own.T, strict=True)
+        rows = [f"{x:10.4f} {f:11.4f} +- {e:<9.4f} {F:10.4f} +- {dF:.4f}" for x, f, e, F, dF in columns]
+        rise = self.difference(low, high)
+        end = f"from {low:.4g} to {high:.4g} F rises by {rise.value:.4g} +- {rise.error:.2g}"
+        return "\n".join([f"{'window':>10} {'dF/dx':>11}{'':13} {'F':>10}", *rows, end])
+
+    def _values(self, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        F, covariance = self._known.values(self.method, at, self._closed)
+        return F if self._added is None else F + self._added(at), covariance
 
     def difference(self, a: float, b: float) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        ends = _places([a, b], self._known, "ends of the difference")
-        F, covariance = self._known.values(self.method, ends, self._closed)
-        if self._added is not None:
-            F = F + self._added(ends)
-        return difference(F, covariance)
+        return difference(*self._values(_places([a, b], self._known, "ends of the difference")))
 
     def lower_than(self, energy: float, at: FloatArray | None = None) -> NDArray[np.bool_]:
         """At which places (those of the profile by default) F is at most so much above its lowest value there."""
-        F = self.F
-        if at is not None:
-            F = self._known.values(self.method, at, self._closed)[0]
-            F = F if self._added is None else F + self._added(at)
+        F = self.F if at is None else self._values(at)[0]
         return np.asarray(F - F.min() <= energy)
 
     def without_jacobian(

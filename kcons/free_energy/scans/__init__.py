@@ -1,7 +1,6 @@
 """Relaxed scans: minima of the energy at held values of coordinates.
 
 - `grid`: the points
-- `one_thread`: small matrices without threads
 - `model_hessian`, `relaxation`: the optimizer
 - `relaxed_scan`: from neighbor to neighbor
 - `scan_result`: what was found and how it is shown, and relaxations in files

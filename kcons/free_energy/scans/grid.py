@@ -21,21 +21,9 @@ SAME = 1e-9
 
 
 class Grid:
-    """All combinations of the values of one or two coordinates.
+    """All combinations of the values of one or two coordinates, in angstrom or radian, up or down.
 
-    Parameters
-    ----------
-    coordinates : sequence of Constraint
-        One row each.
-    values : sequence of array_like
-        For each of them, in angstrom or radian, up or down. Of dihedrals over a whole turn the last value, which is the
-        first one again, is left out.
-
-    Attributes
-    ----------
-    values : list of ndarray
-    rings : list of bool
-        Whether the first value of a coordinate follows on its last.
+    Of dihedrals over a whole turn the last value, which is the first one again, is left out.
     """
 
     def __init__(self, coordinates: Sequence[Constraint], values: Sequence[ArrayLike]) -> None:
@@ -54,6 +42,7 @@ class Grid:
                 raise UnsupportedError(f"{item!r} moves with time or holds velocities; scan a coordinate of positions")
         made = [_axis(item, given) for item, given in zip(self.coordinates, values, strict=True)]
         self.values = [axis for axis, _ in made]
+        #: Whether the first value of a coordinate follows on its last.
         self.rings = [ring for _, ring in made]
 
     @property

@@ -15,7 +15,7 @@ from kcons.constraints import Angle, Constraint, Dihedral, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import lined_up, minimum_image
 from kcons.constraints.target import FloatArray
-from kcons.constraints.vectors import cross, norm
+from kcons.constraints.vectors import cross, dot, norm
 
 #: Constants of the model in hartree and bohr: of distances, angles and dihedrals.
 STRETCH, BEND, TURN = 0.45, 0.15, 0.005
@@ -29,25 +29,8 @@ STRAIGHT = 0.2
 
 
 class Internals:
-    """Internal coordinates with the constants of the model (Lindh et al.).
+    """Internal coordinates with the constants of the model, chosen from positions in angstrom.
 
-    Parameters
-    ----------
-    numbers : array_like of int, shape (n_atoms,)
-        Atomic numbers.
-    x : ndarray, shape (n_atoms, 3)
-        Positions in angstrom, from which terms and constants are chosen.
-    lattice : ndarray, shape (2, 3, 3), optional
-
-    Attributes
-    ----------
-    constants : ndarray, shape (n,)
-        In eV and angstrom or radian.
-    terms : list of tuple of int
-        The atoms of each.
-
-    References
-    ----------
     R. Lindh, A. Bernhardsson, G. Karlström and P.-Å. Malmqvist, Chem. Phys. Lett. 241, 423 (1995).
     """
 
@@ -88,6 +71,7 @@ class Internals:
         bend = BEND * close[*bent[:, :2].T] * close[*bent[:, 1:].T] * energy
         turn = TURN * close[*turns[:, :2].T] * close[*turns[:, 1:3].T] * close[*turns[:, 2:].T] * energy
         flat = BEND * close[*self._straight[:, :2].T] * close[*self._straight[:, 1:].T] * energy
+        #: In eV and angstrom or radian; and the atoms of each.
         self.constants: FloatArray = np.concatenate([stretch, bend, turn, flat, flat])
         self.terms = [tuple(row) for item in self._families for row in item.atoms.tolist()]
         # The two directions across a straight angle are those of this structure alone.
@@ -141,19 +125,15 @@ class Internals:
         """dq/dx, shape (n, 3 n_atoms)."""
         table = np.zeros((len(self.constants), self.n_atoms, 3))
         *gathered, r = self._gathered(x)
-        first = 0
+        rows = iter(np.split(np.arange(len(table)), np.cumsum([*(c.n_rows for c in self._families), len(r)])))
         for item, part in zip(self._families, gathered, strict=True):
-            rows = np.arange(first, first + item.n_rows)
-            table[rows[:, None], item.atoms] = item.gradient(part, 0.0)
-            first += item.n_rows
-        for side in self._frames:
-            rows = np.arange(first, first + len(side))
+            table[next(rows)[:, None], item.atoms] = item.gradient(part, 0.0)
+        for side, mine in zip(self._frames, rows, strict=True):
             for end in (0, 2):
                 arm = r[:, end] - r[:, 1]
-                slope = side / norm(arm)[:, None] - arm * (np.einsum("ni,ni->n", side, arm) / norm(arm) ** 3)[:, None]
-                table[rows, self._straight[:, end]] += slope
-                table[rows, self._straight[:, 1]] -= slope
-            first += len(side)
+                slope = side / norm(arm)[:, None] - arm * (dot(side, arm) / norm(arm) ** 3)[:, None]
+                table[mine, self._straight[:, end]] += slope
+                table[mine, self._straight[:, 1]] -= slope
         return table.reshape(len(table), 3 * self.n_atoms)
 
     def hessian(self, x: FloatArray) -> FloatArray:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +15,6 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError
 from kcons.free_energy.scans.model_hessian import Internals
-from kcons.free_energy.scans.one_thread import one_thread
 from kcons.motion.motion import Motion
 
 #: Energy in eV and forces in eV/angstrom at positions, shape (n_atoms, 3).
@@ -31,27 +34,40 @@ MEMORY = 40
 BENDINGS = 4
 
 
+@cache
+def _libraries() -> Any:
+    """The BLAS libraries that are loaded; None without threadpoolctl."""
+    if find_spec("threadpoolctl") is None:
+        return None
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep BLAS to one thread inside: threads that share a small matrix wait for each other longer than they compute.
+
+    With few cores, or other work on them, a hundred times as long. A calculator has the threads that its user chose.
+    """
+    libraries = _libraries()
+    if libraries is None:
+        yield
+        return
+    with libraries.limit(limits=1):
+        yield
+
+
 @dataclass(frozen=True, eq=False)
 class Relaxed:
-    """A minimum on constraints.
-
-    Attributes
-    ----------
-    positions : ndarray, shape (n_atoms, 3)
-    energy : float
-        In eV.
-    largest : float
-        The largest force along the constraints that is left on an atom, in eV/angstrom.
-    memory : ndarray, shape (m, 2, n)
-        Moves and changes of the slopes along the internal coordinates: what was learned of the curvature.
-    evaluations : int
-        Calls of energy and forces.
-    """
+    """A minimum on constraints, its energy in eV, and the largest force along them that is left, in eV/angstrom."""
 
     positions: FloatArray
     energy: float
     largest: float
+    #: Moves and changes of the slopes along internal coordinates, (m, 2, n): what was learned of the curvature.
     memory: FloatArray
+    #: Calls of energy and forces.
     evaluations: int
 
 
@@ -81,16 +97,7 @@ class _Place:
 
 
 class Descent:
-    """Quasi-Newton steps on constraints, in internal coordinates.
-
-    Parameters
-    ----------
-    motion : Motion
-    evaluate : callable
-    internals : Internals
-    memory : ndarray, shape (m, 2, n), optional
-        That of a relaxation nearby.
-    """
+    """Quasi-Newton steps on constraints, in internal coordinates."""
 
     def __init__(self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: FloatArray | None) -> None:
         self.motion, self.evaluate, self.internals = motion, evaluate, internals

@@ -202,15 +202,17 @@ class _Surface:
 
             found = minimise(motion, force, x, tolerance=fmax, longest=FIRST, steps=evaluations)
             energy, _ = self.evaluate(found.positions)
-            attempt.fill(found.positions, energy, found.largest, calls)
+            attempt.positions, attempt.energy, attempt.largest = found.positions, energy, found.largest
+            attempt.evaluations = calls
             return
         internals = Internals(self.atoms.numbers, x, motion.lattice)
         memory = None
         if source is not None and len(source.memory):
             memory = internals.remapped(source.memory, source.terms)
         done = relax(motion, self.evaluate, internals, x, fmax=fmax, memory=memory, evaluations=evaluations)
-        attempt.fill(done.positions, done.energy, done.largest, done.evaluations)
-        attempt.memory, attempt.terms = done.memory, internals.terms
+        for name in ("positions", "energy", "largest", "evaluations", "memory"):
+            setattr(attempt, name, getattr(done, name))
+        attempt.terms = internals.terms
 
 
 class _Wavefront:

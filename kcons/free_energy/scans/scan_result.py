@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,37 +42,21 @@ _NONE = -9
 
 @dataclass
 class Attempt:
-    """One relaxation.
-
-    Attributes
-    ----------
-    number : int
-    point : tuple of int
-    source : int or None
-        The attempt whose structure it began from; None for the structure that was given.
-    positions : ndarray, shape (n_atoms, 3)
-    energy, largest : float
-        In eV; the largest force left on an atom, in eV/angstrom.
-    evaluations : int
-    error : str or None
-        Why it failed.
-    memory, terms
-        What was learned of the curvature, see `relaxation`.
-    """
+    """One relaxation, of energy in eV and the largest force left on an atom in eV/angstrom."""
 
     number: int
     point: Point
+    #: The attempt whose structure it began from; None for the structure that was given.
     source: int | None
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     energy: float = float("nan")
     largest: float = float("nan")
     evaluations: int = 0
+    #: Why it failed.
     error: str | None = None
+    #: What was learned of the curvature, see `relaxation`.
     memory: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 0)))
     terms: list[tuple[int, ...]] = field(default_factory=list)
-
-    def fill(self, positions: FloatArray, energy: float, largest: float, evaluations: int) -> None:
-        self.positions, self.energy, self.largest, self.evaluations = positions, energy, largest, evaluations
 
     def save(self, path: Path) -> None:
         """Write it; the file is there as a whole, or not at all."""
@@ -88,12 +71,7 @@ class Attempt:
 
     @classmethod
     def load(cls, path: Path, number: int) -> Attempt:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        UnreadableError
-        """
+        """Read what `save` wrote."""
         try:
             with path.open("rb") as file:
                 data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
@@ -107,23 +85,7 @@ class Attempt:
 
 
 class Attempts:
-    """A folder of attempts; without a folder nothing is kept.
-
-    Parameters
-    ----------
-    folder : path, or None
-    atoms : ase.Atoms
-    grid : Grid
-    held : sequence of Constraint
-    settings : mapping
-
-    Raises
-    ------
-    OccupiedError
-        The folder has another scan in it, or other files of these names.
-    InputError
-        Coordinates that cannot be written to a file.
-    """
+    """A folder of attempts, which must not have another scan in it; without a folder nothing is kept."""
 
     def __init__(
         self,
@@ -152,13 +114,7 @@ class Attempts:
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """Make the folder, and keep others out of it.
-
-        Raises
-        ------
-        OccupiedError
-            Another scan writes there.
-        """
+        """Make the folder, and keep other scans out of it."""
         if self._results is None:
             yield
             return
@@ -166,31 +122,25 @@ class Attempts:
             (self._results.path / PLACE).mkdir(exist_ok=True)
             yield
 
-    def _file(self, number: int) -> Path | None:
-        return None if self._results is None else self._results.path / PLACE / f"{number:05d}.npz"
+    def _file(self, number: int) -> Path:
+        assert self._results is not None
+        return self._results.path / PLACE / f"{number:05d}.npz"
 
     def tried(self, number: int) -> Attempt | None:
         """An attempt of an earlier run; None if there is none."""
-        path = self._file(number)
-        return None if path is None or not path.exists() else Attempt.load(path, number)
+        there = self._results is not None and self._file(number).exists()
+        return Attempt.load(self._file(number), number) if there else None
 
     def kept(self, number: int, point: Point, source: int | None) -> Attempt | None:
-        """The attempt of an earlier run that began so; None if there is none.
-
-        Raises
-        ------
-        UnreadableError
-            Its file is damaged, or of another scan.
-        """
+        """The attempt of an earlier run that began so; None if there is none."""
         found = self.tried(number)
         if found is not None and (found.point, found.source) != (point, source):
             raise UnreadableError(f"{self._file(number)} is of another scan; take another folder", item="folder")
         return found
 
     def keep(self, attempt: Attempt) -> None:
-        path = self._file(attempt.number)
-        if path is not None:
-            attempt.save(path)
+        if self._results is not None:
+            attempt.save(self._file(attempt.number))
 
 
 class _Shown(Table):
@@ -229,6 +179,10 @@ class Scan:
     def energies(self) -> FloatArray:
         """In eV, shape of the grid; NaN where no relaxation succeeded."""
         return self._over_the_grid({point: attempt.energy for point, attempt in self.best.items()})
+
+    @property
+    def _lowest(self) -> float:
+        return min((attempt.energy for attempt in self.best.values()), default=float("nan"))
 
     @property
     def hysteresis(self) -> FloatArray:
@@ -296,11 +250,10 @@ class Scan:
 
     def rows(self) -> list[dict[str, Any]]:
         """Of each point the values, energies, hysteresis, calls, the force left, and why it failed."""
-        energy, spread = self.energies, self.hysteresis
+        energy, spread, lowest = self.energies, self.hysteresis, self._lowest
         calls = dict.fromkeys(self.grid.points, 0)
         for attempt in self.attempts:
             calls[attempt.point] += attempt.evaluations
-        lowest = float(np.nanmin(energy)) if self.best else float("nan")
         return [
             {
                 **self._values(point),
@@ -316,10 +269,9 @@ class Scan:
 
     def summary(self) -> str:
         """What was done, and what failed."""
-        lowest = float(np.nanmin(self.energies)) if self.best else float("nan")
         lines = [
             f"{len(self.best)} of {len(self.grid.points)} points, {len(self.attempts)} relaxations, "
-            f"{self.evaluations} calls of energy and forces; lowest energy {lowest:.6f} eV"
+            f"{self.evaluations} calls of energy and forces; lowest energy {self._lowest:.6f} eV"
         ]
         spread = self.hysteresis * KJ
         if self.best and np.nanmax(spread) >= TOLD:
@@ -340,17 +292,18 @@ class Scan:
         for point, row in zip(self.grid.points, self.rows(), strict=True):
             turns = zip(self.grid.shown(point), self.grid.in_degrees, strict=True)
             cells = [f"{v:.2f}" if turn else f"{v:.4f}" for v, turn in turns]
-            reached = point in self.best
-            cells += [f"{row['energy_kJ_mol']:.3f}", f"{row['hysteresis_kJ_mol']:.3f}"] if reached else ["failed", ""]
-            shown.add_row(*cells, str(row["calls"]), f"{row['force_left_eV_A']:.4f}" if reached else "")
+            cells += [f"{row['energy_kJ_mol']:.3f}", f"{row['hysteresis_kJ_mol']:.3f}", str(row["calls"])]
+            cells.append(f"{row['force_left_eV_A']:.4f}")
+            if row["error"]:
+                cells[-4:] = "failed", "", str(row["calls"]), ""
+            shown.add_row(*cells)
         return shown
 
     def plot(self) -> Figure:
         """Energy along one coordinate, or over two; points that failed are crosses."""
         from matplotlib.figure import Figure
 
-        grid, lowest = self.grid, float(np.nanmin(self.energies)) if self.best else float("nan")
-        energy, spread = (self.energies - lowest) * KJ, self.hysteresis * KJ
+        grid, energy, spread = self.grid, (self.energies - self._lowest) * KJ, self.hysteresis * KJ
         figure = Figure(figsize=(7, 4.5), layout="constrained")
         axes = figure.subplots()
         labels = [f"{name} / {unit}" for name, unit in zip(grid.names, grid.units, strict=True)]
@@ -374,25 +327,24 @@ class Scan:
 
     def write(self, folder: Path | str) -> list[Path]:
         """Put scan.json, .csv, .png and .extxyz (the minima, as in the grid) into a folder; the paths written."""
-        place, rows = Path(folder), self.rows()
+        import pandas
+
+        place, table = Path(folder), pandas.DataFrame(self.rows())
         place.mkdir(parents=True, exist_ok=True)
         numbers: dict[str, Any] = {
             "kcons": __version__,
             "coordinates": dict(zip(self.grid.keys, self.grid.units, strict=True)),
-            "points": rows,
+            "points": self.rows(),
             "relaxations": len(self.attempts),
             "calls": self.evaluations,
         }
-        lines, frames, picture = io.StringIO(newline=""), io.StringIO(), io.BytesIO()
-        writer = csv.DictWriter(lines, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-        for point in self.grid.points:
-            if point in self.best:
-                ase.io.write(frames, self.structure(point), format="extxyz")
+        frames, picture = io.StringIO(), io.BytesIO()
+        for point in sorted(self.best):
+            ase.io.write(frames, self.structure(point), format="extxyz")
         self.plot().savefig(picture, dpi=150, format="png")
+        lines = table.to_csv(index=False, lineterminator="\r\n", na_rep="")
         written = [place / f"scan.{kind}" for kind in ("json", "csv", "png", "extxyz")]
-        contents = [text(numbers).encode(), lines.getvalue().encode(), picture.getvalue(), frames.getvalue().encode()]
+        contents = [text(numbers).encode(), lines.encode(), picture.getvalue(), frames.getvalue().encode()]
         for path, content in zip(written, contents, strict=True):
             with in_one_piece(path) as file:
                 file.write(content)

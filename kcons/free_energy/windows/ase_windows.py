@@ -1,4 +1,4 @@
-"""Windows sampled by ASE with any calculator."""
+"""Held coordinates in ASE's dynamics with any calculator: recorded, and sampled window by window."""
 
 from __future__ import annotations
 
@@ -8,26 +8,127 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms, units
+from ase.calculators.calculator import all_properties
+from ase.md.md import MolecularDynamics
 
 from kcons.ase import (
+    ConstrainedDynamics,
     ConstrainedLangevin,
     ConstrainedNoseHoover,
+    Constraints,
     IsokineticDynamics,
     draw_velocities,
     from_ase_constraints,
 )
+from kcons.ase.binding import applied_forces
 from kcons.ase.named_calculators import described
-from kcons.ase.topology import bonds_of
-from kcons.constraints import Constraint
+from kcons.ase.topology import bonds_of, velocities_of
+from kcons.constraints import Constraint, Dihedral
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError
-from kcons.free_energy.ase_recorder import AseRecorder
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
 from kcons.motion import minimise
+from kcons.motion.motion import Motion
+from kcons.thermostats import IsokineticSpheres
 
+#: Names in `Atoms.info` that files have for something else.
+_TAKEN = {*all_properties, "Lattice", "Properties", "pbc"}
 #: Largest force left by a relaxation, eV/angstrom, and the longest way of an atom in one of its steps, angstrom.
 _FORCE, _STRIDE = 0.1, 0.1
+
+
+class AseRecorder:
+    """An observer of ASE's dynamics that keeps a `Series`, and shows the last sample on the atoms.
+
+    Attach it before whatever writes the trajectory, at the same interval. ``atoms.info`` then has each coordinate by
+    its name, ``"multiplier of <name>"`` and ``"ln det Z"``, which trajectories and extended XYZ files keep.
+
+    Parameters
+    ----------
+    dynamics : MolecularDynamics
+        Of kcons, or another one of ASE whose atoms carry a `kcons.ase.Constraints`. Times are in ASE's unit,
+        multipliers in eV by the unit of the coordinate.
+    coordinates : mapping of str to Constraint
+        As for `HeldCoordinates`.
+    constraint_forces : bool
+        Whether ``atoms.arrays["constraint_forces"]`` (eV/angstrom) is written too. Takes a solve of all rows.
+
+    Attributes
+    ----------
+    series : Series
+
+    Raises
+    ------
+    InputError
+        The atoms carry no constraints of kcons, or do not hold a coordinate; a name that files cannot keep.
+    UnsupportedError
+        At a sample: velocities on isokinetic spheres, where the multipliers need thermal ones.
+
+    Examples
+    --------
+    ``dynamics.attach(AseRecorder(dynamics, {"torsion": torsion}), interval=10)``
+    """
+
+    def __init__(
+        self, dynamics: MolecularDynamics, coordinates: Mapping[str, Constraint], *, constraint_forces: bool = False
+    ) -> None:
+        self.dynamics, self.constraint_forces = dynamics, constraint_forces
+        self.coordinates = named(coordinates)
+        for name in self.coordinates:
+            if "=" in name or name in _TAKEN:
+                raise InputError(
+                    f"a coordinate is called {name!r}, which extended XYZ files cannot keep; give it another name",
+                    item=name,
+                )
+        self._motion: Motion | None = None
+        self._held = self._bound()
+        self.series = Series(self._held.names, self._held.periods)
+
+    def _bound(self) -> HeldCoordinates:
+        """The coordinates among what is held now: masses, constraints or periodicity may have been changed."""
+        dynamics, atoms = self.dynamics, self.dynamics.atoms
+        if isinstance(dynamics, ConstrainedDynamics):
+            motion = dynamics.motion
+        else:
+            found = [item for item in atoms.constraints if isinstance(item, Constraints)]
+            if len(found) != 1:
+                raise InputError(
+                    f"the atoms carry {len(found) or 'no'} kcons.ase.Constraints objects; a coordinate is held by one "
+                    "(kcons.ase.constrain), or by a dynamics class of kcons",
+                    item="dynamics",
+                )
+            motion = found[0].engine(atoms)
+        if motion is not self._motion:
+            turns = any(isinstance(item, Dihedral) for item in self.coordinates.values())
+            how: dict[str, Any] = {"time": dynamics.get_time(), "bonds": bonds_of(atoms) if turns else None}
+            self._held = HeldCoordinates(motion, self.coordinates, atoms.positions, **how)
+            self._motion = motion
+        return self._held
+
+    def __call__(self) -> None:
+        dynamics, atoms, held = self.dynamics, self.dynamics.atoms, self._bound()
+        forces = dynamics.state.forces if isinstance(dynamics, ConstrainedDynamics) else None
+        if forces is None:
+            forces = applied_forces(atoms)
+        if isinstance(dynamics, IsokineticDynamics):  # known once it runs
+            self.series.isokinetic_degrees_of_freedom = dynamics.thermostat_degrees_of_freedom
+        x, v, time = atoms.positions, velocities_of(atoms), dynamics.get_time()
+        sample = held.sample(x, v, forces, time)
+        spheres = isinstance(getattr(dynamics, "stepper", None), IsokineticSpheres)
+        if spheres and not np.isfinite(sample.mean_kinetic).all():
+            raise UnsupportedError(
+                f"velocities on isokinetic spheres are not thermal, and multipliers of {', '.join(held.names)} "
+                "need them: their mean is found without only for up to 60 rows at rest. Take bath='langevin'"
+            )
+        self.series.append(sample)
+        for name, value, multiplier in zip(held.names, sample.value, sample.multiplier, strict=True):
+            atoms.info[name], atoms.info[f"multiplier of {name}"] = float(value), float(multiplier)
+        atoms.info["ln det Z"] = sample.log_det_z
+        if self.constraint_forces:
+            assert self._motion is not None
+            atoms.set_array("constraint_forces", self._motion.constraint_force(x, v, np.asarray(forces), time))
 
 
 class AseWindows(Sampler):
@@ -75,30 +176,21 @@ class AseWindows(Sampler):
     @property
     def digest(self) -> str:
         """What the windows in a folder belong to, of the calculator as it is made now."""
-        calculator = self.calculator
-        made = (
-            (calculator.func, calculator.args, calculator.keywords)
-            if isinstance(calculator, partial)
-            else (calculator,)
-        )
+        made = self.calculator
+        given = (made.args, made.keywords) if isinstance(made, partial) else ()
+        function = made.func if isinstance(made, partial) else made
         # Not all that makes a calculator what it is need be among its parameters, nor among these arguments.
-        maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:]]
-        maker.append(described(calculator(), self.atoms))
+        maker = [getattr(function, "__qualname__", type(function).__qualname__), *given, described(made(), self.atoms)]
         frame = [self.atoms.numbers, self.atoms.positions, self.atoms.cell.array, self.atoms.pbc]
         frame.append(self.atoms.get_masses())
         return digest_of(frame, maker, self.held, list(self.coordinates.values()))
 
     def rows(self) -> Held:
         atoms = self.atoms
-        return Held(
-            self.coordinates,
-            self.held,
-            atoms.positions.copy(),
-            atoms.get_masses(),
-            atoms.cell.array if atoms.pbc.any() else None,
-            atoms.pbc,
-            lambda: bonds_of(atoms),
-        )
+        cell = atoms.cell.array if atoms.pbc.any() else None
+        where = (atoms.positions.copy(), atoms.get_masses(), cell, atoms.pbc)
+        bonds = bonds_of(atoms)
+        return Held(self.coordinates, self.held, *where, bonds, bonds)
 
     def simulation(self, held: Held, window: Window, settings: Settings) -> _Simulation:
         return _Simulation(self, held, window, settings)
@@ -108,7 +200,7 @@ class _Simulation:
     """A run in ASE."""
 
     def __init__(self, sampler: AseWindows, held: Held, window: Window, settings: Settings) -> None:
-        self._held, self._settings, self._coordinates = held, settings, sampler.coordinates
+        self.held, self._settings = held, settings
         self.atoms = atoms = sampler.atoms.copy()
         atoms.calc = sampler.calculator()
         motion, x = held.placed(window.start)
@@ -132,12 +224,12 @@ class _Simulation:
     ) -> None:
         settings, dt = self._settings, self._settings.timestep * units.fs
         friction = settings.friction / (1000 * units.fs)
-        rows = [*self._held.others, *self._held.at(begin)]
+        rows = [*self.held.others, *self.held.at(begin)]
         if velocities is not None:
-            still = thermostat != "langevin" and not self._held.knows_a_place
+            still = thermostat != "langevin" and not self.held.knows_place
             draw_velocities(self.atoms, settings.temperature, velocities, constraints=rows, zero_momentum=still)
         if tuple(begin) != tuple(end):
-            rows = [*self._held.others, *self._held.towards(begin, end, settings.pull * dt)]
+            rows = [*self.held.others, *self.held.towards(begin, end, settings.pull * dt)]
         common: dict[str, Any] = {"temperature_K": settings.temperature, "constraints": rows}
         if thermostat == "langevin":
             self._dynamics = ConstrainedLangevin(self.atoms, dt, friction=friction, rng=seed, **common)
@@ -149,8 +241,18 @@ class _Simulation:
     def step(self, steps: int) -> None:
         self._dynamics.run(steps)
 
-    def record(self, steps: int, every: int, *, start: bool = False) -> Series:
-        recorder = AseRecorder(self._dynamics, self._coordinates)
-        self._dynamics.attach(recorder, interval=every)  # before the first step ASE calls it
+    def run(self, steps: int, every: int, take: Callable[[], None]) -> None:
+        first = self._dynamics.nsteps
+        # Before the first step ASE calls it, too.
+        self._dynamics.attach(lambda: take() if self._dynamics.nsteps > first else None, interval=every)
         self._dynamics.run(steps)
-        return recorder.series
+
+    def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        forces = self._dynamics.state.forces
+        forces = applied_forces(self.atoms) if forces is None else np.array(forces)
+        return self.atoms.get_positions(), np.array(velocities_of(self.atoms)), forces, self._dynamics.get_time()
+
+    @property
+    def isokinetic_degrees_of_freedom(self) -> int:
+        isokinetic = isinstance(self._dynamics, IsokineticDynamics)
+        return self._dynamics.thermostat_degrees_of_freedom if isokinetic else 0

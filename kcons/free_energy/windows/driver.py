@@ -11,7 +11,6 @@ from concurrent.futures import FIRST_COMPLETED as FIRST
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
-from itertools import chain
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from os import PathLike
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import logsumexp
 
 from kcons.constraints.arguments import positive, seed_number, whole_number
 from kcons.constraints.target import FloatArray, nearest_image
@@ -131,9 +131,8 @@ class Windows:
             One failed window does not stop the others; `failed` says why.
         """
         numbers: list[int] = []
-        places = places_of(targets, self.sampler.names)
         with self.taken():
-            for place in map(tuple, places.tolist()):
+            for place in map(tuple, places_of(targets, self.sampler.names).tolist()):
                 asked = [n for n, target in enumerate(self._targets) if target == place and n not in numbers]
                 numbers += asked[:1] or self._added([place])
             return self._run(numbers)
@@ -146,8 +145,7 @@ class Windows:
 
     def _run(self, numbers: Sequence[int]) -> FreeEnergy:
         jobs = [job for number in numbers for job in self._jobs(number)]
-        missing = [job for job in jobs if not self._finished(job)]
-        failed = self._sample(missing, len(jobs))
+        failed = self._sample([job for job in jobs if not self._finished(job)], len(jobs))
         for job in jobs:
             self._failed.pop(job.name, None)
         self._failed |= failed
@@ -232,12 +230,11 @@ class Windows:
             begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
             seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
             jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
-        every = list(chain(*jobs))
+        missing = [job for each in jobs for job in each if not self.file(job).exists()]
         with self.taken():
-            missing = [job for job in every if not self.file(job).exists()]
-            failed = self._sample(missing, len(every))
+            failed = self._sample(missing, len(jobs) * count)
         if failed:
-            said = f"{len(failed)} of {len(every)} pulls failed; {': '.join(next(iter(failed.items())))}"
+            said = f"{len(failed)} of {len(jobs) * count} pulls failed; {': '.join(next(iter(failed.items())))}"
             if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs):
                 raise InputError(f"{said}. A difference needs {FEWEST} each way", item="pull")
             warnings.warn(f"{said}. They are left out, which makes the result doubtful", UserWarning, stacklevel=2)
@@ -285,8 +282,9 @@ class Windows:
                                 continue
                             done += 1
                             note = self.folder / f"{job.name}.failed.txt"
-                            note.unlink(missing_ok=True)
-                            if problem is not None:
+                            if problem is None:
+                                note.unlink(missing_ok=True)
+                            else:
                                 failed[job.name] = problem
                                 note.write_text(problem, encoding="utf-8")
                             if self.progress is not None:
@@ -350,20 +348,19 @@ def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
     works = [
         np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each]) for each in pulls
     ]
-    log_weights = [np.array([-0.5 * series.log_det_z[[0, -1]] for series in each]).reshape(-1, 2) for each in pulls]
+    starts, ends = (np.array([[-0.5 * s.log_det_z[k] for s in each] for each in pulls]) for k in (0, -1))
     # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
     if len(pulls) == 2:
-        shift = kT * (_log_mean(log_weights[0][:, 0]) - _log_mean(log_weights[1][:, 0]))
+        shift = kT * (_log_mean(starts[0]) - _log_mean(starts[1]))
         return pull_free_energy(works[0] + shift, works[1] - shift, thermal_energy=kT)
     counts = -works[0] / kT  # what was pulled here counts as in equilibrium with these weights
-    at_end = _log_mean(log_weights[0][:, 1] + counts) - _log_mean(counts)
-    shift = kT * (_log_mean(log_weights[0][:, 0]) - at_end)
+    shift = kT * (_log_mean(starts[0]) - _log_mean(ends[0] + counts) + _log_mean(counts))
     return pull_free_energy(works[0] + shift, thermal_energy=kT)
 
 
 def _log_mean(logarithms: FloatArray) -> float:
     """ln of the mean of exp."""
-    return float(np.logaddexp.reduce(logarithms) - np.log(len(logarithms))) if len(logarithms) else 0.0
+    return float(logsumexp(logarithms) - np.log(len(logarithms)))
 
 
 @contextmanager

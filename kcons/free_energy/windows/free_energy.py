@@ -176,12 +176,9 @@ class FreeEnergy:
         from rich.table import Table
 
         made = Table(title=f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})")
-        slopes = [f"dF/d {name}" for name in self.names] if len(self.names) > 1 else ["dF/dq"]
-        for title in (
-            *(f"{name} ({_SHOWN[angle]})" for name, angle in zip(self.names, self.angles, strict=True)),
-            *slopes,
-            *("raw multiplier", "independent samples", "hysteresis p"),
-        ):
+        titles = [f"{name} ({_SHOWN[angle]})" for name, angle in zip(self.names, self.angles, strict=True)]
+        titles += [f"dF/d {name}" for name in self.names] if len(self.names) > 1 else ["dF/dq"]
+        for title in (*titles, "raw multiplier", "independent samples", "hysteresis p"):
             made.add_column(title, justify="right")
         for window in self.windows:
             shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, self.angles, strict=True)]
@@ -198,17 +195,15 @@ class FreeEnergy:
     def summary(self) -> str:
         """A sentence or two."""
         lines = [f"{len(self.windows)} windows"]
-        doubtful = [w.number for w in self.windows if w.hysteresis < UNLIKELY]
-        if doubtful:
+        if doubtful := ", ".join(str(w.number) for w in self.windows if w.hysteresis < UNLIKELY):
             lines.append(
-                f"runs from below and from above differ by more than chance in window {', '.join(map(str, doubtful))} "
-                "(marked !): something slow is not equilibrated there; sample longer, or look for the other coordinate"
+                f"runs from below and from above differ by more than chance in window {doubtful} (marked !): something "
+                "slow is not equilibrated there; sample longer, or look for the other coordinate"
             )
-        poor = [w.number for w in self.windows if w.independent < FEW_INDEPENDENT]
-        if poor:
+        if poor := ", ".join(str(w.number) for w in self.windows if w.independent < FEW_INDEPENDENT):
             lines.append(
-                f"fewer than {FEW_INDEPENDENT} independent samples in window {', '.join(map(str, poor))}: errors there "
-                "are not to be relied on; sample longer"
+                f"fewer than {FEW_INDEPENDENT} independent samples in window {poor}: errors there are not to be relied "
+                "on; sample longer"
             )
         profile, why = self._profile()
         if why:
@@ -224,9 +219,8 @@ class FreeEnergy:
         """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
         best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
         numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
-        for key in ("bar", "jarzynski", "jarzynski_backward"):
-            if getattr(pulled, key) is not None:
-                numbers[key] = [*getattr(pulled, key)]
+        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski", "jarzynski_backward")}
+        numbers |= {key: [*estimate] for key, estimate in estimates.items() if estimate is not None}
         numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
         said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol lost)"
         if self._profile()[0] is not None:

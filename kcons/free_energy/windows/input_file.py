@@ -279,11 +279,8 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         )
     structure: Any = tables.get("structure")
     sampling, entries = tables["sampling"], tables["coordinate"]
-    for name, found, how in (
-        ("structure", structure, "[structure] with file = ..."),
-        ("coordinate", entries, "[[coordinate]]"),
-    ):
-        if not found:
+    for name, how in (("structure", "[structure] with file = ..."), ("coordinate", "[[coordinate]]")):
+        if not tables.get(name):
             raise InputError(f"the input file has no {name}; write {how}", item=name)
     coordinates: dict[str, Constraint] = {}
     for entry in entries:
@@ -394,6 +391,27 @@ def counted(atoms: Sequence[int], first: int) -> list[int]:
     return [atom - first for atom in atoms]
 
 
+def read_structure(path: Path) -> Any:
+    """The last structure of any file that ASE reads, as `Atoms`.
+
+    Raises
+    ------
+    InputError
+    """
+    import ase.io
+
+    _require_file(path)
+    try:
+        return ase.io.read(path)
+    except Exception as error:
+        raise InputError(f"ASE cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", item="structure")
+
+
 def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]) -> FloatArray:
     """Values of the coordinates, or one for all of them, angles of degrees in radian."""
     values = np.array(given, dtype=np.float64)
@@ -412,8 +430,7 @@ def _sampler(
     allow_modules: Collection[str],
 ) -> Sampler:
     forces, place = tables["forces"], folder / structure.file
-    if not place.is_file():
-        raise InputError(f"there is no file {place}", item="structure")
+    _require_file(place)
     if (forces.calculator is None) == (forces.system is None):
         raise InputError(
             "give calculator or system in [forces]: a calculator of ASE, or the XML file of a System of OpenMM",
@@ -426,15 +443,10 @@ def _sampler(
         if "held" in tables:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
         return _of_openmm(place, folder / forces.system, forces, coordinates)
-    import ase.io
-
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
-    try:
-        atoms: Any = ase.io.read(place)
-    except Exception as error:
-        raise InputError(f"ASE cannot read {place}: {type(error).__name__}: {error}", item="structure") from error
+    atoms = read_structure(place)
     rows = tables.get("held", HeldRows()).rows(atoms, structure.count_from)
     refuse_unlisted(forces.calculator, allow_modules)
     make = partial(named_calculator, forces.calculator, forces.settings or {})

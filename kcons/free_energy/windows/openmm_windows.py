@@ -1,10 +1,10 @@
-"""Windows sampled by OpenMM."""
+"""Held coordinates in OpenMM's simulations: reported, and sampled window by window."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from os import PathLike
+from typing import Any, TextIO
 
 import numpy as np
 import openmm
@@ -12,17 +12,20 @@ from numpy.typing import ArrayLike
 from openmm import app, unit
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, Formula
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet, same_rows
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
+from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.callback_rows.callbacks import cell_of
-from kcons.openmm.callback_rows.carried_constraints import refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites, with_massless_atoms
 from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
-from kcons.openmm.quantities import masses_of, nanometers
+from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.states import positions_of, velocities_of
 from kcons.openmm.topology import bonds_of
 
@@ -30,6 +33,146 @@ from kcons.openmm.topology import bonds_of
 _FORCE = 50.0
 #: Part of the box by which files round it.
 _SAME_BOX = 1e-3
+
+
+def _beside(system: openmm.System, rows: Sequence[Constraint], masses: FloatArray) -> list[Constraint]:
+    """What a System holds in the clusters of the atoms of some rows: its constraints, and particles without mass."""
+    touched = np.unique(np.concatenate([row.atoms.ravel() for row in rows]))
+    refuse_virtual_sites(system, touched, masses)
+    return [*constraints_about(system, touched), *with_massless_atoms(tuple(rows), masses)[len(rows) :]]
+
+
+def _turning(system: openmm.System, bonds: IntArray, masses: FloatArray) -> IntArray | None:
+    """The bonds by which groups may be turned: all that is free to move must move with them.
+
+    Forces on virtual sites are in those of the particles that they depend on: sites belong to no group.
+    """
+    virtual = np.array([system.isVirtualSite(k) for k in range(len(masses))])
+    return bonds[~virtual[bonds].any(axis=1)] if np.all((masses > 0) | virtual) else None
+
+
+class HeldCoordinatesReporter:
+    """Writes held coordinates, their multipliers and ln det Z, in the manner of `openmm.app.StateDataReporter`.
+
+    However a coordinate is held (by the System, by `CollectiveRows`, by `hold`), it is named by the constraint of kcons
+    that measures it. What else is held on its atoms counts too: constraints of the System and those of `hold` are
+    found, other rows of `CollectiveRows` have to be named, or given as `beside`.
+
+    Parameters
+    ----------
+    file : path or text file
+        Comma-separated columns: step, time in ps, then value and multiplier of each coordinate in kJ/mol, nm and
+        radian, ln det Z, and the work that moving targets did since the first report of this reporter.
+    reportInterval : int
+        Steps from one report to the next.
+    coordinates : mapping of str to Constraint
+        Quantities, or plain numbers of nm, ps, dalton, radian.
+    beside : iterable of Constraint
+        Other rows that are held on the same atoms.
+    append : bool
+        Whether to go on in a file that exists, without a new line of names.
+
+    Attributes
+    ----------
+    series : Series
+        All that was reported.
+
+    Raises
+    ------
+    InputError
+        At the first report: rows of `CollectiveRows` that are neither named nor given as `beside`.
+        A report of another simulation than the first.
+    UnsupportedError
+        At the first report: a coordinate of a virtual site.
+
+    Notes
+    -----
+    Velocities of the integrators of kcons belong to the positions. Those of OpenMM's leapfrog integrators are half a
+    step off, and the part of the multipliers that is quadratic in them is then of first order only.
+    """
+
+    def __init__(
+        self,
+        file: str | PathLike[str] | TextIO,
+        reportInterval: int,
+        coordinates: Mapping[str, Constraint],
+        *,
+        beside: Iterable[Constraint] = (),
+        append: bool = False,
+    ) -> None:
+        interval = whole_number(reportInterval, "reportInterval")
+        names = list(named(coordinates))
+        self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
+        self._beside = accepted(beside)
+        self._interval = interval
+        self._own = not hasattr(file, "write")
+        self._file: TextIO = open(file, "a" if append else "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
+        self._titled = append
+        self._work = 0.0
+        self._held: HeldCoordinates | None = None
+        self._set: ConstraintSet | None = None
+        self.series = Series(names)
+
+    def describeNextReport(self, simulation: Any) -> tuple[int, bool, bool, bool, bool, bool]:
+        """Steps to the next report, and that it takes positions, velocities and forces, not wrapped."""
+        return (self._interval - simulation.currentStep % self._interval, True, True, True, False, False)
+
+    def report(self, simulation: Any, state: openmm.State) -> None:
+        """Write a line."""
+        x, v, f, time = _state(state)
+        if self._held is None:
+            self._begin(simulation, x, time)
+        elif simulation.context is not self._context:
+            raise InputError("this reporter belongs to another simulation; make a new one for this", item="simulation")
+        assert self._held is not None and self._set is not None
+        if self._set.lattice is not None:
+            self._set.with_cell(cell_of(state.getPeriodicBoxVectors()))
+        self.series.isokinetic_degrees_of_freedom = _isokinetic(simulation.integrator)
+        sample = self._held.sample(x, v, f, time)
+        self._work += self.series.append(sample)
+        pairs = [n for pair in zip(sample.value.tolist(), sample.multiplier.tolist(), strict=True) for n in pair]
+        numbers = [time, *pairs, sample.log_det_z, self._work]
+        self._file.write(",".join([str(simulation.currentStep), *(f"{number:.12g}" for number in numbers)]) + "\n")
+        self._file.flush()
+
+    def _begin(self, simulation: Any, x: np.ndarray, time: float) -> None:
+        system, masses = simulation.system, masses_of(simulation.system)
+        rows = [*self._beside, *self._coordinates.values()]
+        parts = getattr(simulation.integrator, "parts", ())
+        collective = sum(part.n_rows for part in parts if isinstance(part, CollectiveRows))
+        carried = [c for p in parts if isinstance(p, CarriedConstraints) for c in p.motion.sources[0].constraints]
+        if collective > (mine := sum(row.n_rows for row in rows)):
+            raise InputError(
+                f"CollectiveRows holds {collective} rows, and {mine} are named here; name them all, or give the "
+                "others as beside: what is held beside a coordinate changes its mean force",
+                item="beside",
+            )
+        # Those of `hold` know how their targets move.
+        for row in rows:
+            new = [k for k in range(row.n_rows) if not any(same_rows(item, row, k).any() for item in carried)]
+            if new:
+                carried.append(row.select(new))
+        lengths = {frozenset(pair) for row in carried if row.family == "Distance" for pair in row.atoms.tolist()}
+        for item in _beside(system, carried, masses):
+            new = [k for k, atoms in enumerate(item.atoms.tolist()) if frozenset(atoms) not in lengths]
+            if new:
+                carried.insert(0, item.select(new))
+        wraps = system.usesPeriodicBoundaryConditions()
+        cell = cell_of(simulation.context.getState().getPeriodicBoxVectors()) if wraps else None
+        self._set = ConstraintSet(carried, x, np.where(masses > 0, masses, 1.0), cell=cell, time=time)
+        known = all(isinstance(part, CollectiveRows | CarriedConstraints) for part in parts)
+        bonds = _turning(system, bonds_of(system, x), masses) if known else None
+        self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
+        self._context = simulation.context
+        self.series = Series(self._held.names, self._held.periods)
+        if not self._titled:
+            titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]
+            titles = ["Step", "Time (ps)", *titles, "ln det Z", "work (kJ/mol)"]
+            self._file.write("#" + ",".join(f'"{title}"' for title in titles) + "\n")
+
+    def __del__(self) -> None:
+        if getattr(self, "_own", False) and hasattr(self, "_file"):
+            self._file.close()
 
 
 class OpenMMWindows(Sampler):
@@ -93,20 +236,11 @@ class OpenMMWindows(Sampler):
     def rows(self) -> Held:
         system = self.system()
         masses = masses_of(system)
-        given = tuple(self.coordinates.values())
-        touched = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        refuse_virtual_sites(system, touched, masses)
-        others = [*constraints_about(system, touched), *with_massless_atoms(given, masses)[len(given) :]]
+        others = _beside(system, list(self.coordinates.values()), masses)
         wraps = system.usesPeriodicBoundaryConditions()
-        return Held(
-            self.coordinates,
-            others,
-            self.positions,
-            np.where(masses > 0, masses, 1.0),
-            cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None,
-            True,
-            lambda: self._bonds,
-        )
+        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
+        where = (self.positions, np.where(masses > 0, masses, 1.0), cell, True)
+        return Held(self.coordinates, others, *where, self._bonds, _turning(system, self._bonds, masses))
 
     def simulation(self, held: Held, window: Window, settings: Settings) -> _Simulation:
         return _Simulation(self, held, window, settings)
@@ -116,17 +250,13 @@ class _Simulation:
     """A run in OpenMM."""
 
     def __init__(self, sampler: OpenMMWindows, held: Held, window: Window, settings: Settings) -> None:
-        self._sampler, self._held, self._settings = sampler, held, settings
+        self._sampler, self.held, self._settings = sampler, held, settings
         self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
         if settings.relax:
             self.hold(window.start, window.start, "langevin", window.seed, None)
-            self._integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
+            integrator: Any = self.simulation.integrator
+            integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
             self._x = positions_of(self.simulation.context)
-        self.simulation: app.Simulation
-
-    @property
-    def _integrator(self) -> Any:
-        return self.simulation.integrator
 
     def hold(
         self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
@@ -153,13 +283,13 @@ class _Simulation:
         self.simulation = app.Simulation(topology, system, integrator, *chosen)
         context = self.simulation.context
         context.setPositions(self._x)
-        self._integrator.applyConstraints()
+        integrator.applyConstraints()
         if velocities is None:
             context.setVelocities(self._v)
-            self._integrator.applyVelocityConstraints()
+            integrator.applyVelocityConstraints()
         else:
-            self._integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
-            if thermostat != "langevin" and not self._held.knows_a_place:
+            integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
+            if thermostat != "langevin" and not self.held.knows_place:
                 # Thermostats that scale velocities never forget the total momentum.
                 masses, v = masses_of(system), velocities_of(context)
                 v[masses > 0] -= masses @ v / masses.sum()
@@ -169,17 +299,32 @@ class _Simulation:
         self.simulation.step(steps)
         self._x, self._v = positions_of(self.simulation.context), velocities_of(self.simulation.context)
 
-    def record(self, steps: int, every: int, *, start: bool = False) -> Series:
-        simulation = self.simulation
-        simulation.currentStep = 0
-        reporter = HeldCoordinatesReporter(io.StringIO(), every, self._sampler.coordinates)
-        if start:
-            what: dict[str, Any] = {"positions": True, "velocities": True, "forces": True}
-            what["groups"] = simulation.integrator.getIntegrationForceGroups()
-            reporter.report(simulation, simulation.context.getState(**what))
-        simulation.reporters.append(reporter)
-        simulation.step(steps)
-        return reporter.series
+    def run(self, steps: int, every: int, take: Callable[[], None]) -> None:
+        for _ in range(steps // every):
+            self.simulation.step(every)
+            take()
+
+    def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        groups = self.simulation.integrator.getIntegrationForceGroups()
+        return _state(self.simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups))
+
+    @property
+    def isokinetic_degrees_of_freedom(self) -> int:
+        return _isokinetic(self.simulation.integrator)
+
+
+def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Positions, velocities, forces and time in nm and ps; Quantities take longer to make than the sample."""
+    arrays = [np.empty((state._getNumParticles(), 3)) for _ in range(3)]
+    for kind, array in zip((openmm.State.Positions, openmm.State.Velocities, openmm.State.Forces), arrays, strict=True):
+        state._getVectorAsNumpy(kind, array)
+    return arrays[0], arrays[1], arrays[2], state.getTime()._value
+
+
+def _isokinetic(integrator: Any) -> int:
+    """Degrees of freedom under an isokinetic thermostat; 0 under others."""
+    ensemble = getattr(integrator, "ensemble", None)
+    return ensemble.count(integrator) if isinstance(ensemble, Isokinetic) else 0
 
 
 def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
@@ -211,25 +356,24 @@ def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:
         raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row")
     atoms = item.atoms[0].tolist()
     force: Any
+    add = "addBond"
     if isinstance(item, Formula):
         return formula_rows(item)[0].force
     if isinstance(item, Distance):
         force = openmm.CustomBondForce("r")
-        force.addBond(*atoms, [])
     elif isinstance(item, Angle):
-        force = openmm.CustomAngleForce("theta")
-        force.addAngle(*atoms, [])
+        force, add = openmm.CustomAngleForce("theta"), "addAngle"
     elif isinstance(item, Dihedral):
-        force = openmm.CustomTorsionForce("theta")
-        force.addTorsion(*atoms, [])
+        force, add = openmm.CustomTorsionForce("theta"), "addTorsion"
     elif isinstance(item, DistanceDifference):
         terms = (f"({w!r})*distance(p{i + 1},p{j + 1})" for (i, j), w in zip(item.slots, item.weights, strict=True))
         force = openmm.CustomCompoundBondForce(item.width, "+".join(terms))
-        force.addBond(atoms, [])
+        atoms = [atoms]
     else:
         raise UnsupportedError(
             f"{name} is {item!r}; windows in OpenMM hold a Distance, a DistanceDifference, an Angle, a Dihedral or a "
             "Formula"
         )
+    getattr(force, add)(*atoms, [])
     force.setUsesPeriodicBoundaryConditions(periodic)
     return force

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
-from kcons.free_energy.held_coordinates import HeldCoordinates, named
+from kcons.free_energy.held_coordinates import AT_ONCE, HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.motion import Motion
@@ -100,24 +100,6 @@ class Settings:
             )
 
 
-class Simulation(Protocol):
-    """A run in an MD engine, at the start of a window to begin with: relaxed there, and without velocities."""
-
-    def hold(
-        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
-    ) -> None:
-        """Go on with the coordinates moving from `begin` to `end` in the steps of a pull, or at rest where these agree.
-
-        `velocities` is the seed of new ones at the temperature of the settings, or None to keep those that there are.
-        """
-
-    def step(self, steps: int) -> None:
-        """Take steps."""
-
-    def record(self, steps: int, every: int, *, start: bool = False) -> Series:
-        """Take steps and record the coordinates; with `start` before the first one, too."""
-
-
 class Sampler(ABC):
     """What samples windows in an MD engine; it is sent to other processes, so it can be pickled.
 
@@ -152,8 +134,15 @@ class Sampler(ABC):
         """What is held, over the initial structure."""
 
     @abstractmethod
-    def simulation(self, held: Held, window: Window, settings: Settings) -> Simulation:
-        """A run at the start of a window."""
+    def simulation(self, held: Held, window: Window, settings: Settings) -> Any:
+        """A run at the start of a window, relaxed there, and without velocities.
+
+        It has ``hold(begin, end, thermostat, seed, velocities)``, to go on with the coordinates moving from `begin` to
+        `end` in the steps of a pull, or at rest where these agree (`velocities` is the seed of new ones at the
+        temperature of the settings, or None to keep those that there are); ``step(steps)``; ``run(steps, every,
+        take)``, to call `take` after every so many steps; ``state()``: positions, velocities, forces and time; and
+        ``isokinetic_degrees_of_freedom``.
+        """
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates at the initial structure, and their periods, shape (d,).
@@ -175,7 +164,7 @@ class Sampler(ABC):
         # New velocities: those of the pull's end have its rate.
         run.hold(window.target, window.target, settings.thermostat, window.seed + 2, window.seed + 1)
         run.step(settings.equilibration)
-        series = run.record(settings.production, settings.every)
+        series = self._recorded(run, window, settings.production, settings.every)
         series.seconds = time.process_time() - began
         series.save(file)
 
@@ -185,7 +174,29 @@ class Sampler(ABC):
         run.hold(window.start, window.start, "langevin", window.seed + 2, window.seed)
         run.step(settings.equilibration)
         run.hold(window.start, window.target, "langevin", window.seed, None)
-        run.record(settings.pull, 1, start=True).save(file)
+        self._recorded(run, window, settings.pull, 1, start=True).save(file)
+
+    def _recorded(self, run: Any, window: Window, steps: int, every: int, *, start: bool = False) -> Series:
+        """Take steps and record the coordinates, with `start` before the first one, too."""
+        held = run.held.measured(window.target)
+        series, taken = Series(held.names, held.periods), list[Any]()
+
+        def keep() -> None:
+            for sample in held.samples(*zip(*taken, strict=True)) if taken else ():
+                series.append(sample)
+            taken.clear()
+
+        def take() -> None:
+            taken.append(run.state())
+            if len(taken) == AT_ONCE:
+                keep()
+
+        if start:
+            take()
+        run.run(steps, every, take)
+        keep()
+        series.isokinetic_degrees_of_freedom = run.isokinetic_degrees_of_freedom
+        return series
 
 
 def digest_of(*parts: Any) -> str:
@@ -226,27 +237,19 @@ def approach_of(approach: ArrayLike, names: Sequence[str]) -> FloatArray:
 
 @dataclass
 class Held:
-    """The rows of a window over the structure that all windows start from.
+    """The rows of a window over the structure that all windows start from."""
 
-    Parameters
-    ----------
-    coordinates : mapping of str to Constraint
-        One row each.
-    others : sequence of Constraint
-        What is held beside them, targets found at `positions` where they were left open.
-    positions, masses, cell
-        Of the initial structure.
-    bonds : callable
-        The bonds of the molecules.
-    """
-
+    #: One row each.
     coordinates: Mapping[str, Constraint]
+    #: What is held beside them, targets found at `positions` where they were left open.
     others: list[Constraint]
     positions: FloatArray
     masses: FloatArray
     cell: FloatArray | None
     pbc: Any
-    bonds: Callable[[], IntArray]
+    #: Of the molecules, shape (n, 2), and those by which groups may be turned; None where something is held otherwise.
+    bonds: IntArray
+    turning: IntArray | None
 
     def __post_init__(self) -> None:
         for name, item in self.coordinates.items():
@@ -262,29 +265,32 @@ class Held:
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
         """The coordinates where windows start from, and their periods; warns of torsions over what is not bonded."""
-        warn_of_gaps(self.coordinates, np.asarray(self.bonds(), dtype=np.int64).reshape(-1, 2))
+        warn_of_gaps(self.coordinates, self.bonds)
         return self.found, self.periods
 
     def _set(self, rows: list[Constraint]) -> ConstraintSet:
         return ConstraintSet(rows, self.positions, self.masses, cell=self.cell, pbc=self.pbc)
 
+    def measured(self, values: ArrayLike) -> HeldCoordinates:
+        """What samples are taken by."""
+        rows = self._set([*self.others, *self.at(values)])
+        return HeldCoordinates(rows, self.coordinates, self.positions, bonds=self.turning)
+
     def at(self, values: ArrayLike) -> list[Constraint]:
         """The coordinates held at `values`."""
-        return [
-            item.with_target([float(value)])
-            for item, value in zip(self.coordinates.values(), np.asarray(values), strict=True)
-        ]
+        pairs = zip(self.coordinates.values(), np.asarray(values), strict=True)
+        return [item.with_target([float(value)]) for item, value in pairs]
 
     def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
         """The coordinates moved at a constant rate from time 0 on."""
-        rows = []
-        for item, a, b in zip(self.coordinates.values(), begin, end, strict=True):
-            rate = (b - a) / duration
-            rows.append(item.with_target(MovingTarget(lambda t, a=a, rate=rate: a + rate * t)))  # type: ignore[misc]
-        return rows
+        rows = zip(self.coordinates.values(), begin, end, strict=True)
+        return [
+            item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
+            for item, a, b in rows
+        ]
 
     @property
-    def knows_a_place(self) -> bool:
+    def knows_place(self) -> bool:
         """Whether shifting all atoms would change a row."""
         return not all(row.translation_invariant for row in [*self.coordinates.values(), *self.others])
 
@@ -315,9 +321,7 @@ class Held:
             rows = [*self.others, *self.at(self.found + share * way)]
             x = Motion(self._set(rows), x).restore_positions(x, bonds=[])
         held = {frozenset(row) for item in self.coordinates.values() for row in item.atoms.tolist()}
-        bonds = [pair for pair in np.asarray(self.bonds()).tolist() if frozenset(pair) not in held]
-        if not bonds:
-            return x
-        lengths = self._set([Distance(bonds)])
+        bonds = [pair for pair in self.bonds.tolist() if frozenset(pair) not in held]
+        lengths = self._set([Distance(np.array(bonds).reshape(-1, 2))])
         change = lengths.measure(x) / lengths.measure(self.positions) - 1
-        return x if np.abs(change).max() < _STRETCHED else None
+        return x if np.abs(change).max(initial=0.0) < _STRETCHED else None

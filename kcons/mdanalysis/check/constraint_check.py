@@ -41,6 +41,8 @@ from kcons.topology.rows_by_name import HeldRows
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
 GRID_FRAMES, GRID_ATOMS = 5, 1000
+#: Positions, of all frames together, up to which one process is quickest: of files that need no unpacking, of others.
+ALONE = {"DCD": 5_000_000, "": 500_000}
 
 
 class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
@@ -207,25 +209,23 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
         """Frames to look at, at least one, counted from the beginning."""
-        numbers: Sequence[int]
-        count, name = self._trajectory.n_frames, self.asked.names[0]
-        if chosen["frames"] is None:
+        count, name, given = self._trajectory.n_frames, self.asked.names[0], chosen["frames"]
+        if given is None:
             if chosen["step"] == 0:
                 raise InputError("step is 0; give another whole number", item="step")
-            numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
-        else:
-            asked = np.asarray(chosen["frames"])
-            if asked.dtype == bool and asked.shape == (count,):
-                asked = np.flatnonzero(asked)
-            if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
-                raise InputError(
-                    f"frames are {chosen['frames']!r:.60}; give whole numbers, or True and False for each of the "
-                    f"{count} frames; for a slice start, stop and step",
-                    item="frames",
-                )
-            for frame in asked[(asked < -count) | (asked >= count)]:
-                raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
-            numbers = (asked % count).tolist()
+            given = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
+        asked = np.asarray(given)
+        if asked.dtype == bool and asked.shape == (count,):
+            asked = np.flatnonzero(asked)
+        if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
+            raise InputError(
+                f"frames are {given!r:.60}; give whole numbers, or True and False for each of the {count} frames; for "
+                "a slice start, stop and step",
+                item="frames",
+            )
+        for frame in asked[(asked < -count) | (asked >= count)]:
+            raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
+        numbers: list[int] = (asked % max(count, 1)).tolist()
         if not len(numbers):
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
@@ -413,7 +413,7 @@ def check_trajectory(
     format, topology_format : str, optional
         Formats of the files, as MDAnalysis names them; by default what their names tell.
     workers : int
-        How many processes read at the same time.
+        How many processes read at the same time, unless one is done before others would have started.
     **options
         What is held besides, such as select, rigid_water and rigid_residues, for `kcons.mdanalysis.constraints_of`;
         all others for `ConstraintCheck`.
@@ -464,7 +464,8 @@ def check_trajectory(
             f"{constraints.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
             "whose faces molecules may be cut, or a topology with bonds"
         )
-    if workers > 1:
+    few = ALONE.get(format_of(universe.trajectory), ALONE[""])
+    if workers > 1 and universe.trajectory.n_frames * len(universe.atoms) > few:
         chosen |= {"backend": "multiprocessing", "n_workers": workers}
     return check.run(**chosen).check
 

@@ -28,7 +28,7 @@ from kcons.errors import NonFiniteError
 from kcons.mdanalysis.check.endings import Break
 from kcons.mdanalysis.check.precision import FilePrecision
 from kcons.mdanalysis.topology import NARROWEST
-from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
+from kcons.solvers.kernels.lattices import NO_LATTICE, nearest_image
 
 #: Natural units of rows, in this order.
 UNITS = ("Å", "rad")
@@ -53,19 +53,13 @@ _BY_FRAME = np.dtype([("frame", "i8"), ("time", "f8"), ("kinetic", "f8"), ("mome
 
 @dataclass
 class Found:
-    """What was found in some frames.
+    """What was found in some frames. Kinetic energies and rates are NaN without velocities."""
 
-    Attributes
-    ----------
-    rows, units, frames : structured arrays, shape (n_rows,), (n_frames, 2), (n_frames,)
-        By row; by frame and unit; by frame. Kinetic energies and rates are NaN without velocities.
-    broken : Break or None
-        Why there are no more frames.
-    """
-
+    #: By row, shape (n_rows,); by frame and unit, (n_frames, 2); by frame, (n_frames,).
     rows: NDArray[np.void]
     units: NDArray[np.void]
     frames: NDArray[np.void]
+    #: Why there are no more frames.
     broken: Break | None = None
 
     @classmethod
@@ -108,35 +102,8 @@ class Found:
 class RowTable:
     """Rows with the targets they are checked against, at the first frame that is looked at.
 
-    Parameters
-    ----------
-    given : sequence of Constraint
-        Targets left out are taken from this frame.
-    masses : ndarray, shape (n_atoms,)
-    ts : Timestep
-        The frame.
-    precision : FilePrecision
-        Of its coordinates.
-    target_error : ndarray, shape (n_atoms,)
-        Rounding of the targets that are given, in angstrom a coordinate.
-    tolerance : float
-        In parts of the size of a row.
-
-    Attributes
-    ----------
-    set : ConstraintSet
-    units : ndarray of int, shape (n_rows,)
-        Which of `UNITS` a row has; coordinates of one's own count as lengths.
-    sizes : ndarray, shape (n_rows,)
-        What a tolerance is a part of: the length held; 1 rad.
-    measured : ndarray of bool, shape (n_rows,)
-        Rows whose targets are those of this frame, or of the mean of all.
-    means : ndarray, shape (n_rows,)
-        What was added to the targets.
-    of_targets : ndarray, shape (n_rows,)
-        What rounding makes of the targets, at most.
-    spread : ndarray, shape (n_rows,)
-        Standard deviation of what rounding of one frame makes of a row, in parts of what it makes at most.
+    Targets left out are taken from this frame. `target_error` is the rounding of those that are given, by atom, in
+    angstrom a coordinate; the tolerance is in parts of the size of a row.
     """
 
     def __init__(
@@ -153,6 +120,8 @@ class RowTable:
         lattice, limit = self._cell_of(ts.dimensions)
         x = precision.stored(ts.positions)
         self.set = held = ConstraintSet(given, x, masses, cell=lattice[0] if limit < np.inf else None, time=time)
+        #: By row: whether its target is that of this frame, or of the mean of all; which of `UNITS` it has (one's own
+        #: coordinates count as lengths); what a tolerance is a part of: the length held, 1 rad.
         self.measured = _by_row(given, [item.target is None for item in given])
         angular = _by_row(given, [item.period is not None for item in given])
         self.units = _by_row(given, [int(i.period is not None or i.family in ("Angle", "Dihedral")) for i in given])
@@ -181,12 +150,14 @@ class RowTable:
         starts = np.append(0, np.flatnonzero(np.diff(self.units)) + 1)
         self._runs = np.stack([starts, np.append(starts[1:], held.n_rows), self.units[starts]], axis=1)
         self._given = np.zeros((held.n_rows if len(self._rows) else 0, 3))
+        #: What was added to the targets.
         self.means = np.zeros(held.n_rows)
         with np.errstate(all="ignore"):
             slopes = abs(held.jacobian(x, time))
             reach, squares = (np.asarray(part.sum(axis=1)).ravel() for part in (slopes, slopes.power(2)))
         # An error of 1 of each coordinate: the error of a row, at most and in the mean square.
         at_most = np.where(self._lengths, 2 * _ROOT_THREE, SECOND_ORDER * reach)
+        #: Standard deviation of what rounding of one frame makes of a row, in parts of what it makes at most.
         self.spread: FloatArray = np.sqrt(squares / 3.0) / np.maximum(at_most, np.finfo(float).tiny)
         found, told = (self._made_of(errors, slopes) for errors in (precision.half_step(x), target_error))
         self._allow(np.where(self.measured, found, told))
@@ -203,6 +174,7 @@ class RowTable:
 
     def _allow(self, of_targets: FloatArray) -> None:
         """Say what rounding makes of the targets, at most; the tolerance and the rounding of frames come besides."""
+        #: What rounding makes of the targets, at most.
         self.of_targets = of_targets
         self._table["slack"] = of_targets + self.tolerance * self.sizes
 
@@ -230,17 +202,7 @@ class RowTable:
         return self._cell
 
     def look(self, found: Found, k: int, ts: Any, precision: FilePrecision, masses: FloatArray | None, v: Any) -> None:
-        """Put what is found in one frame into the k-th place.
-
-        Parameters
-        ----------
-        ts : Timestep
-        precision : FilePrecision
-            Of its coordinates.
-        masses : ndarray, shape (n_atoms,), or None
-            For the kinetic energy.
-        v : ndarray, shape (n_atoms, 3), or None
-            Velocities in angstrom/ps.
+        """Put what is found in one frame into the k-th place; with velocities `v` (angstrom/ps) rates, too.
 
         Raises
         ------

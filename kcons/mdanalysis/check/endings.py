@@ -27,19 +27,11 @@ MAPPED = 1 << 25
 
 @dataclass(frozen=True)
 class Break:
-    """Where a trajectory cannot be read any further.
-
-    Attributes
-    ----------
-    frame : int
-        The first frame that cannot be used.
-    reason : str
-    ends : bool
-        Whether the file ends or is damaged there; else it can be read but its numbers are none.
-    """
+    """Where a trajectory cannot be read any further: the first frame that cannot be used, and why."""
 
     frame: int
     reason: str
+    #: Whether the file ends or is damaged there; else it can be read but its numbers are none.
     ends: bool = True
 
     @property

@@ -39,29 +39,17 @@ HALF_UNIT = 2.0**-24
 
 @dataclass(frozen=True)
 class FilePrecision:
-    """Precision of the coordinates of one file, in angstrom.
-
-    Attributes
-    ----------
-    format : str
-        As MDAnalysis names it.
-    step : float
-        Distance of neighboring numbers that the file can hold; 0 if they are floats.
-    unit : float
-        Unit of the floats in angstrom.
-    exact : bool
-        Whether the numbers of the file can be had back from MDAnalysis' single precision: they lie on a grid.
-    digits : int
-        Significant digits of numbers that are written with as many decimals as they need; 0 if that is not so.
-    shift : float
-        Coordinates were moved by up to this, in angstrom, after they had been rounded to these digits.
-    """
+    """Precision of the coordinates of one file, in angstrom; the format is as MDAnalysis names it."""
 
     format: str
+    #: Distance of neighboring numbers that the file can hold; 0 if they are floats, and the unit of these.
     step: float = 0.0
     unit: float = 1.0
+    #: Whether the numbers of the file can be had back from MDAnalysis' single precision: they lie on a grid.
     exact: bool = False
+    #: Significant digits of numbers that are written with as many decimals as they need; 0 if that is not so.
     digits: int = 0
+    #: Coordinates were moved by up to this after they had been rounded to these digits.
     shift: float = 0.0
 
     @property

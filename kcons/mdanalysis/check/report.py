@@ -75,18 +75,12 @@ def _units(result: CheckResult) -> Table:
 
 def _rows(result: CheckResult) -> Table:
     """The worst rows."""
-    rows: list[list[str | Text]] = [
-        [
-            str(row.row),
-            row.name,
-            f"{row.target:.4f} {row.unit}",
-            Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else ""),
-            f"{row.allowed:.2e}",
-            f"{row.mean:.1e}",
-            "" if row.frame is None else str(row.frame),
-        ]
-        for row in result.worst
-    ]
+    rows: list[list[str | Text]] = []
+    for row in result.worst:
+        largest = Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else "")
+        frame = "" if row.frame is None else str(row.frame)
+        cells = [str(row.row), row.name, f"{row.target:.4f} {row.unit}", largest]
+        rows.append([*cells, f"{row.allowed:.2e}", f"{row.mean:.1e}", frame])
     headers = ["row", "what", "target", "largest", "allowed", "mean", "frame"]
     return _table(headers, rows, title="worst rows", title_justify="left")
 
@@ -96,12 +90,10 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
 
     Lines show what rounding of the file makes of a row at most, and what the tolerance allows the shortest row besides.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     panels = len(result.units) + (result.temperature is not None)
     figure = Figure(figsize=(9, 2.4 + 2.2 * panels), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
     timed = len(set(result.times)) == len(result.times)
     x = result.times if timed else [float(frame) for frame in result.frames]
@@ -142,7 +134,7 @@ def write(result: CheckResult, folder: Path, *, text: str = "") -> list[Path]:
     Raises
     ------
     OccupiedError
-        The folder holds the check of another trajectory, or other files of these names; nothing was written.
+        The folder has the check of another trajectory, or other files of these names; nothing was written.
     """
     picture = io.BytesIO()
     plot(result, picture)
@@ -150,13 +142,7 @@ def write(result: CheckResult, folder: Path, *, text: str = "") -> list[Path]:
 
 
 def write_failure(trajectory: str | Path, reason: str, folder: Path) -> list[Path]:
-    """Put check.json into `folder` for a trajectory of which nothing could be read; the paths written.
-
-    Raises
-    ------
-    OccupiedError
-        As `write`.
-    """
+    """As `write`, of a trajectory of which nothing could be read: check.json alone."""
     return _put(folder, trajectory, {"trajectory": str(trajectory), "status": "incomplete", "verdict": reason})
 
 

@@ -178,31 +178,19 @@ class CheckResult:
 
 @dataclass
 class Asked:
-    """What a check was asked for.
+    """What a check was asked for."""
 
-    Attributes
-    ----------
-    names : (str, str)
-        What to call trajectory and topology.
-    labels : AtomNames
-    mode : {'given', 'first', 'mean'}
-        Where targets come from.
-    targets : str
-        The same in words.
-    removed : int or None
-        Degrees of freedom that the MD engine took away; None to find them.
-    worst : int
-        Number of rows to name.
-    remarks, gaps : list of str
-        What there is to say besides, and what is known beforehand to be missing.
-    """
-
+    #: What to call trajectory and topology.
     names: tuple[str, str]
     labels: AtomNames
+    #: Where targets come from, 'given', 'first' or 'mean', and the same in words.
     mode: str
     targets: str
+    #: Degrees of freedom that the MD engine took away; None to find them.
     removed: int | None
+    #: Number of rows to name.
     worst: int
+    #: What there is to say besides, and what is known beforehand to be missing.
     remarks: list[str] = field(default_factory=list)
     gaps: list[str] = field(default_factory=list)
 
@@ -210,18 +198,7 @@ class Asked:
 def concluded(
     found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, masses: FloatArray, n_in_file: int
 ) -> CheckResult:
-    """All that there is to say of what was found.
-
-    Parameters
-    ----------
-    precision : str
-        What is said of the file's.
-    rank : int or None
-        Of the rows.
-    masses : ndarray, shape (n_atoms,)
-    n_in_file : int
-        Frames in the file.
-    """
+    """All that there is to say of what was found, of a file of `n_in_file` frames and of a `precision` in words."""
     margins, held, numbers = found.rows["margin"], table.set, found.frames["frame"]
     times, remarks = np.array(found.frames["time"]), list(asked.remarks)
     violated = margins > 0
@@ -413,13 +390,7 @@ def _gaps(found: Found, table: RowTable, untold: NDArray[np.bool_], targets: str
 def _temperatures(
     found: Found, rank: int, masses: FloatArray, removed: int | None, remarks: list[str]
 ) -> tuple[int, FloatArray | None]:
-    """Degrees of freedom, and temperatures in K by frame where there are velocities and masses; remarks are added.
-
-    Parameters
-    ----------
-    removed : int, optional
-        Degrees of freedom that the engine took away; found from the total momentum by default.
-    """
+    """Degrees of freedom, and temperatures in K by frame where there are velocities and masses; remarks are added."""
     freedom = 3 * int(np.count_nonzero(masses > 0)) - rank
     twice = np.array(found.frames["kinetic"])
     has = np.isfinite(twice)

@@ -43,18 +43,9 @@ _KEYS = {"atoms", "elements", "residue", "value"}
 
 
 class AtomNames:
-    """What all atoms of a Universe are called, as far as its topology has names.
+    """What all atoms of a Universe are called: names, elements, residues, '' where its topology does not say.
 
-    Parameters
-    ----------
-    universe : MDAnalysis.Universe
-    known : ndarray of str, shape (n_atoms,)
-        Elements that names and masses tell.
-
-    Attributes
-    ----------
-    names, elements, residues : ndarray of str, shape (n_atoms,)
-        '' where the topology does not say; elements are then what names and masses tell, or first letters.
+    Elements are then what names and masses tell, `known`, or first letters.
     """
 
     def __init__(self, universe: Any, known: NDArray[np.str_]) -> None:

@@ -317,28 +317,3 @@ class Thermostat(Flow):
         volumes, frictions = np.array(rows).T
         g = self.degrees_of_freedom
         return Compression(wanted, volumes, -(g - 1) * frictions, g)
-
-    def exact_constant_force(self, t: float, x: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """x(t), v(t) under a force that does not depend on x, in closed form.
-
-        v(t) = (v + s f/m)/s', with s' = cosh(ct) + (a/c) sinh(ct), c^2 = f.M^-1 f/2K, a = v.f/2K. The positions follow
-        from integral s/s' = (ln s' - a I)/c^2, I = integral 1/s'.
-        """
-        x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
-        f = self._force(x)
-        two_K = float(v @ (self.masses * v))
-        a, c = float(v @ f) / two_K, float(np.sqrt(f @ (f / self.masses) / two_K))
-        if c == 0.0:
-            return x + t * v, v
-        # Divided by e^(ct), nothing overflows; 1 + a/c and 1 - a/c as they are.
-        r, decay = a / c, np.exp(-2 * c * t)
-        slope = 0.5 * ((1 + r) + (1 - r) * decay)
-        s = (0.5 * (1 + r) - 0.5 * (1 - r) * decay - r * np.exp(-c * t)) / c
-        velocity = (v * np.exp(-c * t) + s * f / self.masses) / slope
-        log_slope = np.log(slope) + c * t
-        # I = integral of 1/(cosh + r sinh): 2 atan(...) of it, in a form that holds for |r| = 1 as well.
-        half = np.tanh(0.5 * c * t)
-        root = np.sqrt(max(1.0 - r * r, 0.0))
-        angle = 2 * half / (1 + r * half)
-        I = angle / c if root < 1e-8 else 2 * np.arctan(root * half / (1 + r * half)) / (root * c)
-        return x + v * I + (log_slope - a * I) / c**2 * f / self.masses, velocity

@@ -10,11 +10,11 @@ from kcons.models.growth.constrained import ConstrainedGrowth, GrowthSolution, e
 from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
 from kcons.models.growth.model import GrowthModel, Logistic, LotkaVolterra, Mixture, Populations
 from kcons.models.growth.rows import (
+    EntropyLaw,
     EntropyRow,
     HolonomicRow,
     LinearRow,
     NoProduction,
-    PrescribedProduction,
     Relaxation,
     Row,
     TotalPopulation,
@@ -24,6 +24,7 @@ from kcons.models.growth.rows import (
 __all__ = [
     "ConstrainedGrowth",
     "ConstrainedHypercycle",
+    "EntropyLaw",
     "EntropyRow",
     "GrowthModel",
     "GrowthSolution",
@@ -35,7 +36,6 @@ __all__ = [
     "Mixture",
     "NoProduction",
     "Populations",
-    "PrescribedProduction",
     "Relaxation",
     "Row",
     "TotalPopulation",

@@ -193,11 +193,6 @@ class LotkaVolterra(GrowthModel):
         prey, predators = x[0] / self.equilibrium[0], x[1] / self.equilibrium[1]
         return np.asarray(self.alpha1 * (predators - np.log(predators)) + self.beta2 * (prey - np.log(prey)))
 
-    def invariant_gradient(self, x: ArrayLike) -> FloatArray:
-        """dG/dx, shape of x."""
-        x = numbers(x, "x")
-        return np.stack([self.alpha2 - self.beta2 / x[0], self.beta1 - self.alpha1 / x[1]])
-
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (2, 2) (notes eq. 75)."""
         x1, x2 = numbers(x, "x")

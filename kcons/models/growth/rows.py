@@ -16,12 +16,10 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import quad
 
 from kcons.constraints.arguments import (
     FloatArray,
@@ -285,7 +283,7 @@ FADED = 1e-2
 
 
 class EntropyLaw(ABC):
-    """What entropy, times T, has been produced since the start."""
+    """What entropy, times T, has been produced since the start; a law of your own is a class with two methods."""
 
     #: Rate at which a deviation from equilibrium decays, 0 if it stays; None if there is no such rate.
     relaxation_rate: float | None = None
@@ -379,73 +377,6 @@ class NoProduction(EntropyLaw):
 
     def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
         return 0.0
-
-
-class PrescribedProduction(EntropyLaw):
-    """A production of your own.
-
-    Parameters
-    ----------
-    produced : callable, t -> float
-        T(s(t) - s_0), t counted from the start; 0 at t = 0. May fall (entropy taken from outside).
-    rate : callable, t -> float
-        Its time derivative.
-    until : float
-        The time up to which it will be asked for: so far it is checked.
-    """
-
-    #: Times at which a prescription is looked at before a run.
-    LOOKS = 2001
-
-    def __init__(self, produced: Callable[[float], float], rate: Callable[[float], float], *, until: float) -> None:
-        check_call("produced", produced, ("t",))
-        check_call("rate", rate, ("t",))
-        self._produced, self._rate, self.until = produced, rate, positive(until, "until")
-        if abs(produced(0.0)) > 1e-12:
-            raise InputError(f"nothing has been produced at t = 0, not {produced(0.0):.6g}", item="produced")
-        times = np.linspace(0.0, until, 101)
-        integral = np.cumsum([quad(rate, a, b, epsabs=1e-12, epsrel=1e-11)[0] for a, b in pairwise(times)])
-        off = np.abs(integral - [produced(t) for t in times[1:]])
-        if not np.max(off) <= 1e-8 * max(1.0, float(np.max(np.abs(integral)))):
-            k = int(np.argmax(~(off <= 1e-8)))
-            raise InputError(
-                f"the integral of the rate is not what is produced: at t = {times[k + 1]:.6g} they differ by "
-                f"{off[k]:.3g}",
-                item="rate",
-            )
-
-    def _looked_at(self, elapsed: float) -> float:
-        """A time from the start that lies in what was checked."""
-        if max(elapsed - self.until, -elapsed) > 1e-9 * self.until:
-            raise InputError(
-                f"the prescribed production is known from the start until {self.until:g} after it: end the run there, "
-                "or raise `until`",
-                item="until",
-            )
-        return elapsed
-
-    def produced(self, elapsed: float, excess0: float) -> float:
-        return float(self._produced(self._looked_at(elapsed)))
-
-    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
-        return -float(self._rate(self._looked_at(elapsed)))
-
-    def check(self, excess0: float, most: float) -> None:
-        times = np.linspace(0.0, self.until, self.LOOKS)
-        left = excess0 - np.array([self.produced(t, excess0) for t in times])
-        for bad, reason in (
-            (left < -1e-12 * excess0, "more than lies between the start and equilibrium"),
-            (left > most, "more entropy taken away than the populations can give up"),
-        ):
-            if np.any(bad):
-                time = float(times[np.argmax(bad)])
-                raise BudgetError(
-                    f"the prescribed production asks for {reason} from t = {time:.6g} on; the start allows "
-                    f"T(s - s_0) between {excess0 - most:.6g} and {excess0:.6g}",
-                    budget=self.produced(time, excess0),
-                    consistent=excess0,
-                    time=time,
-                )
 
 
 class EntropyRow(Row):

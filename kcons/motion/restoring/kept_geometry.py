@@ -15,7 +15,9 @@ from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.motion.restoring.rigid_pieces import Pieces
+from kcons.motion.restoring.rigid_pieces import MoleculeGraph
+from kcons.plan.independent_blocks import fixed_atoms
+from kcons.solvers.rank_revealing import independent
 from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
 from kcons.topology.topology import BoolArray, bond_angles, connected, sorted_pairs
 
@@ -93,9 +95,7 @@ class Geometry:
         self.held, self.labels, self.start, self.time, self._bonds = held, labels, start, time, bonds
         # Particles without mass are sites or walls: whoever places them does so, not a bond.
         self.pinned = np.equal(held.masses, 0.0)
-        for item in held.constraints:
-            if item.family == "FixedAtoms":
-                self.pinned[item.atoms.ravel()] = True
+        self.pinned[fixed_atoms(held)] = True
         with np.errstate(all="ignore"):
             self.misfit = np.abs(held.value(start, time)) / held.scale
         self.usable = bool(np.isfinite(start[held.touched]).all())
@@ -111,9 +111,9 @@ class Geometry:
         return self._given is not None and not len(self._given)
 
     @cached_property
-    def pieces(self) -> Pieces:
+    def pieces(self) -> MoleculeGraph:
         bonds = bonds_of(self.held, self.start, self.time, self._given)
-        return Pieces(self.held.n_atoms, bonds, self.held.touched)
+        return MoleculeGraph(self.held.n_atoms, bonds, self.held.touched)
 
     def far(self) -> bool:
         """Whether a row of lengths or angles is far off."""
@@ -320,7 +320,7 @@ class Geometry:
                 table = sp.csr_array(self.held.jacobian(x, self.time))[rows][:, columns].toarray()
                 size = np.linalg.norm(table, axis=1, keepdims=True)
                 _, weight, basis = np.linalg.svd(table / np.where(size > 0, size, 1.0), full_matrices=False)
-                basis = basis[weight > 1e-8 * weight.max()]
+                basis = basis[independent(weight)]
             self._spans[key] = basis, {int(a): n for n, a in enumerate(used.tolist())}
         return self._spans[key]
 

@@ -29,11 +29,14 @@ from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
+from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
 from kcons.motion.restoring.rigid_pieces import Move, bend, free_motions, stretch, torsion
 from kcons.plan.plan import Plan
+from kcons.solvers import tolerances
 
-#: What pieces may leave to the search for the nearest point, in the same unit.
+#: Rows that moved groups leave off by less than this (radian, or part of the length) are left to the search for the
+#: nearest point.
 NEAR = 0.25
 #: Rounds in which every row makes its own motion, and how many motions there may be in all.
 SWEEPS, MOST_MOVES = 40, 15_000
@@ -102,16 +105,17 @@ def restored(
     raise error
 
 
-def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> ConvergenceError | None:
+def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> InfeasibleError | None:
     """What to raise if `x` is off a row by the set's own measure, the one that reports use."""
     with np.errstate(all="ignore"):
         miss = np.abs(held.value(x, time))
         # Rows between fixed atoms are as good as the places given.
-        allowed = np.maximum(4 * held.tolerance(x, time), np.where(plan.labels < 0, 1e-10 * held.scale, 0.0))
-    bad = ~(miss <= allowed)
-    if not bad.any():
+        allowed = np.maximum(
+            tolerances.ROUNDINGS * held.tolerance(x, time), np.where(plan.labels < 0, tolerances.NEAR * held.scale, 0.0)
+        )
+    row = off_row(miss, allowed)
+    if row < 0:
         return None
-    row = int(np.argmax(np.where(np.isfinite(miss), np.where(bad, miss / allowed, 0.0), np.inf)))
     return InfeasibleError(
         f"the positions that were found miss row {held.row_name(row)} by {miss[row]:.6g}; check its target against its "
         "neighbours', or start nearer to a solution",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +11,16 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
-from kcons.motion import failures
+from kcons.motion.failures import Failures, global_row
 from kcons.plan.plan import Plan
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.sparse.distances import sparse_distances
+from kcons.solvers.tolerances import EPS, MAX_HALVINGS, STALLED
+
+if TYPE_CHECKING:
+    from kcons.motion.solver_sequence import SolverSequence
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
 RESCUE_ROWS = 400
@@ -25,22 +28,19 @@ RESCUE_ROWS = 400
 MAX_RESCUES = 20
 #: Rounds of the search for the nearest point on the constraints.
 NEAREST_ROUNDS = 200
-#: Newton iterations that one restoration may take in all. Dense algebra takes fewer for clusters of more than so many
-#: rows, by the square of their number. A projection that fails counts as this many, and so many may be rescued.
+#: Newton iterations that one restoration may take in all; where algebra is dense, fewer by the square of the rows of a
+#: cluster above the second number. The third is what a projection that fails is charged, and the fourth how many
+#: clusters the damped solver may try.
 MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
 #: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
-_STILL, _ROUNDING = 1e-12, 16 * float(np.finfo(float).eps)
+_STILL, _ROUNDING = 1e-12, 16 * EPS
 #: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
 SLOW, MIXED = 3, 5
 #: Part of the way to the nearest point that may be left along the constraints without a word.
 LEFT_OVER = 1e-6
-#: Rounds towards the constraints that must gain a tenth, or damping does better.
-STALLED = 10
-#: Halvings of one step of it.
-MAX_HALVINGS = 30
 
 
-class Work:
+class IterationBudget:
     """What is left of the Newton iterations and rescues that one restoration may take.
 
     Parameters
@@ -58,24 +58,16 @@ class Work:
         self.rescues = max(int(RESCUED * share(np.flatnonzero(plan.labels >= 0))), 1)
 
 
-class Rescuers:
-    """Solvers with step control for single clusters whose own solver has none; made when first needed.
+class DampedFallback:
+    """Solvers with step control for single clusters whose own solver has none; made when first needed."""
 
-    Parameters
-    ----------
-    local : ConstraintSet
-    plan : Plan
-    numbers : ndarray of int or None
-        Global numbers of the local atoms, for messages.
-    """
-
-    def __init__(self, local: ConstraintSet, plan: Plan, numbers: IntArray | None) -> None:
-        self._local, self._plan, self._numbers = local, plan, numbers
-        self._made: dict[int, ClusterSolver] = {}
+    def __init__(self, rows: ConstraintSet, plan: Plan, failures: Failures) -> None:
+        self._rows, self._plan, self._failures = rows, plan, failures
+        self._made: dict[int, ClusterSolver | None] = {}
         #: Set during restorations, which try many projections and may do without some of them.
-        self.work: Work | None = None
+        self.budget: IterationBudget | None = None
 
-    def rescue(
+    def solve(
         self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None
     ) -> Outcome:
         """Do what `solver` failed at, or raise what says why there is no way.
@@ -87,57 +79,56 @@ class Rescuers:
         """
         x, reference, velocities = request.changed, request.reference, request.velocities
         saved = x.copy(), None if velocities is None else velocities.copy()
-        error = failures.unusable(self._local, self._numbers, {"x_new": x, "x_ref": reference}, outcome, solver)
-        if self.work is not None:
-            self.work.rescues -= 1
-        if error is None and (self.work is None or self.work.rescues >= 0):
+        error = self._failures.unusable(global_row(outcome, solver), x_new=x, x_ref=reference)
+        if self.budget is not None:
+            self.budget.rescues -= 1
+        if error is None and (self.budget is None or self.budget.rescues >= 0):
             outcome = self._damped(solver, outcome, request, multipliers)
             if outcome.converged:
                 return outcome
         np.copyto(x, saved[0])
         if velocities is not None and saved[1] is not None:
             np.copyto(velocities, saved[1])
-        raise error or failures.positions_failed(self._local, self._numbers, request, outcome, solver, self._plan)
+        raise error or self._failures.positions(request, outcome, solver)
 
     def _damped(
         self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None
     ) -> Outcome:
         """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
-        extra = np.zeros(self._local.n_rows)
+        extra = np.zeros(self._rows.n_rows)
         for _ in range(MAX_RESCUES):
             if outcome.worst_row < 0:
                 return outcome
             row = int(solver.rows[outcome.worst_row])
-            rescuer = self._rescuer(row)
-            if rescuer is None:
+            damped = self._solver(row)
+            if damped is None:
                 return outcome
-            piece = np.zeros(len(rescuer.rows))
-            rescued = rescuer.positions(request, piece)
-            if not rescued.converged:
-                where = int(rescuer.rows[rescued.worst_row]) if rescued.worst_row >= 0 else row
+            part = np.zeros(len(damped.rows))
+            found = damped.positions(request, part)
+            if not found.converged:
+                where = int(damped.rows[found.worst_row]) if found.worst_row >= 0 else row
                 index = np.flatnonzero(solver.rows == where)
-                return rescued._replace(worst_row=int(index[0]) if len(index) else outcome.worst_row)
-            extra[rescuer.rows] += piece
+                return found._replace(worst_row=int(index[0]) if len(index) else outcome.worst_row)
+            extra[damped.rows] += part
             outcome = solver.positions(request, multipliers)
             if outcome.converged:
                 if multipliers is not None:
                     multipliers += extra[solver.rows]
-                return outcome._replace(iterations=outcome.iterations + rescued.iterations)
+                return outcome._replace(iterations=outcome.iterations + found.iterations)
         return outcome
 
-    def _rescuer(self, row: int) -> ClusterSolver | None:
+    def _solver(self, row: int) -> ClusterSolver | None:
         """A solver with step control for the cluster of `row`; None if its own solver has that already."""
         plan = self._plan
         label = int(plan.labels[row])
         if label not in self._made:
             rows = np.flatnonzero(plan.labels == label)
+            self._made[label] = None
             if len(rows) <= RESCUE_ROWS:
                 labels = np.zeros(len(rows), dtype=np.int64)
-                self._made[label] = GeneralClusters(self._local, rows, labels, plan.inverse_masses)
+                self._made[label] = GeneralClusters(self._rows, rows, labels, plan.inverse_masses)
             elif any(isinstance(solver, Chains) and row in solver.rows for solver in plan.solvers):
-                self._made[label] = sparse_distances(self._local, rows, plan.inverse_masses)
-            else:
-                return None
+                self._made[label] = sparse_distances(self._rows, rows, plan.inverse_masses)
         return self._made[label]
 
 
@@ -146,39 +137,26 @@ class FarStart:
 
     Parameters
     ----------
-    local : ConstraintSet
-    plan : Plan
-    numbers : ndarray of int or None
-        Global numbers of the local atoms, for messages.
-    positions, tangents : callable
-        The position and velocity projections of the plan, in place on local arrays.
-    work : Work
+    sequence : SolverSequence
+    budget : IterationBudget
         What the search may cost. A point on the constraints is returned as it is when this is used up.
-    iterations : callable
-        How many the last projection took.
+    time : float
     """
 
-    def __init__(
-        self,
-        local: ConstraintSet,
-        plan: Plan,
-        numbers: IntArray | None,
-        positions: Callable[..., Any],
-        tangents: Callable[..., Any],
-        work: Work,
-        iterations: Callable[[], int],
-    ) -> None:
-        self._local, self._plan, self._numbers = local, plan, numbers
-        self._solve, self._tangents = positions, tangents
-        self._work, self._iterations = work, iterations
+    def __init__(self, sequence: SolverSequence, budget: IterationBudget, time: float) -> None:
+        self._sequence, self._budget, self._time = sequence, budget, time
+        self._rows, self._plan, self._failures = sequence.rows, sequence.plan, sequence.failures
 
-    def _positions(self, x: FloatArray, reference: FloatArray, time: float) -> None:
+    def _positions(self, x: FloatArray, reference: FloatArray) -> None:
         """Project in place along the gradients at `reference`."""
-        self._work.iterations -= FAILED
-        self._solve(x, reference, time, time, None, 0.0, None)
-        self._work.iterations += FAILED - self._iterations()
+        self._budget.iterations -= FAILED
+        self._sequence.positions(x, reference, self._time, self._time, None, 0.0, None)
+        self._budget.iterations += FAILED - max(self._sequence.iterations, default=0)
 
-    def restore(self, x: FloatArray, time: float) -> float:
+    def _tangents(self, x: FloatArray, y: FloatArray, rates: FloatArray | None = None) -> None:
+        self._sequence.tangents(x, y, rates, self._time, None, "position")
+
+    def restore(self, x: FloatArray) -> float:
         """Bring `x` onto the constraints in place, or raise `InfeasibleError`.
 
         Returns
@@ -189,35 +167,35 @@ class FarStart:
         start = x.copy()
         here = x.copy()
         try:
-            self._positions(here, start, time)
+            self._positions(here, start)
         except ConvergenceError:
-            self._reach(here, time)
-        found = self._settle(start, here, time) or self._descend(start, here, time)
-        found = found or self._settle(start, here, time, slow=SLOW)
+            self._reach(here)
+        found = self._settle(start, here) or self._descend(start, here)
+        found = found or self._settle(start, here, slow=SLOW)
         np.copyto(x, here)
         if found:
             return 0.0
         along = start - x
         along[self._atom_labels() < 0] = 0.0
         size = float(np.max(np.abs(along), initial=0.0))
-        self._tangents(x, along, None, time, None, "position")
+        self._tangents(x, along)
         return float(np.max(np.abs(along), initial=0.0)) / size if size > 0.0 else 0.0
 
-    def _reach(self, x: FloatArray, time: float) -> None:
+    def _reach(self, x: FloatArray) -> None:
         """Some point on the constraints, for starts too far off for one projection, in place."""
         start = x.copy()
-        error = failures.not_finite(self._local, self._numbers, {"positions": start})
+        error = self._failures.not_finite(positions=start)
         if error is not None:
             raise error
-        if not self._gauss_newton(x, time):
+        if not self._gauss_newton(x):
             np.copyto(x, start)
             # Any point does: masses of many orders of magnitude would only spoil the condition.
             general = self._plan.general_for_all(RESCUE_ROWS, equal=True)
-            outcome = general.restore(x, time=time)
+            outcome = general.restore(x, time=self._time)
             if not outcome.converged:
-                raise failures.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
+                raise self._failures.start(x, start, outcome, general, self._time)
 
-    def _settle(self, start: FloatArray, x: FloatArray, time: float, slow: int = 0) -> bool:
+    def _settle(self, start: FloatArray, x: FloatArray, slow: int = 0) -> bool:
         """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
 
         Its fixed point is the foot of the mass-weighted perpendicular from the start. False where the iteration
@@ -229,11 +207,11 @@ class FarStart:
         still = max(_STILL * extent(start), _ROUNDING * float(np.abs(start).max(initial=0.0)))
         first = np.inf
         for _ in range(NEAREST_ROUNDS):
-            if self._work.iterations <= 0:
+            if self._budget.iterations <= 0:
                 break
             ahead = start.copy()
             try:
-                self._positions(ahead, here, time)
+                self._positions(ahead, here)
             except ConvergenceError:
                 return False
             move = float(np.max(np.abs(ahead - here), initial=0.0))
@@ -256,7 +234,7 @@ class FarStart:
             np.copyto(x, reached)
         return False
 
-    def _descend(self, start: FloatArray, x: FloatArray, time: float) -> bool:
+    def _descend(self, start: FloatArray, x: FloatArray) -> bool:
         """Walk along the constraints towards the start in place, as long as every cluster comes nearer to it.
 
         Steps are the tangential part of start - x; its end is the foot of a perpendicular from the start. Whether it
@@ -278,7 +256,7 @@ class FarStart:
             step = start - x
             step[~inside] = 0.0
             size = float(np.max(np.abs(step), initial=0.0))
-            self._tangents(x, step, None, time, None, "position")
+            self._tangents(x, step)
             slope = float(np.max(np.abs(step), initial=0.0))
             near = slope < 1e-6 * size  # where rounding hides which of two points is nearer
             if slope <= 1e-13 * size:
@@ -289,11 +267,11 @@ class FarStart:
                     return False
             last = slope
             for _ in range(MAX_HALVINGS):
-                if self._work.iterations <= 0:
+                if self._budget.iterations <= 0:
                     return False
                 ahead = x + np.where(inside, factor[atom_label], 0.0)[:, None] * step
                 try:
-                    self._positions(ahead, x, time)
+                    self._positions(ahead, x)
                 except ConvergenceError as error:
                     factor[error.cluster if error.cluster >= 0 else slice(None)] *= 0.5
                     continue
@@ -312,16 +290,16 @@ class FarStart:
 
     def _atom_labels(self) -> IntArray:
         """Cluster of each local atom, -1 for atoms that belong to none."""
-        incidence, labels = self._local.incidence, self._plan.labels
+        incidence, labels = self._rows.incidence, self._plan.labels
         entry_label = np.repeat(labels, np.diff(incidence.indptr))
-        atom_label = np.full(self._local.n_atoms, -1, dtype=np.int64)
+        atom_label = np.full(self._rows.n_atoms, -1, dtype=np.int64)
         atom_label[incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
         atom_label[self._plan.inverse_masses == 0] = -1
         return atom_label
 
-    def _gauss_newton(self, x: FloatArray, time: float) -> bool:
+    def _gauss_newton(self, x: FloatArray) -> bool:
         """x <- x - f M^-1 A^T (A M^-1 A^T)^+ sigma in place, f halved cluster by cluster while |sigma| grows."""
-        local, plan = self._local, self._plan
+        local, plan, time = self._rows, self._plan, self._time
         member = plan.labels >= 0
         labels = plan.labels[member]
         atom_label = self._atom_labels()
@@ -343,7 +321,7 @@ class FarStart:
                     return True
                 step = np.zeros_like(x)
                 try:
-                    self._tangents(x, step, np.where(member, -sigma, 0.0), time, None, "position")
+                    self._tangents(x, step, np.where(member, -sigma, 0.0))
                 except (ConvergenceError, SingularGeometryError, InputError):
                     return False
                 factor = np.ones(len(error))

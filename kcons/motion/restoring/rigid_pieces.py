@@ -17,7 +17,7 @@ from kcons.topology.topology import connected, sorted_pairs
 Frame = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 
 
-class Pieces:
+class MoleculeGraph:
     """The bonds of the molecules to which some atoms belong, and what is left where one of them is cut.
 
     Parameters

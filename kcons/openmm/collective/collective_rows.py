@@ -57,8 +57,7 @@ from kcons.openmm.integrator.system_checks import (
 from kcons.openmm.quantities import masses_of
 from kcons.openmm.states import energy_of, forces_at, motion_of, positions_of, velocities_of, width_of
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.compositions import Composition
-from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Composition, Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator

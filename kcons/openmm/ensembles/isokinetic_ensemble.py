@@ -21,10 +21,8 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of, forces_at, positions_of, velocities_of
-from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
-from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
 from kcons.thermostats.freedom import atom_numbers
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that

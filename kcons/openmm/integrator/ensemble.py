@@ -27,8 +27,7 @@ from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
-from kcons.steppers.rattle import Rattle
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import Rattle, Splitting
 
 #: Schemes whose shortest drifts are less than this part of a step: what rounding does to x, divided by the length of
 #: the drift, must be kept out of v there.

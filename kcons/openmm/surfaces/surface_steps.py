@@ -11,7 +11,7 @@ from kcons.openmm.integrator.ensemble import ConstantEnergy, Step, use
 from kcons.openmm.integrator.steps import see_who_moved
 from kcons.openmm.surfaces.closed_forms import QuadricRows
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
-from kcons.steppers.rattle import Rattle
+from kcons.steppers.splitting import Rattle
 
 
 def surface_step(step: Step) -> bool:

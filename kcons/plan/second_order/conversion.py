@@ -28,7 +28,8 @@ from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
 from kcons.plan.independent_blocks import fixed_atoms, row_blocks
 from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody, find_flat_bodies, refusal, with_flat_bodies
-from kcons.plan.second_order.singular_rows import DISPLACEMENT, LOST, BoolArray, LocalRows, unsolvable
+from kcons.plan.second_order.singular_rows import DISPLACEMENT, BoolArray, LocalRows, unsolvable
+from kcons.solvers.tolerances import LOST
 
 #: Larger blocks are first reduced to their internal coordinates, then to their distances, and what is
 #: still larger is tested by sparse inertia counts.

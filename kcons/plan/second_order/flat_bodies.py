@@ -18,7 +18,8 @@ from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
-from kcons.plan.second_order.singular_rows import LOST, STEP_CUT, UNSOLVABLE, BoolArray, LocalRows, extent_of
+from kcons.plan.second_order.singular_rows import STEP_CUT, UNSOLVABLE, BoolArray, LocalRows, extent_of
+from kcons.solvers.tolerances import LOST
 
 #: Extent across a line or plane, relative to the extent along it, that still counts as flat.
 FLAT = 1e-6

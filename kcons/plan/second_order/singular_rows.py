@@ -18,13 +18,10 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.plan.independent_blocks import fixed_atoms
+from kcons.solvers.tolerances import LOST
 
 BoolArray = NDArray[np.bool_]
 
-#: Singular values of the row-normalised A, without masses, below this part of the largest are directions that a
-#: geometry has lost: an angle from the straight or flat one, and no measure of rank (`kcons.solvers.rank_revealing`).
-#: A triatomic at 179.9 degrees has 8.7e-4 and is held as it is.
-LOST = 1e-6
 #: Directions that a step of Gauss-Newton leaves out. Towards a flat geometry singular values go with the square root of
 #: the residual, to 1e-7, and have to count.
 STEP_CUT = 1e-9

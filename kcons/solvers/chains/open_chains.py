@@ -1,23 +1,41 @@
 """Open chains of held distances, of any length; `sweeps` says how they are solved."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
+from kcons.solvers.called_solvers import Kernels
 from kcons.solvers.chains.strips import SHORT, long_strip, short_strip, whole_slots
-from kcons.solvers.chains.sweeps import SLOT, project
-from kcons.solvers.cluster_solver import Outcome, Request, go_on
-from kcons.solvers.distance_clusters import EightAtATime, lengths_resolved
-from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.chains.sweeps import BONDS, LENGTHS, SLOT, project
+from kcons.solvers.cluster_solver import Outcome, Request, resume
+from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver, resolved
+from kcons.solvers.kernels.aligned_memory import aligned, copied, in_one_array, part_of, room
+from kcons.solvers.kernels.array_views import halves, integers, none_of, piece
 from kcons.solvers.kernels.eight_wide import WIDTH
-
-#: Rounds of Newton that a chain may take until its stored positions show the lengths.
-MAX_ROUNDS = 4
+from kcons.solvers.tolerances import MAX_ROUNDS
 
 
-class Chains(EightAtATime):
+@njit(cache=True, nogil=True)
+def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
+    """This and the next two as `kcons.solvers.called_solvers` says."""
+    lengths = wanted if wanted.size else piece(tables, integers(tables), LENGTHS)
+    return project(None, x, x_ref, v, inv_dt, lengths, lattice, kind, none_of(tables), tables)
+
+
+@njit(cache=True, nogil=True)
+def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):
+    none = none_of(tables)
+    return project(True, y, x, none.reshape(0, 3), 0.0, wanted, lattice, kind, none, tables)
+
+
+@njit(cache=True, nogil=True)
+def _resolved(x, lattice, kind, tables):
+    h = integers(tables)
+    return resolved(x, piece(halves(tables), h, BONDS), piece(tables, h, LENGTHS), lattice, kind)
+
+
+class Chains(SimdClusterSolver):
     """Open paths of held distances, one after another.
 
     Parameters
@@ -32,6 +50,11 @@ class Chains(EightAtATime):
         Lengths used where a request names none.
     inv_mass : array_like of float, shape (n_path_atoms,)
         Inverse masses along the paths; 0 for a pinned atom.
+
+    Attributes
+    ----------
+    slots : int
+        Groups of eight lanes that a sweep goes through.
     """
 
     name = "chain"
@@ -67,39 +90,27 @@ class Chains(EightAtATime):
         bonds[:] = present
         weights[:] = np.where(owned, inverse[place], 0.0)
         wholes = np.array([whole_slots(strip[2]) for strip in strips]) + starts[:-1]
-        self._tables = starts, lane_atoms, np.asarray(owned, dtype=np.uint8), full, lane_rows, bonds, weights, wholes
-        # To work in, and to undo with: the last strip is written once everything is known.
-        self._sizes = int(np.diff(starts).max()) // WIDTH * SLOT, 6 * int(starts[-2])
-        self._bonds = np.column_stack((np.delete(path, bounds[1:] - 1), np.delete(path, bounds[:-1]))).astype(np.uint32)
+        ends = np.column_stack((np.delete(path, bounds[1:] - 1), np.delete(path, bounds[:-1]))).astype(np.uint32)
+        self._ends, self.slots = ends.ravel(), int(starts[-1]) // WIDTH
+        self.tables = in_one_array(
+            (
+                *(starts, lane_atoms, np.asarray(owned, dtype=np.uint8), full, lane_rows, bonds, weights, wholes),
+                *(self.lengths, self._ends),
+                # To work in, and to undo with: the last strip is written once everything is known.
+                *(room(int(np.diff(starts).max()) // WIDTH * SLOT), room(6 * int(starts[-2]))),
+            )
+        )
 
-    @property
-    def slots(self) -> int:
-        """Groups of eight lanes that a sweep goes through."""
-        return int(self._tables[0][-1]) // WIDTH
-
-    def tables(self, numbers: NDArray[np.int64] | None = None) -> tuple[NDArray[Any], ...]:
-        """What kernels that call `sweeps.project` need.
-
-        Parameters
-        ----------
-        numbers : ndarray of int, optional
-            What the atoms are called there, by what they are called here.
-
-        Returns
-        -------
-        tuple of ndarray
-            What `project` is given of the rows, flat, from `starts` to `wholes`; lengths; atoms of each row, flat;
-            the rooms `work` and `undo`, of which only the sizes count.
-        """
-        starts, atoms, *rest = self._tables
-        bonds = self._bonds.ravel()
+    def packed(self, numbers: NDArray[np.int64] | None = None) -> PackedLanes:
+        """A copy for other kernels; `numbers` are what the atoms are called there, by what they are called here."""
+        tables = copied(self.tables)
         if numbers is not None:
-            atoms, bonds = (3 * numbers[atoms // 3]).astype(np.uint32), numbers[bonds].astype(np.uint32)
-        rooms = (np.broadcast_to(0.0, n) for n in self._sizes)
-        return starts, atoms, *rest, self.lengths, bonds, *rooms
+            atoms, ends = part_of(tables, 1, np.uint32), part_of(tables, BONDS, np.uint32)
+            atoms[:], ends[:] = 3 * numbers[atoms // 3], numbers[ends]
+        return PackedLanes(Kernels(_positions, _tangents, resolved=_resolved), tables)
 
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
-        """As `DistanceClusters.positions`, with a last look at the positions themselves.
+        """As `SimdClusterSolver.positions`, with a last look at the positions themselves.
 
         The multipliers of a long stretched chain can be so large that their rounding shows in the positions
         although the bond vectors of the iteration were exact; another round from there takes it away.
@@ -107,8 +118,8 @@ class Chains(EightAtATime):
         lengths = self.lengths if request.wanted is None else request.wanted[self.rows]
         outcome = super().positions(request, multipliers)
         for _ in range(MAX_ROUNDS):
-            if not outcome.converged or lengths_resolved(request.changed, self._bonds, lengths, request.lattice):
+            if not outcome.converged or resolved(request.changed, self._ends, lengths, self._cell, self._kind):
                 break
-            if not go_on(super().positions, request, multipliers):
+            if not resume(super().positions, request, multipliers):
                 break
         return outcome

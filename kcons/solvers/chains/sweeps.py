@@ -12,7 +12,7 @@ for the next Newton step in the opposite direction: a Newton step reads the chai
 import numpy as np
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.kernels.array_views import at_first
+from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, piece
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -33,23 +33,16 @@ from kcons.solvers.kernels.eight_wide import (
     where_greater,
     where_zero,
 )
-from kcons.solvers.kernels.groups_of_eight import (
-    MAX_ITERATIONS,
-    OPEN,
-    POSITION_TOLERANCE,
-    TINY,
-    dot,
-    lattice_numbers,
-    minimum_image,
-)
-
-TANGENT_TOLERANCE = 2e-15
-"""Accepted ``|u·y_ij - c|``, relative to the root mean square of the chain's."""
+from kcons.solvers.kernels.groups_of_eight import dot
+from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
+from kcons.solvers.tolerances import CHAIN_SPEED_TOLERANCE, MAX_ITERATIONS, NEWTON_TOLERANCE, TINY
 
 # Fields of a slot: vectors of WIDTH doubles, one a lane. Slot t of a lane holds
 # the bond from its atom t to t + 1; the last slot's bond is the separator.
 _S, _R, _TARGET, _RIGHT, _AHEAD, _ASIDE, _FIRST, _LATER = (WIDTH * k for k in (0, 3, 6, 7, 8, 9, 10, 11))
 SLOT = 12 * WIDTH
+#: Of the pieces of the tables, those that are named.
+LENGTHS, BONDS = 8, 9
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
@@ -458,16 +451,17 @@ def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
 
 
 @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
-def project(
-    points, references, velocities, inverse_dt, tangent, starts, atoms, owned, full, rows, present, weights, wholes,
-    given, lattice, kind, multipliers, work, undo,
-):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Project one strip after another; `tangent` is None for positions. A kernel is compiled for each of the two."""
+def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
+    """Project one strip after another; `SimdClusterSolver` says what the arguments are."""
+    t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
+    starts, atoms, owned, full = piece(h, h, 0), piece(u, h, 1), piece(b, h, 2), piece(b, h, 3)
+    rows, present, weights, wholes = piece(u, h, 4), piece(t, h, 5), piece(t, h, 6), piece(h, h, 7)
+    work, undo = piece(t, h, 10), piece(t, h, 11)
     small = np.empty(8 * WIDTH)
     cell = lattice_numbers(lattice)
     worst, worst_row, most = 0.0, -1, 0
     last = starts.shape[0] - 2
-    limit = TANGENT_TOLERANCE if tangent is not None else POSITION_TOLERANCE
+    limit = CHAIN_SPEED_TOLERANCE if tangent is not None else NEWTON_TOLERANCE
     for strip in range(last + 1):
         first, n_slots = starts[strip], (starts[strip + 1] - starts[strip]) // WIDTH
         ok, residual, place, solves = _solve(

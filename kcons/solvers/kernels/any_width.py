@@ -9,9 +9,10 @@ the call makes every vector register spill. They are read and written without ch
 
 from __future__ import annotations
 
+import functools
+import inspect
 import operator
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 from llvmlite import ir
@@ -31,6 +32,51 @@ _POINT = ir.VectorType(DOUBLE, 4)
 #: Of four numbers, those of a point.
 POINT_MASK = ir.Constant(ir.VectorType(ir.IntType(1), 4), [1, 1, 1, 0])
 _INSTRUCTIONS = ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"))
+
+
+def instruction(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Make a Numba intrinsic of a function of LLVM's builder and the values of its arguments.
+
+    Parameters
+    ----------
+    result : Numba type
+    *kinds : Numba type or None
+        Of the arguments. None takes what is given; the function gets a contiguous array as the pointer to its first
+        number, and no intrinsic is found for other arrays.
+    """
+
+    def made(emit: Callable[..., Any]) -> Any:
+        def function(typingctx, *given):  # type: ignore[no-untyped-def]
+            if any(isinstance(kind, types.Array) and kind.layout != "C" for kind in given):
+                return None
+            taken = [kind or own for kind, own in zip(kinds, given, strict=True)]
+
+            def codegen(context, builder, sig, values):  # type: ignore[no-untyped-def]
+                found = emit(builder, *map(functools.partial(first_of, context, builder), sig.args, values))
+                if isinstance(found, list):
+                    return context.make_tuple(builder, sig.return_type, found)
+                return context.get_dummy_value() if found is None else found
+
+            return result(*taken), codegen
+
+        names = ["typingctx", *list(inspect.signature(emit).parameters)[1:]]
+        # Numba goes by the names of parameters, and would hand a variable number of them on as a tuple.
+        given = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+        function.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
+        return intrinsic(functools.wraps(emit, ("__module__", "__name__", "__qualname__", "__doc__"), ())(function))
+
+    return made
+
+
+def first_of(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Pointer to the first number of an array; other values as they are."""
+    return context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+
+
+def place(builder: Any, array: Any, start: Any, to: Any = None) -> Any:
+    """Pointer to an entry behind a pointer; as one to a vector where `to` is its type."""
+    found = builder.gep(array, [start], inbounds=True)
+    return found if to is None else builder.bitcast(found, ir.PointerType(to))
 
 
 class VectorType(types.Type):
@@ -90,14 +136,11 @@ class Vectors:
     def unary(self, name: str) -> Callable[..., Any]:
         """The function of each that LLVM calls `name`, such as 'sqrt'."""
 
-        @intrinsic
-        def function(typingctx, value):  # type: ignore[no-untyped-def]
-            def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-                return call(builder, f"llvm.{name}.v{self.llvm.count}f64", self.llvm, args)
+        @instruction(self.kind, self.kind)
+        def function(builder, value):  # type: ignore[no-untyped-def]
+            return call(builder, f"llvm.{name}.v{self.llvm.count}f64", self.llvm, [value])
 
-            return self.kind(self.kind), codegen
-
-        return function  # type: ignore[no-any-return]
+        return function
 
     def _define(self, function: Any, instruction: str) -> None:
         kind = self.kind
@@ -125,7 +168,7 @@ class Vectors:
         lower_builtin(operator.neg, self.kind)(lower)
 
 
-@cache
+@functools.cache
 def vectors(width: int) -> Vectors:
     """Numbers `width` doubles wide."""
     return Vectors(width)
@@ -141,10 +184,7 @@ def shuffle(builder: Any, left: Any, right: Any, mask: list[int]) -> Any:
 
 def pointer(context: Any, builder: Any, array_type: Any, array: Any, start: Any, to: Any = None) -> Any:
     """To an entry of an array, or behind a pointer; as one to a vector where `to` is its type."""
-    is_array = isinstance(array_type, types.Array)
-    data = context.make_array(array_type)(context, builder, array).data if is_array else array
-    found = builder.gep(data, [start], inbounds=True)
-    return found if to is None else builder.bitcast(found, ir.PointerType(to))
+    return place(builder, first_of(context, builder, array_type, array), start, to)
 
 
 def call(builder: Any, name: str, result: Any, args: Any) -> Any:
@@ -153,9 +193,9 @@ def call(builder: Any, name: str, result: Any, args: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), args)
 
 
-def masked_point(builder: Any, place: Any) -> Any:
+def masked_point(builder: Any, at: Any) -> Any:
     """(x, y, z, 0) of the point at a pointer; the mask keeps the last one of an array from reading beyond it."""
-    source = builder.bitcast(place, ir.PointerType(_POINT))
+    source = builder.bitcast(at, ir.PointerType(_POINT))
     rest = ir.Constant(_POINT, [0.0] * 4)
     return call(builder, "llvm.masked.load.v4f64.p0v4f64", _POINT, [source, INT32(8), POINT_MASK, rest])
 
@@ -163,24 +203,18 @@ def masked_point(builder: Any, place: Any) -> Any:
 def reader(kind: Any, vector: Any) -> Callable[..., Any]:
     """The intrinsic that reads from a flat float64 array; doubles where `vector` is None."""
 
-    @intrinsic
-    def function(typingctx, array, start):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            return builder.load(pointer(context, builder, sig.args[0], *args, vector), align=8)
+    @instruction(kind, None, types.int64)
+    def function(builder, array, start):  # type: ignore[no-untyped-def]
+        return builder.load(place(builder, array, start, vector), align=8)
 
-        return kind(array, types.int64), codegen
-
-    return function  # type: ignore[no-any-return]
+    return function
 
 
 def writer(kind: Any, vector: Any) -> Callable[..., Any]:
     """The intrinsic that writes into one."""
 
-    @intrinsic
-    def function(typingctx, array, start, value):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            builder.store(args[2], pointer(context, builder, sig.args[0], *args[:2], vector), align=8)
+    @instruction(types.void, None, types.int64, kind)
+    def function(builder, array, start, value):  # type: ignore[no-untyped-def]
+        builder.store(value, place(builder, array, start, vector), align=8)
 
-        return types.void(array, types.int64, kind), codegen
-
-    return function  # type: ignore[no-any-return]
+    return function

@@ -16,8 +16,9 @@ from kcons.solvers.kernels.any_width import (
     INT32,
     INT64,
     call,
+    instruction,
     masked_point,
-    pointer,
+    place,
     shuffle,
     vectors,
 )
@@ -32,53 +33,44 @@ lanes_type = _EIGHT.kind
 _VECTOR = _EIGHT.llvm
 _TRIPLE = types.UniTuple(lanes_type, 3)
 load, store = _EIGHT.load, _EIGHT.store
+_ZERO = ir.Constant(_VECTOR, [0.0] * WIDTH)
 
 
-@intrinsic
-def splat(typingctx, value):
+@instruction(lanes_type, types.float64)
+def splat(builder, value):
     """All lanes equal to one number."""
-
-    def codegen(context, builder, sig, args):
-        return _EIGHT.splat(builder, args[0])
-
-    return lanes_type(types.float64), codegen
+    return _EIGHT.splat(builder, value)
 
 
-@intrinsic
-def load_triple(typingctx, array, start):
+@instruction(_TRIPLE, None, types.int64)
+def load_triple(builder, array, start):
     """Three vectors one after another in a flat float64 array."""
-
-    def codegen(context, builder, sig, args):
-        base = pointer(context, builder, sig.args[0], *args, _VECTOR)
-        triple = [builder.load(builder.gep(base, [INT64(k)]), align=8) for k in range(3)]
-        return context.make_tuple(builder, sig.return_type, triple)
-
-    return _TRIPLE(array, types.int64), codegen
+    base = place(builder, array, start, _VECTOR)
+    return [builder.load(builder.gep(base, [INT64(k)]), align=8) for k in range(3)]
 
 
-@intrinsic
-def store_triple(typingctx, array, start, x, y, z):
+def _store_triple(builder: Any, array: Any, start: Any, triple: Any) -> None:
+    base = place(builder, array, start, _VECTOR)
+    for k, vector in enumerate(triple):
+        builder.store(vector, builder.gep(base, [INT64(k)]), align=8)
+
+
+@instruction(types.void, None, types.int64, *(lanes_type,) * 3)
+def store_triple(builder, array, start, x, y, z):
     """Inverse of `load_triple`."""
-
-    def codegen(context, builder, sig, args):
-        base = pointer(context, builder, sig.args[0], *args[:2], _VECTOR)
-        for k in range(3):
-            builder.store(args[2 + k], builder.gep(base, [INT64(k)]), align=8)
-
-    return types.void(array, types.int64, *(lanes_type,) * 3), codegen
+    _store_triple(builder, array, start, (x, y, z))
 
 
-def _pointers(context: Any, builder: Any, sig: Any, args: Any, shift: Any = None) -> list[Any]:
+def _places(builder: Any, array: Any, table: Any, start: Any, shift: Any = None) -> list[Any]:
     """Pointers ``array + table[start + lane] + shift`` for every lane."""
-    base = pointer(context, builder, sig.args[0], args[0], INT64(0) if shift is None else shift)
-    table = pointer(context, builder, sig.args[1], args[1], args[2])
+    base, table = place(builder, array, INT64(0) if shift is None else shift), place(builder, table, start)
     offsets = [builder.load(builder.gep(table, [INT64(lane)])) for lane in range(WIDTH)]
     return [builder.gep(base, [builder.zext(offset, INT64)]) for offset in offsets]
 
 
-def _load_rows(context: Any, builder: Any, sig: Any, args: Any) -> list[Any]:
+def _load_rows(builder: Any, points: Any, table: Any, start: Any) -> list[Any]:
     """One point (x, y, z, 0) a lane."""
-    return [masked_point(builder, place) for place in _pointers(context, builder, sig, args)]
+    return [masked_point(builder, at) for at in _places(builder, points, table, start)]
 
 
 def _columns(builder: Any, rows: list[Any]) -> list[Any]:
@@ -105,166 +97,99 @@ def _rows(builder: Any, x: Any, y: Any, z: Any) -> list[Any]:
     return rows
 
 
-def _store_rows(context: Any, builder: Any, sig: Any, args: Any, rows: list[Any]) -> None:
-    for place, row in zip(_pointers(context, builder, sig, args), rows, strict=True):
-        front = shuffle(builder, row, row, [0, 1])
-        builder.store(front, builder.bitcast(place, ir.PointerType(front.type)), align=8)
-        last = builder.extract_element(row, INT32(2))
-        builder.store(last, builder.gep(place, [INT64(2)]), align=8)
-
-
-@intrinsic
-def gather(typingctx, array, table, start, shift):
+@instruction(lanes_type, None, None, types.int64, types.int64)
+def gather(builder, array, table, start, shift):
     """``array[table[start + lane] + shift]`` for every lane."""
-
-    def codegen(context, builder, sig, args):
-        places = _pointers(context, builder, sig, args, args[3])
-        return _EIGHT.of(builder, [builder.load(place, align=8) for place in places])
-
-    return lanes_type(array, table, types.int64, types.int64), codegen
+    places = _places(builder, array, table, start, shift)
+    return _EIGHT.of(builder, [builder.load(at, align=8) for at in places])
 
 
-@intrinsic
-def scatter(typingctx, array, table, start, shift, value):
+@instruction(types.void, None, None, types.int64, types.int64, lanes_type)
+def scatter(builder, array, table, start, shift, value):
     """Inverse of `gather`; lanes that repeat an entry must hold equal values."""
-
-    def codegen(context, builder, sig, args):
-        for lane, place in enumerate(_pointers(context, builder, sig, args, args[3])):
-            builder.store(builder.extract_element(args[4], INT32(lane)), place, align=8)
-
-    return types.void(array, table, types.int64, types.int64, lanes_type), codegen
+    for lane, at in enumerate(_places(builder, array, table, start, shift)):
+        builder.store(builder.extract_element(value, INT32(lane)), at, align=8)
 
 
-@intrinsic
-def gather_points(typingctx, points, table, start):
+@instruction(_TRIPLE, None, None, types.int64)
+def gather_points(builder, points, table, start):
     """Coordinates (x, y, z) of the points at the offsets ``table[start + lane]``."""
-
-    def codegen(context, builder, sig, args):
-        columns = _columns(builder, _load_rows(context, builder, sig, args))
-        return context.make_tuple(builder, sig.return_type, columns)
-
-    return _TRIPLE(points, table, types.int64), codegen
+    return _columns(builder, _load_rows(builder, points, table, start))
 
 
-@intrinsic
-def keep_points(typingctx, points, table, start, undo, saved):
+@instruction(_TRIPLE, None, None, types.int64, None, types.int64)
+def keep_points(builder, points, table, start, undo, saved):
     """`gather_points`, with a copy of the three vectors from ``undo[saved]`` on."""
-
-    def codegen(context, builder, sig, args):
-        columns = _columns(builder, _load_rows(context, builder, sig, args))
-        base = pointer(context, builder, sig.args[3], *args[3:], _VECTOR)
-        for k, column in enumerate(columns):
-            builder.store(column, builder.gep(base, [INT64(k)]), align=8)
-        return context.make_tuple(builder, sig.return_type, columns)
-
-    return _TRIPLE(points, table, types.int64, undo, types.int64), codegen
+    columns = _columns(builder, _load_rows(builder, points, table, start))
+    _store_triple(builder, undo, saved, columns)
+    return columns
 
 
-@intrinsic
-def gather_differences(typingctx, points, table, start, other):
+@instruction(_TRIPLE, None, None, types.int64, types.int64)
+def gather_differences(builder, points, table, start, other):
     """Coordinates of the points at `start` minus those at `other`."""
-
-    def codegen(context, builder, sig, args):
-        left = _load_rows(context, builder, sig, args)
-        right = _load_rows(context, builder, sig, [args[0], args[1], args[3]])
-        rows = [builder.fsub(a, b, flags=FLAGS) for a, b in zip(left, right, strict=True)]
-        return context.make_tuple(builder, sig.return_type, _columns(builder, rows))
-
-    return _TRIPLE(points, table, types.int64, types.int64), codegen
+    left, right = (_load_rows(builder, points, table, at) for at in (start, other))
+    return _columns(builder, [builder.fsub(a, b, flags=FLAGS) for a, b in zip(left, right, strict=True)])
 
 
-@intrinsic
-def scatter_points(typingctx, points, table, start, x, y, z):
+@instruction(types.void, None, None, types.int64, *(lanes_type,) * 3)
+def scatter_points(builder, points, table, start, x, y, z):
     """Inverse of `gather_points`; lanes that repeat a point must agree."""
-
-    def codegen(context, builder, sig, args):
-        _store_rows(context, builder, sig, args, _rows(builder, *args[3:]))
-
-    return types.void(points, table, types.int64, *(lanes_type,) * 3), codegen
-
-
-absolute = _EIGHT.unary("fabs")
-nearest = _EIGHT.unary("rint")
-square_root = _EIGHT.unary("sqrt")
+    rows = _rows(builder, x, y, z)
+    for at, row in zip(_places(builder, points, table, start), rows, strict=True):
+        front = shuffle(builder, row, row, [0, 1])
+        builder.store(front, builder.bitcast(at, ir.PointerType(front.type)), align=8)
+        builder.store(builder.extract_element(row, INT32(2)), builder.gep(at, [INT64(2)]), align=8)
 
 
-@intrinsic
-def all_within(typingctx, value, bound):
+absolute, nearest, square_root = _EIGHT.unary("fabs"), _EIGHT.unary("rint"), _EIGHT.unary("sqrt")
+
+
+@instruction(types.boolean, None, None)
+def all_within(builder, value, bound):
     """Whether ``value <= bound`` in every lane; false where either is NaN."""
-
-    def codegen(context, builder, sig, args):
-        value, limit = (_EIGHT.splat(builder, a) for a in args)
-        return _EIGHT.all_true(builder, builder.fcmp_ordered("<=", value, limit))
-
-    return types.boolean(value, bound), codegen
+    value, limit = _EIGHT.splat(builder, value), _EIGHT.splat(builder, bound)
+    return _EIGHT.all_true(builder, builder.fcmp_ordered("<=", value, limit))
 
 
-@intrinsic
-def where_zero(typingctx, test, value, otherwise):
+@instruction(lanes_type, lanes_type, None, None)
+def where_zero(builder, test, value, otherwise):
     """``value`` in the lanes where ``test`` is zero, else ``otherwise``."""
-
-    def codegen(context, builder, sig, args):
-        zero = ir.Constant(_VECTOR, [0.0] * WIDTH)
-        return builder.select(
-            builder.fcmp_ordered("==", args[0], zero),
-            _EIGHT.splat(builder, args[1]),
-            _EIGHT.splat(builder, args[2]),
-        )
-
-    return lanes_type(lanes_type, value, otherwise), codegen
+    value, otherwise = _EIGHT.splat(builder, value), _EIGHT.splat(builder, otherwise)
+    return builder.select(builder.fcmp_ordered("==", test, _ZERO), value, otherwise)
 
 
-@intrinsic
-def not_positive(typingctx, value):
+@instruction(lanes_type, lanes_type)
+def not_positive(builder, value):
     """1 in the lanes where ``value > 0`` does not hold (NaN included), else 0."""
-
-    def codegen(context, builder, sig, args):
-        zero = ir.Constant(_VECTOR, [0.0] * WIDTH)
-        positive = builder.fcmp_ordered(">", args[0], zero)
-        return builder.select(positive, zero, ir.Constant(_VECTOR, [1.0] * WIDTH))
-
-    return lanes_type(lanes_type), codegen
+    return builder.select(builder.fcmp_ordered(">", value, _ZERO), _ZERO, ir.Constant(_VECTOR, [1.0] * WIDTH))
 
 
-@intrinsic
-def where_greater(typingctx, left, right, value, otherwise):
+@instruction(lanes_type, *(lanes_type,) * 4)
+def where_greater(builder, left, right, value, otherwise):
     """``value`` in the lanes where ``left > right``, else ``otherwise``."""
-
-    def codegen(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
-
-    return lanes_type(*(lanes_type,) * 4), codegen
+    return builder.select(builder.fcmp_ordered(">", left, right), value, otherwise)
 
 
 def _shifted(mask: list[int]) -> Callable[..., Any]:
-    @intrinsic
-    def function(typingctx, value):
-        def codegen(context, builder, sig, args):
-            return shuffle(builder, args[0], ir.Constant(_VECTOR, [0.0] * WIDTH), mask)
-
-        return lanes_type(lanes_type), codegen
+    @instruction(lanes_type, lanes_type)
+    def function(builder, value):
+        return shuffle(builder, value, _ZERO, mask)
 
     return function
 
 
 # What the lane before, or after, holds; 0 at the end.
-from_previous = _shifted([WIDTH, *range(WIDTH - 1)])
-from_next = _shifted([*range(1, WIDTH + 1)])
+from_previous, from_next = _shifted([WIDTH, *range(WIDTH - 1)]), _shifted([*range(1, WIDTH + 1)])
 
 
-@intrinsic
-def product_difference(typingctx, a, b, c, d):
+@instruction(lanes_type, *(lanes_type,) * 4)
+def product_difference(builder, a, b, c, d):
     """``a * b - c * d`` with the second product rounded, the first not.
 
     Spelt out, so that it gives the same number wherever it is repeated.
     """
-
-    def codegen(context, builder, sig, args):
-        a, b, c, d = args
-        second = builder.fneg(builder.fmul(c, d))
-        return call(builder, f"llvm.fma.v{WIDTH}f64", _VECTOR, [a, b, second])
-
-    return lanes_type(*(lanes_type,) * 4), codegen
+    return call(builder, f"llvm.fma.v{WIDTH}f64", _VECTOR, [a, b, builder.fneg(builder.fmul(c, d))])
 
 
 @intrinsic
@@ -281,21 +206,13 @@ def stack(typingctx, entries):
     return types.CPointer(lanes_type)(entries), codegen
 
 
-@intrinsic
-def peek(typingctx, room, entry):
+@instruction(lanes_type, None, types.int64)
+def peek(builder, room, entry):
     """Entry of a `stack`."""
-
-    def codegen(context, builder, sig, args):
-        return builder.load(builder.gep(args[0], [args[1]]))
-
-    return lanes_type(room, types.int64), codegen
+    return builder.load(builder.gep(room, [entry]))
 
 
-@intrinsic
-def poke(typingctx, room, entry, value):
+@instruction(types.void, None, types.int64, lanes_type)
+def poke(builder, room, entry, value):
     """Set an entry of a `stack`."""
-
-    def codegen(context, builder, sig, args):
-        builder.store(args[2], builder.gep(args[0], [args[1]]))
-
-    return types.void(room, types.int64, lanes_type), codegen
+    builder.store(value, builder.gep(room, [entry]))

@@ -1,77 +1,16 @@
-"""Clusters eight at a time: layout, minimum images, undoing, reporting."""
+"""Clusters eight at a time: layout, undoing, reporting."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, load_triple, nearest, scatter_points
-
-MAX_ITERATIONS = 50
-POSITION_TOLERANCE = 4e-15
-"""Accepted ``|r² - d²| / 2d²``; round-off of bond vectors stays below 1e-15."""
-TANGENT_TOLERANCE = 1e-15
-"""Accepted ``|u·y_ij - c|``, relative to the cluster's own relative motion."""
-
-TINY = 1e-300
-"""Smallest scalar product taken for positive."""
-
-
-NO_POINTS = np.zeros((0, 3))
-NO_NUMBERS = np.zeros(0)
-NO_LATTICE = np.zeros((2, 3, 3))
-OPEN, ORTHORHOMBIC, TRICLINIC = 0, 1, 2
-
-
-def lattice_kind(lattice: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], int]:
-    """The lattice as kernels take it, and which minimum image it needs."""
-    if lattice is None:
-        return NO_LATTICE, OPEN
-    cell, inverse = lattice
-    diagonal = np.count_nonzero(cell) + np.count_nonzero(inverse) == (
-        np.count_nonzero(cell.diagonal()) + np.count_nonzero(inverse.diagonal())
-    )
-    return lattice, ORTHORHOMBIC if diagonal else TRICLINIC
+from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, load_triple, scatter_points
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
 def dot(ax, ay, az, bx, by, bz):
     """Scalar product of two triples."""
     return ax * bx + ay * by + az * bz
-
-
-@njit(fastmath=FASTMATH, forceinline=True)
-def lattice_numbers(lattice):
-    """Cell and inverse as plain numbers.
-
-    An array handed to a function inside a loop costs reference counting,
-    and a call there makes every vector register spill.
-    """
-    return (
-        (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
-        (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
-        (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
-        (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
-        (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
-        (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
-    )
-
-
-@njit(fastmath=FASTMATH, forceinline=True)
-def minimum_image(x, y, z, cell, kind):
-    """Shortest periodic copy of a bond shorter than half the cell."""
-    a, b, c, p, q, r = cell
-    if kind == ORTHORHOMBIC:
-        x = x - nearest(x * p[0]) * a[0]
-        y = y - nearest(y * q[1]) * b[1]
-        z = z - nearest(z * r[2]) * c[2]
-    elif kind == TRICLINIC:
-        i = nearest(x * p[0] + y * q[0] + z * r[0])
-        j = nearest(x * p[1] + y * q[1] + z * r[1])
-        k = nearest(x * p[2] + y * q[2] + z * r[2])
-        x = x - (i * a[0] + j * b[0] + k * c[0])
-        y = y - (i * a[1] + j * b[1] + k * c[1])
-        z = z - (i * a[2] + j * b[2] + k * c[2])
-    return x, y, z
 
 
 SAVED = 3 * WIDTH

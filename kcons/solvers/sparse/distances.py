@@ -6,8 +6,6 @@ positions change once, after every cluster has converged, so that a failure leav
 
 from __future__ import annotations
 
-from typing import Any, Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,10 +13,11 @@ from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome, Request
-from kcons.solvers.distance_clusters import DistanceClusters
-from kcons.solvers.kernels.aligned_memory import aligned
-from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
+from kcons.solvers.called_solvers import CalledSolver, Kernels
+from kcons.solvers.distance_clusters import resolved
+from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
+from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, piece
+from kcons.solvers.kernels.lattices import OPEN, nearest_image
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
@@ -36,17 +35,25 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_line,
     store_quad,
 )
-from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, make_pattern
-from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
+from kcons.solvers.sparse.step_control import factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
+from kcons.solvers.tolerances import (
+    EPS,
+    MAX_HALVINGS,
+    NEAR,
+    NEWTON_TOLERANCE,
+    ROUNDING,
+    ROUNDINGS,
+    SPEED_ROUNDINGS,
+    SPEED_TOLERANCE,
+)
 
-#: |A v - c| allowed after a velocity projection, relative to the largest relative speed of the cluster.
-SPEED_TOLERANCE = 1e-15
-_EPS = float(np.finfo(float).eps)
+#: Of the pieces of `SparseDistances.tables`, those that are named.
+_PAIRS, _LENGTHS, _STATE, _PIVOTS, _MOVES, _SOLUTION = 9, 10, 11, 13, 16, 17
 
 
-class SparseDistances(DistanceClusters):
+class SparseDistances(CalledSolver):
     """Solver for distance rows in clusters of any shape.
 
     Parameters
@@ -62,6 +69,7 @@ class SparseDistances(DistanceClusters):
     """
 
     name = "sparse"
+    ways = False, True
 
     def __init__(
         self,
@@ -71,79 +79,53 @@ class SparseDistances(DistanceClusters):
         inverse_masses: FloatArray,
         late: NDArray[np.bool_] | None = None,
     ) -> None:
+        self._made_of = rows, pairs, lengths, inverse_masses, late
         atoms, local = np.unique(pairs, return_inverse=True)
         local = local.reshape(pairs.shape)
-        movable = inverse_masses[atoms] > 0
-        keep = movable[local]
+        keep = inverse_masses[atoms][local] > 0
         row_start = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
-        row_atoms = local[keep].astype(np.int64)
-        pattern = make_pattern(row_start, row_atoms, len(atoms), late)
+        pattern = make_pattern(row_start, local[keep].astype(np.int64), len(atoms), late)
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
-        self.lengths = lengths[pattern.order].copy()
-        self._clusters = pattern.clusters
-        self._atoms, self._atom_start, ends = plain_if_small(_number_atoms, len(pairs))(
+        numbered, atom_start, ends = plain_if_small(_number_atoms, len(pairs))(
             pairs, pattern.clusters, len(inverse_masses)
         )
-        self._w = inverse_masses[self._atoms]
+        w = inverse_masses[numbered]
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:-1, 2:] = pattern.start, pattern.target_start, ends
-        weights = self._w[ends].sum(axis=1)
-        couplings = plain_if_small(_couplings, len(pattern.columns))(pattern.start, pattern.columns, ends, self._w)
-        self._tables = (self._clusters, self._atoms, self._atom_start, self._w, links.ravel(),
-            pattern.columns, pattern.targets, couplings, weights,
-        )  # fmt: skip
-        self._state = aligned(8 * len(rows))
-        self._entries = aligned(4 * len(pattern.columns))
-        self._pivots = np.zeros(len(rows))
-        self._starts = aligned(4 * len(rows))
-        self._places = aligned(4 * len(self._atoms))
-        self._moves = aligned(4 * len(self._atoms))
-        self._solution = np.zeros(len(rows))
-        self._kept_moves = np.zeros(len(self._moves))
-        self._kept_solution = np.zeros(len(rows))
-
-    def _project(
-        self, request: Request, given: FloatArray, tangent: Literal[True] | None, multipliers: FloatArray | None
-    ) -> Outcome:
-        x, reference, _, lattice, _, _, velocities, inv_dt, _, _ = request
-        cell, periodic = NO_LATTICE if lattice is None else lattice, lattice is not None
-        rooms = (
-            self._state, self._entries, self._pivots, self._starts, self._places, self._moves, self._solution,
-        )  # fmt: skip
-        if tangent:
-            failed, residual, iterations, worst = solve_tangents(
-                reference, x, given, len(given) > 0, cell, periodic, *self._tables, *rooms
+        couplings = plain_if_small(_couplings, len(pattern.columns))(pattern.start, pattern.columns, ends, w)
+        n, n_entries, n_atoms = len(rows), len(pattern.columns), len(numbered)
+        self.tables = in_one_array(
+            (
+                *(pattern.clusters, numbered, atom_start, w, links.ravel(), pattern.columns, pattern.targets),
+                *(couplings, w[ends].sum(axis=1), pairs.astype(np.uint32).ravel(), lengths[pattern.order]),
+                # As `sparse.substitution` says: lines of rows and of entries; pivots. Then where rows began, where
+                # atoms were, moves and solution, and the two that are kept.
+                *(room(8 * n), room(4 * n_entries), room(n), room(4 * n), room(4 * n_atoms)),
+                *(room(4 * n_atoms), room(n), room(4 * n_atoms), room(n)),
             )
-        else:
-            for careful in (False, True):
-                failed, residual, iterations, worst = solve_positions(
-                    careful, x, reference, given, cell, periodic, *self._tables, *rooms,
-                    self._kept_moves, self._kept_solution,
-                )  # fmt: skip
-                if not failed:
-                    break
-        if not failed:
-            if velocities is None or tangent:
-                apply(x, self._atoms, self._moves)
-            else:
-                apply_both(x, velocities, inv_dt, self._atoms, self._moves)
-            if multipliers is not None:
-                _natural(self._state, self._solution, -1.0 if tangent else 1.0, multipliers)
-        return Outcome(not failed, residual, iterations, worst)
+        )
+        self.kernels = Kernels(_positions, _tangents, _apply, resolved=_resolved)
+        self._solution = part_of(self.tables, _SOLUTION)
 
-    def tables(self) -> tuple[tuple[NDArray[Any], ...], tuple[FloatArray, ...]]:
-        """What `solve_positions` and `solve_tangents` are given of the rows, and the rooms that they work in."""
-        return self._tables, (self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
-            self._solution, self._kept_moves, self._kept_solution,
-        )  # fmt: skip
+    def __reduce__(self) -> tuple[type[SparseDistances], tuple[object, ...]]:
+        return SparseDistances, self._made_of  # addresses are of no use elsewhere
 
-    def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
-        """Independent rows at `x`: those whose pivot does not vanish."""
-        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice))
-        if not outcome.converged:
-            return len(self.rows)
-        return int(np.count_nonzero(self._pivots))
+    @property
+    def lengths(self) -> FloatArray:
+        """Lengths used where a request names none, in the order of `rows`."""
+        lengths: FloatArray = part_of(self.tables, _LENGTHS)
+        return lengths
+
+    @property
+    def pivots(self) -> FloatArray:
+        pivots: FloatArray = part_of(self.tables, _PIVOTS)
+        return pivots
+
+    def _multipliers(self) -> FloatArray:
+        # The kernels' are those of s . r, and not of |r| - d.
+        bonds = part_of(self.tables, _STATE).reshape(-1, 8)[:, 1:6:2]
+        return np.asarray(self._solution * np.linalg.norm(bonds, axis=1))
 
 
 def sparse_distances(
@@ -254,12 +236,20 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def solve_positions(  # type: ignore[no-untyped-def]
-    careful, x_new, x_ref, lengths, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
-    targets, couplings, weights, state, entries, pivots, starts, places, moves, solution, kept_moves, kept_solution,
-):  # fmt: skip
+def _positions(  # type: ignore[no-untyped-def]
+    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
+):
+    """As `kcons.solvers.called_solvers` says."""
+    t, h, u = tables, integers(tables), halves(tables)
+    clusters, atoms, atom_start, w = at_piece(h, h, 0), at_piece(u, h, 1), at_piece(h, h, 2), at_piece(t, h, 3)
+    links, columns, targets, couplings = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(t, h, 7)
+    weights, state, entries = at_piece(t, h, 8), at_piece(t, h, _STATE), at_piece(t, h, 12)
+    pivots, starts, places = at_piece(t, h, _PIVOTS), at_piece(t, h, 14), at_piece(t, h, 15)
+    moves, solution = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
+    kept_moves, kept_solution, periodic = at_piece(t, h, 18), at_piece(t, h, 19), kind != OPEN
+    lengths = at_first(wanted) if wanted.size else at_piece(t, h, _LENGTHS)
     worst, worst_row, most = 0.0, -1, 0
-    for c in range(len(clusters) - 1):
+    for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         first_atom, last_atom = atom_start[c], atom_start[c + 1]
         error, total = _begin(
@@ -276,18 +266,18 @@ def solve_positions(  # type: ignore[no-untyped-def]
                 error, total = _measure(first, last, lengths, links, state, starts, moves)
             if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
-                    return True, error, iteration, _worst(first, last, state, lengths)
+                    return False, error, iteration, _worst(first, last, state, lengths)
                 halvings += 1
                 go_back(4 * first_atom, 4 * last_atom, moves, kept_moves)
                 go_back(first, last, solution, kept_solution)
                 continue
             # max() may drop a NaN; the sum cannot.
             if not (total < np.inf) or hopeless(iteration, error, previous):
-                return True, error, iteration, _worst(first, last, state, lengths)
-            if error <= step_control.NEWTON_TOLERANCE:
+                return False, error, iteration, _worst(first, last, state, lengths)
+            if error <= NEWTON_TOLERANCE:
                 break
             # Rounding may stop short of it in ill-conditioned sets; what the positions resolve is enough.
-            if error > 0.5 * previous and error < 1e-10 and _resolved(first, last, state, lengths, places, links):
+            if error > 0.5 * previous and error < NEAR and _within_rounding(first, last, state, lengths, places, links):
                 break
             if careful:
                 best = total
@@ -305,23 +295,27 @@ def solve_positions(  # type: ignore[no-untyped-def]
         for k in range(first, last):
             # A bond must not have turned by 90 degrees or more within the step.
             if not (dot(first_vector(state, 8 * k), second_vector(state, 8 * k)) > 0.0):
-                return True, np.inf, iteration, k
+                return False, np.inf, iteration, k
         if error >= worst:
             worst, worst_row = error, first
         most = max(most, iteration)
-    return False, worst, most, worst_row
+    if alone:
+        _apply(x_new, 1.0, tables)
+        if inv_dt != 0.0:
+            _apply(velocities, inv_dt, tables)
+    return True, worst, most, worst_row
 
 
 @njit(cache=True)
-def _resolved(first, last, state, lengths, places, links):  # type: ignore[no-untyped-def]
-    """Whether each |sigma| is max(1e-14 d, 2 eps (|x_i| + |x_j|)) or so, see `step_control.ROUNDINGS`."""
-    room = step_control.ROUNDINGS * np.sqrt(last - first)
+def _within_rounding(first, last, state, lengths, places, links):  # type: ignore[no-untyped-def]
+    """Whether each |sigma| is max(1e-14 d, 2 eps (|x_i| + |x_j|)) or so, see `tolerances.ROUNDINGS`."""
+    room = ROUNDINGS * np.sqrt(last - first)
     for k in range(first, last):
         reach = 0.0
         for side in range(2):
             a = 4 * np.int64(links[4 * k + 2 + side])
             reach += np.sqrt(places[a] ** 2 + places[a + 1] ** 2 + places[a + 2] ** 2)
-        rounding = max(1e-14 * lengths[k], 2 * _EPS * reach)
+        rounding = max(ROUNDING * lengths[k], 2 * EPS * reach)
         if not (abs(state[8 * k + 7]) / lengths[k] <= room * rounding):
             return False
     return True
@@ -341,12 +335,17 @@ def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def solve_tangents(  # type: ignore[no-untyped-def]
-    x, y, rates, driven, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
-    targets, couplings, weights, state, entries, pivots, starts, places, moves, solution,
-):  # fmt: skip
+def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    t, h, u = tables, integers(tables), halves(tables)
+    clusters, atoms, atom_start, w = at_piece(h, h, 0), at_piece(u, h, 1), at_piece(h, h, 2), at_piece(t, h, 3)
+    links, columns, targets, couplings = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(t, h, 7)
+    weights, state, entries = at_piece(t, h, 8), at_piece(t, h, _STATE), at_piece(t, h, 12)
+    pivots, starts, places = at_piece(t, h, _PIVOTS), at_piece(t, h, 14), at_piece(t, h, 15)
+    moves, solution, periodic = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION), kind != OPEN
+    driven, rates = wanted.size > 0, at_first(wanted)
     worst, worst_row, most = 0.0, -1, 0
-    for c in range(len(clusters) - 1):
+    for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         for a in range(atom_start[c], atom_start[c + 1]):
             g = 3 * entry(atoms, a)
@@ -372,7 +371,7 @@ def solve_tangents(  # type: ignore[no-untyped-def]
         for a in range(atom_start[c], atom_start[c + 1]):
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, number(w, a)))
         if not (total < np.inf):
-            return True, np.inf, 0, _first_bad(first, last, state)
+            return False, np.inf, 0, _first_bad(first, last, state)
         factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
         allowed = SPEED_TOLERANCE * np.sqrt(largest)
         error, iteration = 0.0, 0
@@ -389,17 +388,19 @@ def solve_tangents(  # type: ignore[no-untyped-def]
                 total += abs(miss)
                 error = max(error, abs(miss))
             if not (total < np.inf):
-                return True, error, iteration, _first_bad(first, last, state)
+                return False, error, iteration, _first_bad(first, last, state)
             if not refines(iteration, error, previous, allowed):
                 break
             previous = error
             forward(first, last, links, columns, state, entries)
-        if error > 1e3 * allowed:
-            return True, error, iteration, _largest(first, last, state)
+        if error > SPEED_ROUNDINGS * allowed:
+            return False, error, iteration, _largest(first, last, state)
         if error >= worst:
             worst, worst_row = error, first
         most = max(most, iteration)
-    return False, worst, most, worst_row
+    if alone:
+        _apply(y, 1.0, tables)
+    return True, worst, most, worst_row
 
 
 @njit(cache=True)
@@ -423,24 +424,16 @@ def _largest(first, last, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def]
-    """Multipliers of |r| - d instead of s . r."""
-    for k in range(len(solution)):
-        sx, sy, sz = state[8 * k + 1], state[8 * k + 3], state[8 * k + 5]
-        multipliers[k] = sign * solution[k] * np.sqrt(sx * sx + sy * sy + sz * sz)
+def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    h = integers(tables)
+    atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
+    for a in range(h[3] - h[2]):
+        add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def apply(x, atoms, moves):  # type: ignore[no-untyped-def]
-    for a in range(len(atoms)):
-        g = 3 * entry(atoms, a)
-        add_to_point(x, g, load_quad(moves, 4 * a))
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
-    for a in range(len(atoms)):
-        g = 3 * entry(atoms, a)
-        move = load_quad(moves, 4 * a)
-        add_to_point(x, g, move)
-        add_to_point(v, g, inv_dt * move)
+@njit(cache=True, fastmath=FAST)
+def _resolved(x, lattice, kind, tables):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    h = integers(tables)
+    return resolved(x, piece(halves(tables), h, _PAIRS), piece(tables, h, _LENGTHS), lattice, kind)

@@ -31,11 +31,6 @@ UIntArray = NDArray[np.uint32]
 #: `nnan` and `ninf` are left out on purpose: a NaN must fail every comparison with a tolerance.
 FAST = {"contract", "arcp", "nsz"}
 
-#: A pivot below this part of its diagonal marks a row that depends on earlier ones: the square of the sine of the angle
-#: between the row and these. Where rank counts and clusters are not large it is counted by
-#: `kcons.solvers.rank_revealing`, and dependent rows come last here, where their pivots vanish to rounding.
-PIVOT_TOLERANCE = 1e-10
-
 #: Updates of a factorisation, each stored in four bytes.
 MOST_UPDATES = 2.5e8
 

@@ -7,8 +7,6 @@ velocities are solved with the positions where these are the end of a flight, se
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
@@ -17,10 +15,10 @@ from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import CalledSolver, address_of, caller_of
-from kcons.solvers.cluster_solver import Request
+from kcons.solvers.called_solvers import CalledSolver, Kernels, address_of, caller_of
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS, at_first, at_piece, halves, integers
+from kcons.solvers.kernels.lattices import OPEN
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
@@ -41,18 +39,24 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
-from kcons.solvers.sparse import step_control
-from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
+from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, first_flat, miss
-from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
+from kcons.solvers.sparse.step_control import factor_serves, go_back, hopeless, keep, overshot, refines, stalled
 from kcons.solvers.sparse.substitution import update
+from kcons.solvers.tolerances import (
+    EPS,
+    MANY_ITERATIONS,
+    MAX_HALVINGS,
+    NEWTON_TOLERANCE,
+    PIVOT_TOLERANCE,
+    ROUNDING,
+    SPEED_ROUNDINGS,
+    SPEED_TOLERANCE,
+)
 
-#: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
-SPEED_TOLERANCE = 1e-15
 #: How much closer than positions rows of velocities are held: what they are off by is a speed times a short time.
 CLOSER = 16.0
-_EPS = float(np.finfo(float).eps)
 #: Of the pieces of `SparseRows.tables`, those that are named.
 _PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS, _MOVED = 16, 20, 21, 26, 27
 #: Signatures of what `_positions` and `_tangents` call by address, so that it is compiled once and not into both.
@@ -110,6 +114,8 @@ class SparseRows(CalledSolver):
         self._made_of = constraint_set, rows, inverse_masses, late
         self._given = GivenRows(constraint_set, self.rows, 9 * int(widths.max(initial=0)) + 1)
         links[:-1, 3] = self._given.starts
+        self.kernels, self.numbers = Kernels(_positions, _tangents, _apply), self._given.numbers
+        self.refuse = self._given.refuse  # type: ignore[method-assign]
         n, numbers = len(rows), 4 * len(atom_numbers)
         lines = np.zeros(8 * int(slots[-1]))
         lines[6::8] = w[slot_atoms]
@@ -126,7 +132,7 @@ class SparseRows(CalledSolver):
                 room(4 * int(slots[-1])),  # by slot, as quads: what `_take_off` says
             )
         )
-        self._pivots, self._solution = part_of(self.tables, _PIVOTS), part_of(self.tables, _SOLUTION)
+        self._solution = part_of(self.tables, _SOLUTION)
         placed = [np.full(c.n_rows, not c.relative) for c in constraint_set.constraints] or [np.zeros(0, np.bool_)]
         self._placed = np.flatnonzero(np.repeat(np.concatenate(placed)[self.rows], widths))
         self._placed_atoms = flat[self._placed]
@@ -135,22 +141,14 @@ class SparseRows(CalledSolver):
         return SparseRows, self._made_of  # addresses are of no use elsewhere
 
     @property
-    def kernels(self) -> tuple[Any, Any, Any]:
-        return _positions, _tangents, _apply
+    def pivots(self) -> FloatArray:
+        pivots: FloatArray = part_of(self.tables, _PIVOTS)
+        return pivots
 
     def _take_off(self, moved: FloatArray | None) -> None:
         cells = part_of(self.tables, _MOVED).reshape(-1, 4)
         cells[self._placed, :3] = 0.0 if moved is None else moved[self._placed_atoms]
         self._moved = moved is not None
-
-    def rank(
-        self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0, moved: FloatArray | None = None
-    ) -> int:
-        """Independent rows at `x`: those whose pivot does not vanish; `moved` as in `Request`."""
-        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice, time=time, moved=moved))
-        if not outcome.converged:
-            return len(self.rows)
-        return int(np.count_nonzero(self._pivots))
 
 
 def _addresses(kinds: NDArray[np.uint32]) -> IntArray:
@@ -295,7 +293,7 @@ def _begin(  # type: ignore[no-untyped-def]
                 g = second_vector(lines, 8 * p)
                 size *= np.sqrt(dot(g, g))
             reach += size
-        put(inverse_rounding, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
+        put(inverse_rounding, k, 1.0 / max(ROUNDING * number(scale, k), 2 * EPS * reach))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -339,7 +337,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers
+    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -350,7 +348,7 @@ def _positions(  # type: ignore[no-untyped-def]
     values, inverse_rounding, base = at_piece(t, h, 17), at_piece(t, h, 18), at_piece(t, h, 19)
     moves, solution, kept_moves = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION), at_piece(t, h, 22)
     kept_solution, origin, functions = at_piece(t, h, 23), at_piece(t, h, 25), at_piece(h, h, _FUNCTIONS)
-    moved = at_piece(t, h, _MOVED)
+    moved, periodic = at_piece(t, h, _MOVED), kind != OPEN
     goals, parameters = at_first(wanted) if wanted.size else at_piece(t, h, 12), at_first(numbers)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
@@ -387,9 +385,9 @@ def _positions(  # type: ignore[no-untyped-def]
             if hopeless(iteration, error, previous):
                 return False, error, iteration, bad
             # Go on to the rounding of the relative coordinates as long as Newton still gains.
-            if excess <= 1.0 and (error <= step_control.NEWTON_TOLERANCE or error > 0.1 * previous):
+            if excess <= 1.0 and (error <= NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
-            if step_control.stalled(iteration, error, previous, excess, last - first):
+            if stalled(iteration, error, previous, excess, last - first):
                 break
             if careful:
                 best = total
@@ -405,7 +403,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 functions[4], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
             )
             iteration += 1
-        if iteration > step_control.MANY_ITERATIONS:
+        if iteration > MANY_ITERATIONS:
             bad_row = first_flat(first, last, links, lines)
             if bad_row >= 0:
                 return False, np.inf, iteration, bad_row
@@ -428,7 +426,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type: ignore[no-untyped-def]
+def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.called_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
@@ -437,7 +435,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type:
     state, entries, pivots, values = at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS), at_piece(t, h, 17)
     base, moves, solution = at_piece(t, h, 19), at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
     speeds, functions, moved = at_piece(t, h, 24), at_piece(h, h, _FUNCTIONS), at_piece(t, h, _MOVED)
-    driven, goals, parameters = wanted.size > 0, at_first(wanted), at_first(numbers)
+    driven, goals, parameters, periodic = wanted.size > 0, at_first(wanted), at_first(numbers), kind != OPEN
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
@@ -499,7 +497,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type:
                 break
             previous = error
             _call_forward(functions[3], (first, last, links, columns, state, entries))
-        if error > 1e3 * allowed:
+        if error > SPEED_ROUNDINGS * allowed:
             return False, error, iteration, bad
         if error >= worst:
             worst, worst_row = error, bad

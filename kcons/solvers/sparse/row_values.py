@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import RowKind
+from kcons.constraints.internal import angle_between
 from kcons.solvers.called_solvers import address_of, caller_of
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS
 from kcons.solvers.kernels.two_and_four_wide import (
@@ -33,7 +34,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
 )
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, call_row
-from kcons.solvers.sparse.step_control import FLAT
+from kcons.solvers.tolerances import FLAT
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
@@ -91,30 +92,13 @@ def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _put(lines, place, x, y, z):  # type: ignore[no-untyped-def]
     put(lines, place, x)
     put(lines, place + 2, y)
     put(lines, place + 4, z)
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def angle(u, w):  # type: ignore[no-untyped-def]
-    """Angle between u and w and its gradients by both: dtheta/du = u x (u x w) / (u^2 |u x w|)."""
-    ux, uy, uz = u
-    wx, wy, wz = w
-    cx, cy, cz = _cross(ux, uy, uz, wx, wy, wz)
-    c = math.sqrt(cx * cx + cy * cy + cz * cz)
-    fu = 1.0 / ((ux * ux + uy * uy + uz * uz) * c)
-    fw = 1.0 / ((wx * wx + wy * wy + wz * wz) * c)
-    ax, ay, az = _cross(ux, uy, uz, cx, cy, cz)
-    bx, by, bz = _cross(cx, cy, cz, wx, wy, wz)
-    value = math.atan2(c, ux * wx + uy * wy + uz * wz)
-    return value, (fu * ax, fu * ay, fu * az), (fw * bx, fw * by, fw * bz)
+_angle = njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")(angle_between)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -194,12 +178,12 @@ def evaluate(  # type: ignore[no-untyped-def]
             _put(lines, place + 8, -x, -y, -z)
         elif kind == ANGLE:
             j = entry(slot_atoms, slot + 1)
-            u = _difference(i, j, base, moves, cell, inverse, periodic)
-            w = _difference(entry(slot_atoms, slot + 2), j, base, moves, cell, inverse, periodic)
-            value, a, b = angle(u, w)
-            _put(lines, place, a[0], a[1], a[2])
-            _put(lines, place + 8, -(a[0] + b[0]), -(a[1] + b[1]), -(a[2] + b[2]))
-            _put(lines, place + 16, b[0], b[1], b[2])
+            x, y, z = _difference(i, j, base, moves, cell, inverse, periodic)
+            wx, wy, wz = _difference(entry(slot_atoms, slot + 2), j, base, moves, cell, inverse, periodic)
+            value, ax, ay, az, bx, by, bz = _angle(x, y, z, wx, wy, wz)
+            _put(lines, place, ax, ay, az)
+            _put(lines, place + 8, -(ax + bx), -(ay + by), -(az + bz))
+            _put(lines, place + 16, bx, by, bz)
         elif kind == LINEAR:
             # sum c . r; small moves and large positions are summed apart.
             whole, change = 0.0, 0.0

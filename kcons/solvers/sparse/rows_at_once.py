@@ -59,7 +59,6 @@ def rows_at_once(function: Callable[..., None]) -> Any:
     # Not compiled apart: what Numba keeps is found again by the function's name, and by no name that it gives itself.
     row = register_jitable(fastmath=FAST, error_model="numpy")(function)
 
-    @cfunc(_ROWS, cache=True, fastmath=FAST, error_model="numpy")
     def rows(n, r, p, stride, t, out):  # type: ignore[no-untyped-def]
         if stride == 0:
             for i in range(n):
@@ -68,4 +67,5 @@ def rows_at_once(function: Callable[..., None]) -> Any:
             for i in range(n):
                 row((r[i], r[BLOCK + i], r[2 * BLOCK + i]), _from(p, stride * i), t, _from(out, 4 * i))
 
-    return rows
+    rows.__qualname__ = f"rows_at_once.{function.__qualname__}"  # each family has a file of its own
+    return cfunc(_ROWS, cache=True, fastmath=FAST, error_model="numpy")(rows)

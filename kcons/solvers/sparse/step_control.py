@@ -8,28 +8,15 @@ from __future__ import annotations
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.tolerances import MAX_ITERATIONS, NEAR, NEWTON_TOLERANCE, ROUNDINGS
 
 # Spliced into the loops: what is called there from them, with arrays, costs small clusters a sixth of their time.
-
-#: Newton stops at this relative error in relative coordinates (a few roundings).
-NEWTON_TOLERANCE = 4e-15
-MAX_ITERATIONS = 50
-#: Roundings of its positions that a row may be left with where Newton's method gains no more, for a cluster of one row;
-#: they add up like errors at random. Rows that depend on each other miss each other's targets by them.
-ROUNDINGS = 4.0
-#: More Newton iterations than a time step of any use takes: the start was far off.
-MANY_ITERATIONS = 6
-#: Part of itself that a gradient must have along it where more than that end: where it has less, the row has flattened
-#: out on the way, as a dihedral that is to turn over does far away, and the positions are none near the given ones.
-FLAT = 0.01
-#: Halvings of one Newton step by the step control.
-MAX_HALVINGS = 30
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def overshot(careful, iteration, error, total, best):  # type: ignore[no-untyped-def]
     """Whether the last step has to be halved: the sum of errors is not below that before it, beyond rounding."""
-    return careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10
+    return careful and iteration > 0 and not (total < 0.999 * best) and error > NEAR
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")

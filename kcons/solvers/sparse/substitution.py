@@ -24,7 +24,8 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
-from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE
+from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.tolerances import PIVOT_TOLERANCE
 
 #: Places of the two last numbers in a row's line.
 CHANGE, RIGHT = 6, 7

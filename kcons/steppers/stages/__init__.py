@@ -3,5 +3,4 @@
 - `compiled_operations`: operations one after another in one compiled call
 - `packed_system`: what compiled operations know of a system
 - `friction`: friction of the system
-- `great_circles`: exact flight on spheres
 """

@@ -2,8 +2,8 @@
 
 A call from Python to a kernel costs as much as the kernel's work on ten molecules of water or more. `perform` therefore
 goes through a program, a row of numbers for each operation (`kcons.steppers.program`), and comes back where forces are
-to be evaluated, where an operation is one of Python, or where it has not found a solution: the engine then has more
-means, and names the row.
+to be evaluated, where an operation is one of Python, or where rows are left to the engine: those that kernels do not
+know, and those that a kernel found no solution for, where the engine has more means, and names the row.
 
 A step of order 6 moves the atoms up to a hundred times, and each move rounds positions and velocities. Programs of
 several flights keep both in pairs of numbers, the value and what rounding took from it, of which only the last rounding
@@ -12,6 +12,7 @@ of a step remains.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -22,22 +23,21 @@ from numba.extending import intrinsic
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
-from kcons.solvers.called_solvers import caller_of
-from kcons.solvers.fused_distances import MORE, packed_positions, packed_tangents
+from kcons.solvers.called_solvers import MORE, caller_of, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import bits, flat, integers, piece, view
-from kcons.solvers.sparse.step_control import MANY_ITERATIONS
+from kcons.solvers.tolerances import MANY_ITERATIONS
 
-#: What a row tells the kernel to do: nothing, since it is for Python; take the kick, which all do; fly; project
-#: velocities; call a function; end a step.
-PYTHON, KICK, FLY, PROJECT, CALL, END = range(6)
+#: What a row tells the kernel to do: nothing, since it is for Python; take the kick, which all do; fly; fly along great
+#: circles; project velocities; call a function; end a step.
+PYTHON, KICK, FLY, CIRCLE, PROJECT, CALL, END = range(7)
 #: What is where in a row: one of these; which array has the positions before and after (0: those where forces were last
 #: evaluated, 1: those where they will be next, 2: those that nobody sees); the length of the flight, or of the time
 #: that the function is over, and the kick before it, as fractions of the step; whose forces; the function's address.
 VERB, HERE, THERE, LENGTH, PUSH, GROUP, ADDRESS = range(7)
 WIDTH = 7
-#: What a room begins with: whether what rounding takes is kept, the iterations of the last flight, and whether all was
-#: far from the origin at the end of the last step.
-PAIRS, ITERATIONS, FAR, ROOM = range(4)
+#: What a room begins with: whether what rounding takes is kept, whether rows are left to the engine, the iterations of
+#: the last flight, and whether all was far from the origin at the end of the last step.
+PAIRS, ENGINE, ITERATIONS, FAR, ROOM = range(5)
 
 _POINTS, _NUMBERS = numba.float64[:, ::1], numba.float64[::1]
 #: Of functions that programs call, (x, v, forces, time, numbers, tables): 0, or what else than 0 says that nothing has
@@ -84,19 +84,19 @@ def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ig
         `ROOM` numbers, with pairs three arrays of the size of v (what rounding took from positions and from velocities,
         and room for positions), and numbers of the functions that the program calls.
     tables : ndarray
-        Of `PackedSystem`.
+        Of `kcons.steppers.stages.packed_system`.
 
     Returns
     -------
     int
-        Number of the operation that is left to Python, or -1 less this where only its solve is left: kick and flight
-        are done.
+        Number of the operation that is left to Python, since it is Python's, the end of a march, or has a kick by
+        forces that are not finite; -1 less this where only its solve is left: kick and flight are done.
     """
     header, n = integers(tables), v.size
     weights, held = piece(tables, header, MORE), piece(header, header, MORE + 1)
     program, forces, room = flat(program), flat(forces), flat(room)
     x, out, v = _points(flat(x), 0, n), _points(flat(out), 0, n), _points(flat(v), 0, n)
-    pairs, low, push, spare, first = room[PAIRS] != 0.0, weights, v, v, ROOM
+    pairs, engine, low, push, spare, first = room[PAIRS] != 0.0, room[ENGINE] != 0.0, weights, v, v, ROOM
     if pairs:
         low, push, spare = room[ROOM : ROOM + n], _points(room, ROOM + n, n), _points(room, ROOM + 2 * n, n)
         first += 3 * n
@@ -104,8 +104,6 @@ def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ig
     while True:
         row = WIDTH * k
         verb = int(program[row])
-        if verb == PYTHON:
-            return k
         here = _place(program[row + HERE], x, out, spare)
         if verb == END:
             far = held.size and beyond(here, held, held[0], piece(tables, header, MORE + 2)[0])
@@ -116,31 +114,33 @@ def perform(at, more, dt, program, x, out, v, forces, room, tables):  # type: ig
                 low[:] = 0.0
             more, k = False, 0
             continue
-        h, kick, f = program[row + LENGTH] * dt, program[row + PUSH] * dt, weights
-        if kick != 0.0:
-            begin = int(program[row + GROUP]) * n
-            f = forces[begin : begin + n]
-        if verb == FLY:
+        h, kick, begin = program[row + LENGTH] * dt, program[row + PUSH] * dt, int(program[row + GROUP]) * n
+        f = forces[begin : begin + n] if kick != 0.0 else weights
+        if verb in (FLY, CIRCLE):
             there = _place(program[row + THERE], x, out, spare)
-            if pairs:
+            if verb == CIRCLE:
+                sound = fly_circles(here, low, v, push, kick, f, weights, h, there, piece(tables, header, MORE + 3))
+            elif pairs:
                 sound = fly(here, low, v, push, kick, f, weights, h, there)
             else:
                 sound = fly_once(here, v, kick, f, weights, h, there)
             if not sound:
                 return k
-            took = packed_positions(there, here, push, 1.0 / h, tables)
-            room[ITERATIONS] = took
-            if not 0 <= took <= MANY_ITERATIONS:
-                return -1 - k
+            if verb == FLY:
+                took = -1 if engine else packed_positions(there, here, push, 1.0 / h, tables)
+                room[ITERATIONS] = took
+                if not 0 <= took <= MANY_ITERATIONS:
+                    return -1 - k
         else:
-            sound = land(v, push, kick, f, weights) if pairs else add_kick(v, kick, f, weights)
-            if not sound:
+            sound = True
+            if verb != PYTHON or h != 0.0:  # not between a flight and the forces after it
+                sound = land(v, push, kick, f, weights) if pairs else add_kick(v, kick, f, weights)
+            if verb == PYTHON or not sound:
                 return k
             if verb == PROJECT:
-                if not (all_finite(here) and packed_tangents(here, v, tables) and all_finite(v)):
+                if engine or not (all_finite(here) and packed_tangents(here, v, tables) and all_finite(v)):
                     return -1 - k
             elif verb == CALL:
-                begin = int(program[row + GROUP]) * n
                 f = forces[begin : begin + n]
                 if _call(int(program[row + ADDRESS]), (here, v, f, h, numbers, tables)) != 0:
                     return -1 - k
@@ -255,6 +255,55 @@ def fly_once(x, v, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     for i in range(a.size):
         b[i] += kick * w[i] * g[i]
         c[i] = a[i] + h * b[i]
+    return sound
+
+
+@njit(cache=True, nogil=True)
+def fly_circles(x, x_low, v, push, kick, f, weights, h, out, spheres):  # type: ignore[no-untyped-def]
+    """The same in free flight, with atoms of spheres on great circles: exact, without iteration or a limit on h.
+
+    n = (x - c)/R turns in the plane of n and v by |v| h/R: x1 = c + R (n cos + e sin), v1 = |v| (e cos - n sin), with
+    e = v/|v|. `spheres` has c and R of each atom; R is 0 for atoms that are free, and -1 for those at rest.
+
+    References
+    ----------
+    Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
+    """
+    sound = kick == 0.0 or all_finite(f)
+    a, a_low, b, p, c = flat(x), flat(x_low), flat(v), flat(push), flat(out)
+    g, w = flat(f), flat(weights)
+    for i in range(a.size):
+        change = p[i] + kick * w[i] * g[i]
+        total = b[i] + change
+        p[i] = change - (total - b[i])
+        b[i] = total
+    for i in range(0, a.size, 3):
+        r = spheres[4 * (i // 3) + 3]
+        d0 = (a[i] - spheres[4 * (i // 3)]) + a_low[i]
+        d1 = (a[i + 1] - spheres[4 * (i // 3) + 1]) + a_low[i + 1]
+        d2 = (a[i + 2] - spheres[4 * (i // 3) + 2]) + a_low[i + 2]
+        length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2) if r > 0.0 else 1.0
+        outward = (d0 * b[i] + d1 * b[i + 1] + d2 * b[i + 2]) / length
+        across = 0.0
+        for k, d in enumerate((d0, d1, d2)):
+            across += (b[i + k] - outward * (d / length)) ** 2
+        speed = math.sqrt(across)
+        angle = speed * h / r if r > 0.0 else 0.0
+        # sin(angle)/speed and cos(angle) - 1, also for atoms at rest.
+        sine = h / r * (math.sin(angle) / angle) if angle != 0.0 else h / max(r, 1e-300)
+        less = -2.0 * math.sin(0.5 * angle) ** 2
+        for k, d in enumerate((d0, d1, d2)):
+            j, n = i + k, d / length
+            change = h * b[j] + (h * p[j] + a_low[j])
+            if r > 0.0:
+                u = b[j] - outward * n
+                change = a_low[j] + ((r * n - d) + r * (n * less + u * sine))
+                p[j] += u * less - n * (across * sine) - outward * n
+            there = a[j] + change
+            a_low[j] = change - (there - a[j])
+            if r < 0.0:
+                there, a_low[j] = a[j], 0.0
+            c[j] = there
     return sound
 
 

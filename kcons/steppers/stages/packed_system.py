@@ -1,6 +1,6 @@
-"""All that is held by one system as the table that compiled steps read, where kernels know all of it.
+"""What compiled steps know of a system: 1/m, spheres, how far is far, and its rows where kernels know all of them.
 
-The tables are those of `solvers.fused_distances`: rigid triangles, chains and rows of all kinds that are at rest, each
+The tables are those of `solvers.called_solvers`: rigid triangles, chains and rows of all kinds that are at rest, each
 with its solver, behind one array of numbers.
 """
 
@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import Motion
-from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.called_solvers import Addressable, CalledSolver, pack_solver_tables, set_lattice
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver
-from kcons.solvers.distance_clusters import DistanceClusters
-from kcons.solvers.fused_distances import packed, set_lattice
+from kcons.solvers.distance_clusters import SimdClusterSolver
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
+from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 from kcons.solvers.sparse.row_functions import COUNT
 
@@ -30,51 +31,37 @@ MOST_ROWS = 96
 #: Chains have a kernel of their own, which costs as much as that for all shapes on so many rows, and so many more a
 #: slot of eight lanes; where others are held so that both are called, on more.
 CHAIN_ROWS, CHAIN_ROWS_BESIDES, ROWS_A_SLOT = 20, 40, 2
-#: No number of iterations.
-_UNKNOWN = -1.0
 
 
 class PackedSystem:
-    """What compiled steps know of one system: its rows and the cell, 1/m, and how far from the origin is far.
+    """All rows of a system and its cell as the tables of compiled steps.
 
     Parameters
     ----------
     motion : Motion
     found : PackedRows
-        All its rows, from `packed_rows`, with the rest of `made_of` behind them.
-    made_of : tuple
-        What `of` was given.
+        From `packed_rows`.
+    more : tuple of ndarray
+        What is behind the rows, see `more_tables`.
     """
 
-    def __init__(self, motion: Motion, found: PackedRows, made_of: tuple[Any, ...]) -> None:
-        self.motion = motion
+    def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
+        self.motion, self._more = motion, more
         self._tables, self._called = found
-        self._made_of = made_of
         self._cell, self._sources = motion.cell, motion.sources
         self._lattice = motion.lattice
-        #: Those that the engine was told of last.
-        self.iterations = _UNKNOWN
+        #: Those that the engine was told of last; -1: of none.
+        self.iterations = -1.0
         set_lattice(self._tables, self._lattice)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).of, self._made_of  # addresses are of no use elsewhere
+        return type(self).of, (self.motion, *self._more)  # addresses are of no use elsewhere
 
     @classmethod
-    def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> PackedSystem | None:
-        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows.
-
-        Parameters
-        ----------
-        motion : Motion
-        weights : ndarray, shape (n_atoms, 3)
-            1/m.
-        held : ndarray of int
-            Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
-        far : float
-            The system is far if the first is this many times farther from the origin than from any other.
-        """
-        found = packed_rows(motion, weights.ravel(), held, np.array([far]))
-        return None if found is None else cls(motion, found, (motion, weights, held, far))
+    def of(cls, motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
+        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows."""
+        found = packed_rows(motion, *more)
+        return None if found is None else cls(motion, found, more)
 
     @property
     def tables(self) -> FloatArray:
@@ -97,11 +84,60 @@ class PackedSystem:
             self.motion.took(int(iterations))
 
 
+def more_tables(
+    weights: FloatArray, held: IntArray, far: float, spheres: FloatArray | None
+) -> tuple[NDArray[Any], ...]:
+    """What is behind the rows in the tables.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (n_atoms, 3)
+        1/m.
+    held : ndarray of int
+        Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
+    far : float
+        The system is far if the first is this many times farther from the origin than from any other.
+    spheres : ndarray, shape (n_atoms, 4), or None
+        From `spheres_of`.
+    """
+    return weights.ravel(), held, np.array([far]), np.zeros(0) if spheres is None else spheres.ravel()
+
+
+def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
+    """The tables where all rows are left to the engine."""
+    none = np.zeros((0, 2), dtype=np.int64)
+    return pack_solver_tables([], none[:, 0], np.zeros((0, 3)), *more)
+
+
+def spheres_of(motion: Motion) -> FloatArray | None:
+    """Center and radius of each atom where all rows keep one atom on a resting sphere, or at rest; otherwise None.
+
+    The radius of atoms that are free is 0, of those at rest -1.
+    """
+    found, none = np.zeros((motion.n_atoms, 4)), np.zeros(0, dtype=np.int64)
+    held, resting = [none], [none]
+    for item in motion.constraint_set.constraints:
+        if item.moving:
+            return None
+        if isinstance(item, Sphere):
+            held.append(item.atoms[:, 0])
+            found[held[-1], :3], found[held[-1], 3] = item.center, item.target_at(0.0)
+        elif item.family == "FixedAtoms":
+            resting.append(item.atoms.ravel())
+        else:
+            return None
+    atoms, still = np.concatenate(held), np.concatenate(resting)
+    if not len(atoms) or len(np.unique(atoms)) != len(atoms) or np.isin(atoms, still).any():
+        return None
+    found[still, 3] = -1.0
+    return found
+
+
 class PackedRows(NamedTuple):
     """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
 
     tables: FloatArray
-    called: list[CalledSolver]
+    called: list[Addressable]
 
 
 def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
@@ -121,9 +157,9 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     triangles: RigidTriangles | None = None
     chains: Chains | None = None
     rows: list[IntArray] = [np.zeros(0, dtype=np.int64)]
-    mixed = [solver for solver in plan.solvers if not isinstance(solver, DistanceClusters)]
+    mixed = [solver for solver in plan.solvers if not isinstance(solver, SimdClusterSolver | SparseDistances)]
     for solver in plan.solvers:
-        if isinstance(solver, DistanceClusters):
+        if isinstance(solver, SimdClusterSolver | SparseDistances):
             if triangles is None and not compact and not mixed and isinstance(solver, RigidTriangles):
                 triangles = solver
             elif chains is None and not mixed and isinstance(solver, Chains):
@@ -139,12 +175,16 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     if mixed and (held.images is not None or sum(len(each.rows) for each in mixed) > MOST_ROWS):
         return None
     # Solvers of their own, for the atoms of the whole system: those of the plan may be at work for another one.
-    called = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
-    pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
-    lengths = held.target(0.0)[others]
-    places, numbers = plan.pinned_targets(None), held.touched if compact else None
-    given = triangles, chains, pairs, lengths, inverse_masses, pinned, places
-    return PackedRows(packed(*given, *more, numbers=numbers, late=plan.late[others], called=called), called)
+    called: list[Addressable] = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
+    if len(others):
+        pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64)
+        numbers, lengths = np.arange(len(others)), held.target(0.0)[others]
+        called.append(SparseDistances(numbers, pairs, lengths, inverse_masses, plan.late[others]))
+    if triangles is not None:
+        called.append(triangles.packed())
+    if chains is not None:
+        called.append(chains.packed(held.touched if compact else None))
+    return PackedRows(pack_solver_tables(called, pinned, plan.pinned_targets(None), *more), called)
 
 
 def _solver_like(

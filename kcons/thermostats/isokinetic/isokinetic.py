@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
-from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
+from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
 from kcons.thermostats.freedom import (
     LOOK_AT,
     Momentum,

@@ -17,7 +17,7 @@ import numpy as np
 
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
-from kcons.solvers.fused_distances import MORE, packed_tangents
+from kcons.solvers.called_solvers import MORE, packed_tangents
 from kcons.solvers.kernels.array_views import flat, integers, piece
 from kcons.steppers.stages.compiled_operations import all_finite
 

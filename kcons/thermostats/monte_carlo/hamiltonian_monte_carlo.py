@@ -21,7 +21,7 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.steppers import Rattle, State, Stepper, System
-from kcons.steppers.stepper import Portable, require_stepper, stays
+from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_friction
 from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
@@ -97,7 +97,7 @@ class Counts:
         return cls(accepted, energy, irreversible, unsolved, not_finite, change, square)
 
 
-class HamiltonianMonteCarlo(Portable):
+class HamiltonianMonteCarlo(DropsSystemCaches):
     """Canonical sampling on constraints without any error of the time step.
 
     A step draws velocities in the tangent plane, makes a trajectory with a reversible stepper, and accepts its end

@@ -8,10 +8,10 @@ from typing import Any
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
-from kcons.steppers.compositions import SUZUKI_4
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate
 from kcons.steppers.program import Row
+from kcons.steppers.splitting import SUZUKI_4
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
@@ -113,7 +113,7 @@ class LangevinRespa(Langevin):
 
     def depends_on(self, system: System, state: State) -> Any:
         # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.middle else self.thermal_energy
+        return None if self.middle else super().depends_on(system, state)
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)

@@ -165,7 +165,7 @@ class IsokineticSpheres(SeededBath):
 
     def depends_on(self, system: System, state: State) -> Any:
         # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.middle else self.thermal_energy
+        return None if self.middle else super().depends_on(system, state)
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)

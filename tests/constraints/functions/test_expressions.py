@@ -44,17 +44,12 @@ def test_what_is_no_formula_is_named(formula, item, message):
 #: What takes for ever or all memory, or is no formula in other ways: some text, and what is said of it.
 FROM_OTHERS = {
     "x1*9**9**9": r"9 \*\* 9 \*\* 9 is inf",
-    "x1*10**-9**9": "a power above 1000|a number above",
-    "x1*0.5**10**9": "a power above 1000",
+    "x1*10**-9**9": "its gradient is zero",
     "x1+2**2**40": "is inf",
-    "x1**(2**40)": "a power above 1000",
-    "(((9*x1)**99)**99)**99": "a power above 1000",
-    "exp(1000*(1000*(1000*log(9*x1))))": "a power above 1000",
     "pi**pi**pi**pi*x1": "is inf",
-    "x1*1e200*1e200": "a number above",
-    "x1*1e999": "a number above",
-    "x1+" + "9" * 400: "a number above",
-    "x1+0x" + "f" * 4000: "a number above",
+    "x1*1e999": "a number that is too large",
+    "x1+" + "9" * 400: "a number that is too large",
+    "x1+0x" + "f" * 4000: "a number that is too large",
     "x1+log(0)": "is -inf",
     "x999999": "names atom 999999 of a row and not atom 1",
     "x99999999999999999999999": "is not known",
@@ -80,6 +75,21 @@ def test_formulas_without_bound_are_refused_at_once(formula):
 
 
 @pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        ("x1**(2**40)", 1.0),
+        ("(((9*x1)**99)**99)**99", np.inf),
+        ("(" * 40 + "x1" + "**99)" * 40, 1.0),
+        ("exp(1000*(1000*(1000*log(9*x1))))", np.inf),
+        ("x1*1e200*1e200", np.inf),
+    ],
+)
+def test_large_powers_are_computed_as_other_numbers_are(formula, value):
+    with np.errstate(all="ignore"):
+        assert code_of(formula, 1, ()).first(np.ones(1), np.ones(1), np.ones(1), 0.0)[0] == value
+
+
+@pytest.mark.parametrize(
     ("formula", "found"),
     [
         ("(x1 - x2 + y1 - y2)**60", True),  # multiplied out it has thousands of parts
@@ -88,7 +98,7 @@ def test_formulas_without_bound_are_refused_at_once(formula):
         ("abs(x1 - x2)", True),
         ("(x1 + y1 + z1 + x2 + y2 + z2)**60", False),
         ("abs(x1 - 5e8) + x1 + x1 - x2", False),  # on this side of the wall it is x1 - x2 + 5e8
-        ("x1 - x2 + 1e-30*x1", False),
+        ("x1 - x2 + 1e-8*x1", False),
         ("exp(exp(exp(exp(x1 - x2))))", True),
         ("exp(exp(exp(exp(x1 + x2))))", False),
         ("(x1 - x2)**((x1 - x2)**((x1 - x2)**(x1 - x2)))", True),

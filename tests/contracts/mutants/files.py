@@ -155,8 +155,8 @@ MUTANTS = [
     ),
     (
         "motion/failures.py",
-        '        here, step = ahead, ahead - here\n    return ""',
-        "    return _straightened(constraint_set, numbers, *request[1::-1], rows)",
+        '            here, step = ahead, ahead - here\n        return ""',
+        "        return self._straightened(*request[1::-1], rows)",
         "tests/motion/test_failures.py::test_a_dihedral_that_is_passed_in_small_parts_is_not_named",
     ),
     (
@@ -172,7 +172,7 @@ MUTANTS = [
         "tests/constraints/periodic/test_places.py::test_a_molecule_is_the_same_in_the_cell_as_in_open_space",
     ),
     (
-        "motion/local_projections.py",
+        "motion/solver_sequence.py",
         "                moved = None if places is None else rows.moved_places(places, x)",
         "                moved = None",
         "tests/constraints/periodic/test_places.py::test_a_molecule_is_the_same_in_the_cell_as_in_open_space",
@@ -208,7 +208,7 @@ MUTANTS = [
         "tests/constraints/periodic/test_images.py::test_a_chain_of_moving_bonds_may_open_beyond_half_the_cell",
     ),
     (
-        "solvers/sparse/step_control.py",
+        "solvers/tolerances.py",
         "FLAT = 0.01",
         "FLAT = 0.0",
         "tests/solvers/sparse/test_mixed_rows.py::test_a_dihedral_that_turns_over_has_no_solution_far_away",

@@ -33,9 +33,9 @@ MUTANTS = [
         "tests/models/growth/test_constrained.py::test_dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
     ),
     (
-        "steppers/stages/great_circles.py",
-        "((self.radii * n - d) + self.radii",
-        "(self.radii",
+        "steppers/stages/compiled_operations.py",
+        "((r * n - d) + r",
+        "(r",
         "tests/steppers/test_flights.py::test_great_circles_end_on_the_sphere_wherever_they_start",
     ),
     (

@@ -57,8 +57,8 @@ MUTANTS = [
     ),
     (
         "constraints/constraint.py",
-        "if self.squared and not (target > 0).all():",
-        "if not self.squared and not (target > 0).all():",
+        "if self.positive and not (target > 0).all():",
+        "if not self.positive and not (target > 0).all():",
         "tests/constraints/test_target.py::test_a_distance_that_moves_below_zero_is_refused_there",
     ),
     (

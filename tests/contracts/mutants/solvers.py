@@ -16,33 +16,33 @@ MUTANTS = [
     ),
     (
         "constraints/functions/expressions.py",
-        "power *= max(abs(evaluated(node.right, known)), 1.0)",
-        "power = max(abs(evaluated(node.right, known)), 1.0)",
+        "    what = undefined_part(tree, known)\n",
+        "    what = None\n",
         "tests/constraints/functions/test_expressions.py::test_formulas_without_bound_are_refused_at_once",
     ),
     (
         "constraints/functions/expressions.py",
-        "lambda value: next(signs) * value",
-        "abs",
+        'sympy.Symbol(f"sign of {inner}")',
+        "sympy.S.NegativeOne",
         "tests/constraints/functions/test_expressions.py::test_shifts_are_found_out_where_multiplying_out_has_no_end",
     ),
     # -- any rows --
     (
-        "solvers/general_clusters.py",
-        "SPEED_TOLERANCE = 1e-11",
-        "SPEED_TOLERANCE = 1e-7",
+        "solvers/tolerances.py",
+        "DENSE_SPEED_TOLERANCE = 1e-11",
+        "DENSE_SPEED_TOLERANCE = 1e-7",
         "tests/solvers/test_general_clusters.py::test_velocities_that_cannot_be_tangent_are_refused",
     ),
     (
         "solvers/general_clusters.py",
-        "np.maximum(1e-14, 2 * _EPS",
-        "np.maximum(1e-10, 2 * _EPS",
+        "np.maximum(ROUNDING, 2 * EPS",
+        "np.maximum(1e-10, 2 * EPS",
         "tests/solvers/test_general_clusters.py::test_no_more_is_left_than_rounding",
     ),
     (
         "solvers/general_clusters.py",
-        "2 * _EPS * reach / self._scale",
-        "2e4 * _EPS * reach / self._scale",
+        "2 * EPS * reach / self._scale",
+        "2e4 * EPS * reach / self._scale",
         "tests/solvers/test_general_clusters.py::test_no_more_is_left_than_rounding",
     ),
     (
@@ -65,85 +65,85 @@ MUTANTS = [
     ),
     # -- distances of any connection --
     (
-        "solvers/sparse/step_control.py",
+        "solvers/tolerances.py",
         "NEWTON_TOLERANCE = 4e-15",
         "NEWTON_TOLERANCE = 4e-11",
-        "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
+        "tests/solvers/test_distance_solvers.py::test_matches_dense_newton[sparse-comb]",
     ),
     (
         "solvers/sparse/distances.py",
         "if i == j2:\n                total -= w[i]",
         "if i == j2:\n                total += w[i]",
-        "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
+        "tests/solvers/test_distance_solvers.py::test_matches_dense_newton[sparse-comb]",
     ),
     (
         "solvers/sparse/distances.py",
         "second_vector(state, 8 * k)) > 0.0):",
         "second_vector(state, 8 * k)) > -1e300):",
-        "tests/solvers/sparse/test_distances.py::test_failure_changes_nothing_and_names_the_cluster[flipped]",
+        "tests/solvers/test_distance_solvers.py::test_failure_changes_nothing_and_names_the_cluster[turned-sparse-methane]",
     ),
     (
         "solvers/sparse/distances.py",
         "goal = number(rates, k) * np.sqrt(s2) if driven",
         "goal = number(rates, k) * s2 if driven",
-        "tests/solvers/sparse/test_distances.py::test_tangents_match_dense_solve[True-comb]",
+        "tests/solvers/test_distance_solvers.py::test_tangents_match_dense_solve[True-sparse-comb]",
     ),
     # -- eight small clusters at once --
     (
         "solvers/small_clusters.py",
-        "kept = kept and all_within(groups.TINY, inner)",
+        "kept = kept and all_within(TINY, inner)",
         "kept = kept and all_within(-1e300, inner)",
-        "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-flipped]",
+        "tests/solvers/test_distance_solvers.py::test_failure_changes_nothing_and_names_the_cluster[turned-small-bond]",
     ),
     (
         "solvers/small_clusters.py",
         "kept_points, n_local)\n",
         "kept_points, 0)\n",
-        "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-far]",
+        "tests/solvers/test_distance_solvers.py::test_failure_changes_nothing_and_names_the_cluster[far-small-bond]",
     ),
     (
         "solvers/small_clusters.py",
         "rate = rate * square_root(square)",
         "rate = rate * square",
-        "tests/solvers/test_small_clusters.py::test_tangents_match_dense_solve[True-bond]",
+        "tests/solvers/test_distance_solvers.py::test_tangents_match_dense_solve[True-small-bond]",
     ),
     # -- triangles --
     (
         "solvers/rigid_triangles.py",
         "all_within(TINY, ps) and all_within(TINY, qt) and all_within(TINY, us)",
         "all_within(TINY, ps) and all_within(TINY, qt)",
-        "tests/solvers/test_rigid_triangles.py::test_a_third_side_that_turned_round_is_no_solution",
+        "tests/solvers/test_distance_solvers.py::test_a_third_side_that_turned_round_is_no_solution",
     ),
     (
         "solvers/rigid_triangles.py",
         "c10, c11, c12 = -(a12 * a20 + a10 * a22)",
         "c10, c11, c12 = -(a12 * a20 - a10 * a22)",
-        "tests/solvers/test_rigid_triangles.py::test_newton_and_a_chord_step_gain_together",
+        "tests/solvers/test_distance_solvers.py::test_newton_and_a_chord_step_gain_together",
     ),
     (
         "solvers/rigid_triangles.py",
         "restore_points(velocities, atoms, undo, group, 3, kept_points, 3)",
         "restore_points(velocities, atoms, undo, group, 3, kept_points, 0)",
-        "tests/solvers/test_rigid_triangles.py::test_failure_changes_nothing_and_names_the_triangle[far]",
+        "tests/solvers/test_distance_solvers.py::test_failure_changes_nothing_and_names_the_cluster[far-triangles-29]",
     ),
     # -- chains --
     (
         "solvers/chains/sweeps.py",
         "vx, vy, vz = vx - dx * inverse_dt, vy - dy * inverse_dt, vz - dz * inverse_dt",
         "vx, vy, vz = vx - dx * inverse_dt, vy - dy * inverse_dt, vz - dz",
-        "tests/solvers/chains/test_open_chains.py::test_matches_dense_newton[short-free]",
+        "tests/solvers/test_distance_solvers.py::test_matches_dense_newton[chains-short-free]",
     ),
     (
         "solvers/chains/sweeps.py",
         "dx = dx - w * (sx * later - px * later_p)",
         "dx = dx - w * (sx * later)",
-        "tests/solvers/chains/test_open_chains.py::test_ten_thousand_bonds[straight]",
+        "tests/solvers/test_distance_solvers.py::test_ten_thousand_bonds[straight]",
     ),
     (
         "solvers/chains/sweeps.py",
         "rx + real * (gx - fx)",
         "rx + real * (gx + fx)",
-        "tests/solvers/chains/test_open_chains.py::test_ten_thousand_bonds[free]",
+        "tests/solvers/test_distance_solvers.py::test_ten_thousand_bonds[free]",
     ),
     # -- rows of several kinds --
     (
@@ -178,10 +178,10 @@ MUTANTS = [
         "tests/solvers/sparse/test_row_values.py::test_rows_with_a_period_miss_by_the_shorter_way",
     ),
     (
-        "solvers/sparse/row_functions.py",
+        "constraints/internal.py",
         "hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)",
         "hb = -(hx * gx + hy * gy + hz * gz) / (b2 * size)",
-        "tests/solvers/sparse/test_row_values.py::test_rows_equal_their_constraints",
+        "tests/constraints/test_constraint.py::test_gradient_and_curvature_by_taylor_remainder[Dihedral-0]",
     ),
     (
         "solvers/sparse/row_values.py",
@@ -192,15 +192,15 @@ MUTANTS = [
     # -- functions --
     (
         "solvers/called_solvers.py",
-        "add(words, v, inv_dt)",
-        "add(words, v, 1.0)",
+        "_call_apply(words[k + 2], (v, inv_dt, mine))",
+        "_call_apply(words[k + 2], (v, 1.0, mine))",
         "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
     ),
     (
-        "solvers/sparse/row_functions.py",
+        "constraints/surface.py",
         "f, g = h / (rho * q), up / q",
         "f, g = h / rho, up / q",
-        "tests/solvers/test_single_rows.py::test_rows_agree_with_the_dense_solver[Torus-open]",
+        "tests/constraints/test_constraint.py::test_gradient_and_curvature_by_taylor_remainder[Torus-0]",
     ),
     (
         "solvers/sparse/row_functions.py",
@@ -231,12 +231,12 @@ MUTANTS = [
         "solvers/kernels/eight_wide.py",
         '_EIGHT.all_true(builder, builder.fcmp_ordered("<=", value, limit))',
         '_EIGHT.all_true(builder, builder.fcmp_unordered("<=", value, limit))',
-        "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-nan]",
+        "tests/solvers/test_distance_solvers.py::test_failure_changes_nothing_and_names_the_cluster[nan-small-bond]",
     ),
     (
         "solvers/kernels/two_and_four_wide.py",
-        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, args[2], args[2], [0, 1]), flags=FLAGS)",
-        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, args[2], args[2], [0, 0]), flags=FLAGS)",
-        "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
+        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, value, value, [0, 1]), flags=FLAGS)",
+        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, value, value, [0, 0]), flags=FLAGS)",
+        "tests/solvers/test_distance_solvers.py::test_matches_dense_newton[sparse-comb]",
     ),
 ]

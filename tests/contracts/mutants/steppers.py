@@ -3,7 +3,7 @@
 MUTANTS = [
     # -- steppers, thermostats, arrays --
     (
-        "motion/local_projections.py",
+        "motion/solver_sequence.py",
         "np.copyto(velocities, saved[1])",
         "pass",
         "tests/motion/test_motion.py::test_velocities_are_put_back_when_a_later_solver_fails",
@@ -15,13 +15,13 @@ MUTANTS = [
         "tests/steppers/test_flights.py::test_impulses_act_along_the_gradients_of_the_time_of_the_start",
     ),
     (
-        "motion/local_projections.py",
+        "motion/solver_sequence.py",
         "rows.target(0.5 * (reference_time + time))",
         "rows.target(reference_time)",
         "tests/steppers/test_flights.py::test_driven_velocities_hold_at_the_middle_of_the_time",
     ),
     (
-        "motion/local_projections.py",
+        "motion/solver_sequence.py",
         "rows.target(0.5 * (reference_time + time))",
         "rows.target(reference_time + 0.5 * flight)",
         "tests/steppers/stages/test_friction.py::test_rows_of_velocities_keep_order_and_way_back",
@@ -39,7 +39,7 @@ MUTANTS = [
         "tests/solvers/sparse/test_row_functions.py::test_rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
     ),
     (
-        "solvers/sparse/row_functions.py",
+        "constraints/velocity.py",
         "half = 0.5 * (bx * gx",
         "half = -0.5 * (bx * gx",
         "tests/solvers/sparse/test_row_functions.py::test_gradients_of_rows_of_velocities[KnifeEdge]",
@@ -120,7 +120,7 @@ MUTANTS = [
         "steppers/interpreter.py",
         "self.made += 1\n        self.number += 1",
         "self.made += 1",
-        "tests/steppers/test_splitting.py::test_errors_name_the_step",
+        "tests/steppers/test_interpreter.py::test_errors_name_the_step",
     ),
     (
         "steppers/interpreter.py",
@@ -130,9 +130,9 @@ MUTANTS = [
     ),
     (
         "steppers/interpreter.py",
-        "return True\n        if self.low is not None:\n            self.low.fill(0.0)",
-        "return True",
-        "tests/steppers/test_splitting.py::test_a_march_by_the_engine_is_the_same_to_the_last_bit",
+        "if self.low is not None:\n                    self.low.fill(0.0)\n                self._next_step()",
+        "self._next_step()",
+        "tests/steppers/test_interpreter.py::test_steps_in_kernels_are_those_of_the_engine",
     ),
     (
         "steppers/program.py",
@@ -143,6 +143,12 @@ MUTANTS = [
     (
         "steppers/program.py",
         "met[verb] += 1",
+        "pass",
+        "tests/thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part",
+    ),
+    (
+        "thermostats/langevin.py",
+        "numbers[PART] += 1.0",
         "pass",
         "tests/thermostats/multistep/test_respa.py::test_each_exchange_of_a_step_has_noise_of_its_own",
     ),
@@ -156,11 +162,11 @@ MUTANTS = [
         "steppers/stages/compiled_operations.py",
         "            if pairs:\n                low[:] = 0.0",
         "            if False:\n                low[:] = 0.0",
-        "tests/steppers/test_splitting.py::test_the_same_to_the_last_bit",
+        "tests/steppers/test_interpreter.py::test_steps_in_kernels_are_those_of_the_engine",
     ),
     (
         "thermostats/langevin.py",
-        "noise += (1.0 - keep) * kept",
+        "noise += (1.0 - math.exp(-thermostat.friction * dt)) * kept",
         "noise += kept",
         "tests/thermostats/test_langevin.py::test_momentum_is_left_alone_where_asked",
     ),
@@ -268,8 +274,8 @@ MUTANTS = [
     ),
     (
         "thermostats/correlated_series.py",
-        "more = [], [], np.expm1(_LOG_R)",
-        "more = [], [], 0.0 * _LOG_R",
+        "        more = np.expm1(log_r)",
+        "        more = 0.0 * log_r",
         "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[memory-3]",
     ),
     (
@@ -277,6 +283,12 @@ MUTANTS = [
         "_ALIKE * float(blocks @ blocks)",
         "float(blocks @ blocks)",
         "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[smooth]",
+    ),
+    (
+        "thermostats/correlated_series.py",
+        "for turn in (0.0, *_OSCILLATORS):",
+        "for turn in (0.0,):",
+        "tests/thermostats/test_correlated_series.py::test_errors_are_as_large_as_they_say[underdamped]",
     ),
     (
         "thermostats/correlated_series.py",
@@ -350,7 +362,7 @@ MUTANTS = [
         "plan/rank.py",
         "late[rows[order]] = left_over",
         "pass",
-        "tests/plan/test_rank.py::test_dependent_rows_are_eliminated_last",
+        "tests/plan/test_plan.py::test_dependent_rows_are_eliminated_last",
     ),
     (
         "motion/certificate.py",

@@ -4,8 +4,8 @@ MUTANTS = [
     # -- studies: what is kept, and what is shown --
     (
         "steppers/files.py",
-        "if not math.isfinite(value):",
-        "if False:",
+        "and not math.isfinite(value) else value",
+        "and False else value",
         "tests/steppers/test_files.py::test_data_as_json",
     ),
     (
@@ -76,26 +76,26 @@ MUTANTS = [
     ),
     (
         "free_energy/held_coordinates.py",
-        "result[j] += mixed[s]",
-        "result[j] += mixed[j]",
+        "result[:, j] += mixed[:, s]",
+        "result[:, j] += mixed[:, j]",
         "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
     ),
     (
         "free_energy/held_coordinates.py",
-        "bent[1 : 1 + d * d] @ metric.shares.T",
-        "bent[1 : 1 + d * d, -d:]",
+        "bent[:, 1 : 1 + d * d] @ metric.shares.swapaxes(1, 2)",
+        "bent[:, 1 : 1 + d * d, -d:]",
         "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
     ),
     (
         "free_energy/held_coordinates.py",
-        "respond @ (bent[1 + d * d :].sum(axis=0) - traces)",
-        "respond @ (bent[1 + d * d :].sum(axis=0) + traces)",
+        "bent[:, 1 + d * d :].sum(axis=1) - traces)",
+        "bent[:, 1 + d * d :].sum(axis=1) + traces)",
         "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
     ),
     (
         "free_energy/held_coordinates.py",
-        "(respond @ b - along @ force.ravel()",
-        "(respond @ b + along @ force.ravel()",
+        "(respond @ b[:, :, None] - pull)",
+        "(respond @ b[:, :, None] + pull)",
         "tests/free_energy/test_held_coordinates.py::test_multipliers_are_those_of_the_engine",
     ),
     (
@@ -118,8 +118,8 @@ MUTANTS = [
     ),
     (
         "free_energy/torsion_force.py",
-        "np.cross(x[self.group] - x[self.axis[1]], f",
-        "np.cross(x[self.group], f",
+        "arms = x[..., self.group, :] - x[..., self.axis[1:], :]",
+        "arms = x[..., self.group, :]",
         "tests/free_energy/test_torsion_force.py::test_the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy",
     ),
     (

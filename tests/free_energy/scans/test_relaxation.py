@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scan_systems import ANGLE, LENGTH, chain, threefold
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Dihedral, Distance, FixedAtoms
 from kcons.errors import ConvergenceError
+from kcons.free_energy.scans import relaxation
 from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import relax
 from kcons.motion import minimise
@@ -97,3 +99,28 @@ def test_undefined_internal_coordinates_are_told():
     met[4] = met[3]
     with pytest.raises(ConvergenceError, match="two atoms met"):
         relax(motion, lambda y: (0.0, np.ones_like(y)), internals, met, fmax=1e-3)
+
+
+def threads():
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_calculators_keep_their_threads_and_matrices_have_one(monkeypatch):
+    atoms, motion, start = setting([Dihedral([[0, 1, 2, 3]], 0.9)])
+    seen, eigh = {"calculator": set(), "matrices": set()}, np.linalg.eigh
+
+    def evaluate(y):
+        seen["calculator"] |= threads()
+        return forces_of(atoms)(y)
+
+    def counted(*given, **named):
+        seen["matrices"] |= threads()
+        return eigh(*given, **named)
+
+    monkeypatch.setattr(relaxation.np.linalg, "eigh", counted)
+    with threadpool_limits(2, user_api="blas"):
+        relax(motion, evaluate, Internals(atoms.numbers, start), start, fmax=0.05)
+        assert seen == {"calculator": {2}, "matrices": {1}} and threads() == {2}
+        with pytest.raises(ZeroDivisionError), relaxation.one_thread():
+            _ = 1 / 0
+        assert threads() == {2}

@@ -99,7 +99,7 @@ def begun(*arguments):
 def test_an_attempt_comes_back(tmp_path):
     rng = np.random.default_rng(1)
     attempt = Attempt(3, (1,), 2, memory=rng.normal(size=(2, 2, 3)), terms=[(0, 1), (0, 1, 2), (1, 2, 3, -1, 0)])
-    attempt.fill(rng.normal(size=(4, 3)), -1.5, 0.003, 7)
+    attempt.positions, attempt.energy, attempt.largest, attempt.evaluations = rng.normal(size=(4, 3)), -1.5, 0.003, 7
     made(tmp_path).keep(attempt)
     again = made(tmp_path).kept(3, (1,), 2)
     assert np.array_equal(again.positions, attempt.positions) and np.array_equal(again.memory, attempt.memory)

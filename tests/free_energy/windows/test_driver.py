@@ -167,25 +167,24 @@ def test_files_of_others_are_not_taken_for_windows(tmp_path, name):
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "precious"
 
 
-def begun_by_a_process(folder: Path, wait: float) -> subprocess.Popen[bytes]:
-    """A run with two workers that have begun."""
+def started(folder: Path, wait: float) -> subprocess.Popen[bytes]:
+    """A run with two workers in a process of its own."""
     path = os.pathsep.join([str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])])
     (folder / "script.py").write_text(SCRIPT)
     command = [sys.executable, str(folder / "script.py"), str(folder), "2", str(wait)]
-    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.DEVNULL)
-    while not (folder / "diary").exists() or len(diary(folder)) < 2:
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
+
+
+def test_workers_end_with_what_waits_for_them(tmp_path):
+    """Nothing is written any more, and nobody waits for the windows in hand; of Ctrl-C and SIGTERM see tests/cli."""
+    process = started(tmp_path, 1.5)
+    while not (tmp_path / "diary").exists() or len(diary(tmp_path)) < 2:
         assert process.poll() is None
         time.sleep(0.05)
-    return process
-
-
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_workers_end_with_what_waits_for_them(tmp_path, sent):
-    """However it ends: nothing is written any more, and nobody waits for the windows in hand."""
-    process = begun_by_a_process(tmp_path, 3.0)
-    process.send_signal(sent)
+    process.kill()
     assert process.wait(timeout=60) != 0
-    time.sleep(4.0)  # by then windows in hand would have been finished
+    time.sleep(2.5)  # by then windows in hand would have been finished
     assert not list((tmp_path / "out").glob("window-*")) and len(diary(tmp_path)) == 2
     _, result = run(tmp_path, PLACES[:1])
     assert result.failed == {} and not list((tmp_path / "out").glob("*.unfinished"))
@@ -204,15 +203,8 @@ def killed_again_and_again(folder: Path, kills: int) -> None:
     """Run in a process that is killed with all its children after random times, until it ends by itself."""
     rng = np.random.default_rng(3)
     finished: set[str] = set()
-    path = os.pathsep.join([str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])])
-    script = folder / "script.py"
-    script.write_text(SCRIPT)
     for attempt in range(kills + 1):
-        process = subprocess.Popen(
-            [sys.executable, str(script), str(folder), "2", "0.3"],
-            env={**os.environ, "PYTHONPATH": path},
-            start_new_session=True,
-        )
+        process = started(folder, 0.3)
         if attempt < kills:
             time.sleep(rng.uniform(0.5, 6.0))
             os.killpg(process.pid, signal.SIGKILL)

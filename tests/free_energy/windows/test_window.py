@@ -18,7 +18,7 @@ BONDS = [[0, 1], [1, 2], [2, 3], [2, 4]]
 
 
 def held(coordinates=None, others=()):
-    return Held(coordinates or {"turn": TURN}, list(others), X, np.ones(5), None, True, lambda: np.array(BONDS))
+    return Held(coordinates or {"turn": TURN}, list(others), X, np.ones(5), None, True, np.array(BONDS), None)
 
 
 def test_settings_are_plain_numbers():
@@ -52,7 +52,7 @@ AROUND = [[0, 1], [1, 2], [2, 3], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]]
 
 def ring(bonds=AROUND, others=()):
     pucker = {"pucker": Dihedral([[0, 1, 2, 3]])}
-    return Held(pucker, list(others), RING, np.ones(8), None, True, lambda: np.array(bonds))
+    return Held(pucker, list(others), RING, np.ones(8), None, True, np.array(bonds), None)
 
 
 def test_a_ring_comes_to_its_window_by_small_steps():

@@ -8,12 +8,12 @@ from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError
 from kcons.models.growth import (
+    EntropyLaw,
     EntropyRow,
     Hypercycle,
     Mixture,
     NoProduction,
     Populations,
-    PrescribedProduction,
     Relaxation,
     entropy_balance,
     solve,
@@ -272,7 +272,14 @@ def test_too_small_a_budget_must_be_meant():
     assert excesses(system.model, found) == pytest.approx(BUDGET * (0.5 + 0.5 * np.exp(-found.t / 2.0)), abs=1e-14)
 
 
-OWN = PrescribedProduction(lambda t: 0.1 * np.sin(t) ** 2, lambda t: 0.1 * np.sin(2 * t), until=4.0)
+class Own(EntropyLaw):
+    """Entropy is produced in waves."""
+
+    def produced(self, elapsed, excess0):
+        return 0.1 * np.sin(elapsed) ** 2
+
+    def excess_rate(self, elapsed, excess, excess0):
+        return -0.1 * np.sin(2 * elapsed)
 
 
 @pytest.mark.parametrize(
@@ -280,7 +287,7 @@ OWN = PrescribedProduction(lambda t: 0.1 * np.sin(t) ** 2, lambda t: 0.1 * np.si
     [
         (Relaxation(3.0), BUDGET * -np.expm1(-4.0 / 3.0)),
         (NoProduction(), 0.0),
-        (OWN, 0.1 * np.sin(4.0) ** 2),
+        (Own(), 0.1 * np.sin(4.0) ** 2),
     ],
     ids=["relaxation", "none", "own"],
 )
@@ -310,26 +317,6 @@ def test_entropy_produced_inside_and_exchanged(law):
     assert balance.reactions + balance.exchanged == pytest.approx(total, abs=1e-9)
 
 
-def test_prescriptions_are_checked_before_the_run():
-    steady = PrescribedProduction(lambda t: 0.1 * t, lambda t: 0.1, until=10.0)
-    with pytest.raises(BudgetError, match="equilibrium") as caught:
-        solve(Hypercycle().with_law(steady), (0.0, 1.0), X0)
-    assert caught.value.time == pytest.approx(BUDGET / 0.1, abs=0.01)
-    fed = PrescribedProduction(lambda t: -0.1 * t, lambda t: -0.1, until=100.0)
-    with pytest.raises(BudgetError, match="give up") as caught:
-        solve(Hypercycle().with_law(fed), (0.0, 1.0), X0)
-    # g is largest with the last species alone: 0.35.
-    assert caught.value.time == pytest.approx((0.35 + 1.0275294114572127) / 0.1, abs=0.1)
-
-
-@pytest.mark.parametrize("span", [(0.0, 3.0), (1.0, 0.0)], ids=["beyond", "before"])
-def test_a_prescribed_production_is_held_where_it_was_checked(span):
-    law = PrescribedProduction(lambda t: 0.01 * t, lambda t: 0.01, until=1.0)
-    with pytest.raises(InputError, match="known from the start until 1 after it"):
-        solve(Hypercycle(3).with_law(law), span, [0.2, 0.3, 0.5])
-    assert solve(Hypercycle(3).with_law(law), (1e6, 1e6 + 1), [0.2, 0.3, 0.5]).success
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -337,11 +324,6 @@ def test_a_prescribed_production_is_held_where_it_was_checked(span):
         (lambda: Relaxation(np.nan), "tau is nan"),
         (lambda: Relaxation(1.0, -0.1), "budget .* not negative"),
         (lambda: Relaxation(3.0, "all"), "budget is 'all'"),
-        (lambda: PrescribedProduction(lambda t: t, lambda t: 2.0, until=1.0), "integral of the rate"),
-        (lambda: PrescribedProduction(lambda t: 1.0 + t, lambda t: 1.0, until=1.0), "nothing .* at t = 0"),
-        (lambda: PrescribedProduction(lambda t: t, lambda t: 1.0, until=0.0), "until is 0"),
-        (lambda: PrescribedProduction(1.0, lambda t: 1.0, until=1.0), "produced is 1.0"),
-        (lambda: PrescribedProduction(lambda t: t, lambda: 1.0, until=1.0), "rate takes"),
         (lambda: EntropyRow(3, Relaxation(1.0)), "mixture is 3"),
         (lambda: EntropyRow(Mixture([0.1, 0.2]), 3.0), "law is 3.0"),
         (lambda: EntropyRow(Mixture([0.1, 0.2]), Relaxation(1.0)).bind(START), "the mixture has 2 species"),

@@ -12,7 +12,7 @@ from kcons.constraints import Custom, Cylinder, Ellipsoid, Formula, Plane, Spher
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse import row_functions
-from kcons.solvers.sparse.row_functions import GivenRows, plain_row, row_function
+from kcons.solvers.sparse.row_functions import GivenRows, row_function
 from kcons.solvers.sparse.rows_at_once import BLOCK, FEWEST, rows_at_once
 
 AXIS, OFF = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.0, 0.0])
@@ -53,7 +53,7 @@ def test_values_and_gradients_are_those_of_one_row(name, own):
     rows = ctypes.CFUNCTYPE(None, integer, numbers, numbers, integer, ctypes.c_double, numbers)
     row = ctypes.CFUNCTYPE(None, numbers, numbers, ctypes.c_double, numbers)
     columns = np.ascontiguousarray(x.T)
-    function = rows(rows_at_once(plain_row(item)).address)
+    function = rows(rows_at_once(item.row).address)
     function(n, columns.ctypes.data, table.ctypes.data, size if own else 0, time, together.ctypes.data)
     function = row(row_function(item, np.zeros(1)).address)
     for k in range(n):

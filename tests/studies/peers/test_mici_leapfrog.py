@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import beads as beads  # test systems of the tests alone
 import pytest
+import small_test_systems as small_test_systems  # a system that moves
 from peer_packages import check_order_two, need
 
 from kcons.comparison import test_systems
@@ -21,5 +21,5 @@ def test_refusals():
     need("mici")
     refuses = METHODS["mici"].refuses
     assert refuses(test_systems.build("sphere", 2)) is None
-    assert "cannot move" in refuses(test_systems.build("bead-rotating"))
+    assert "cannot move" in refuses(test_systems.build("breathing"))
     assert "dense" in refuses(test_systems.build("chain", 100))

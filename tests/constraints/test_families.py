@@ -1,0 +1,517 @@
+"""Families of constraints against numbers worked out by other means, and what each of them refuses."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from ase import Atoms
+from constraint_cases import MASSES, scattered
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from kcons import ConstraintSet, Motion
+from kcons.constraints import (
+    Angle,
+    CenterDistance,
+    CenterOfMass,
+    CustomVelocity,
+    Cylinder,
+    Dihedral,
+    Distance,
+    DistanceDifference,
+    Ellipsoid,
+    FixedAtoms,
+    Formula,
+    KnifeEdge,
+    Line,
+    LinearCombination,
+    LinearRelation,
+    LinearVelocity,
+    Plane,
+    RadiusOfGyration,
+    Rolling,
+    RowKind,
+    Sphere,
+    Torus,
+    from_dict,
+)
+from kcons.constraints.constraint_set import rows_like
+from kcons.errors import InputError, SingularGeometryError
+
+ORIGIN, UP = [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+#: Chlorine, hydrogen, bromine: 5 apart, then 12.
+TRANSFER = [[0, 1], [1, 2]]
+APART = np.array([ORIGIN, [3.0, 4.0, 0.0], [3.0, 4.0, 12.0]])
+
+
+def bent(degrees: float, first: float = 1.0, last: float = 1.0) -> np.ndarray:
+    """Three atoms with the vertex at the origin."""
+    theta = np.radians(degrees)
+    return np.array([[first, 0, 0], [0, 0, 0], [last * np.cos(theta), last * np.sin(theta), 0]])
+
+
+def twisted(degrees: float) -> np.ndarray:
+    phi = np.radians(degrees)
+    return np.array([[1.0, 0, -0.3], [0, 0, 0], [0, 0, 1.0], [np.cos(phi), np.sin(phi), 1.4]])
+
+
+def on_ellipsoid(axes: list[float], rotation: np.ndarray) -> np.ndarray:
+    y = np.random.default_rng(1).normal(size=3)
+    return np.array([[0.5, 0.1, 0.2] + rotation @ (y / np.linalg.norm(y) * axes)])
+
+
+ROTATION = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+SCATTERED = scattered(0)
+#: What is held, where, and what the coordinate is there.
+VALUES = {
+    "distance": (Distance([0, 1]), APART, [5.0]),
+    "difference": (DistanceDifference(TRANSFER, weights=[2.0, -1.0]), APART, [-2.0]),
+    **{f"angle {a}": (Angle([0, 1, 2]), bent(a, 1.3, 0.7), [np.radians(a)]) for a in (0.001, 20, 109.5, 179.9999)},
+    **{f"dihedral {a}": (Dihedral([0, 1, 2, 3]), twisted(a), [np.radians(a)]) for a in (-179.99, -90, -0.001, 0, 180)},
+    "sphere": (Sphere(0, [1.0, 0.0, 0.0]), [[1.0, 3.0, 4.0]], [5.0]),
+    "cylinder": (Cylinder(0, [0.0, 0.0, 7.0], [0.0, 0.0, 5.0]), [[3.0, 4.0, -100.0]], [5.0]),
+    "torus": (Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 5.0, 2.5]], [2.5]),
+    "torus, inside": (Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 2.5, 1.0]], [0.5]),
+    "ellipsoid": (Ellipsoid(0, [0.5, 0.1, 0.2], [1.0, 2.0, 4.0], ROTATION), on_ellipsoid([1, 2, 4], ROTATION), [0.0]),
+    "ellipsoid, outside": (Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [2.0]),
+    "elliptic cylinder": (
+        Ellipsoid(0, ORIGIN, [2.0, np.inf, 0.5]), [[2.0 * np.cos(0.3), 17.0, 0.5 * np.sin(0.3)]], [0.0]
+    ),
+    "plane": (Plane(0, [0.0, 3.0, 4.0]), [[9.0, 5.0, 5.0]], [7.0]),
+    "fixed": (FixedAtoms([2, 0]), APART, [3, 4, 12, 0, 0, 0]),
+    "combination": (LinearCombination([0, 1], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]]), APART, [-4.0]),
+    "relation": (LinearRelation([0], [1, 2], [0.25, 0.75]), APART, [-3.0, -4.0, -9.0]),
+    "centers": (
+        CenterDistance([0, 1, 2], [5, 7]), SCATTERED,
+        [math.dist(*(MASSES[g] @ SCATTERED[g] / MASSES[g].sum() for g in ([0, 1, 2], [5, 7])))],
+    ),
+    "center of mass": (
+        CenterOfMass([[0, 1, 2], [5, 3, 4]], axes=(2, 0)), SCATTERED,
+        [MASSES[g] @ SCATTERED[g, axis] / MASSES[g].sum() for g in ([0, 1, 2], [5, 3, 4]) for axis in (2, 0)],
+    ),
+    "gyration": (
+        RadiusOfGyration([0, 1, 2]), SCATTERED,
+        [np.sqrt(np.cov(SCATTERED[:3].T, aweights=MASSES[:3], ddof=0).trace())],
+    ),
+    "gyration, equal weights": (
+        RadiusOfGyration([0, 1, 2], mass_weighted=False), SCATTERED, [np.sqrt(SCATTERED[:3].var(axis=0).sum())]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_values(name):
+    item, x, expected = VALUES[name]
+    held = ConstraintSet(item.with_target(None), x, MASSES[: len(x)])
+    miss = held.measure(x) - expected
+    if item.period:
+        miss = (miss + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(miss).max() < 4e-15 * max(1, np.abs(expected).max())
+
+
+def slope(item, x):
+    return item.gradient(np.asarray(x)[item.atoms], 0.0)
+
+
+def test_gradients():
+    expected = [[-1.2, -1.6, 0.0], [1.2, 1.6, 1.0], [0.0, 0.0, -1.0]]
+    assert slope(VALUES["difference"][0], APART)[0] == pytest.approx(np.array(expected), abs=1e-15)
+    ring = Torus(0, ORIGIN, UP, 2.0)
+    assert np.allclose(slope(ring, [[1.5, 0.0, 0.0]]), [[[-1.0, 0.0, 0.0]]], atol=1e-15)
+    item = Ellipsoid(0, ORIGIN, [2.0, np.inf, 0.5])
+    assert slope(item, [[1.0, 5.0, 0.3]])[0, 0, 1] == 0.0
+    for degrees in (20.0, 90.0, 170.0, 179.0, 179.9, 179.9999):  # of order one where that of the cosine vanishes
+        size = np.linalg.norm(slope(Angle([0, 1, 2]), bent(degrees)))
+        assert size == pytest.approx(np.sqrt(4 - 2 * np.cos(np.radians(degrees))), rel=1e-9)
+
+
+def test_curvatures():
+    """Of moving arms by their polar angles; of distances by what is across them."""
+    v = np.array([[0.8, -0.6, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    found = VALUES["difference"][0].curvature(APART[None], v[None], 0.0)
+    assert found == pytest.approx([2 * 1 / 5 - 9 / 12], abs=1e-15)
+    far = np.array([[[1e6, 0.0, 0.0], [1e6 + 1.0, 0.0, 0.0]]])
+    across = np.array([[[0.0, 3.0, 0.0], [0.0, 0.0, 4.0]]])
+    assert Distance([0, 1]).curvature(far, across, 0.0)[0] == pytest.approx(25.0, rel=1e-15)
+    v = np.array([[[0.3, -0.4, 0], [0.1, 0.2, 0], [-0.5, 0.6, 0]]])
+    for degrees in (60.0, 179.0, 179.9, 179.9999):
+        r, expected = bent(degrees, 1.3, 0.7)[None], 0.0
+        for end, sign in ((0, -1), (2, 1)):
+            d, w = r[0, end] - r[0, 1], v[0, end] - v[0, 1]
+            expected += sign * -2 * (d @ w) * (d[0] * w[1] - d[1] * w[0]) / (d @ d) ** 2
+        assert Angle([0, 1, 2]).curvature(r, v, 0.0)[0] == pytest.approx(expected, rel=1e-8)
+
+
+POINTS = arrays(np.float64, (4, 3), elements=st.floats(-5, 5, allow_subnormal=False, width=32))
+VECTORS = arrays(np.float64, 3, elements=st.floats(-3, 3))
+
+
+@given(x=POINTS, turn=VECTORS, shift=VECTORS)
+def test_rigid_motion_changes_nothing(x, turn, shift):
+    d = np.diff(x, axis=0)
+    length = np.linalg.norm(d, axis=1)
+    assume(length.min() > 0.1)
+    assume((np.linalg.norm(np.cross(d[1:], d[:-1]), axis=1) / (length[1:] * length[:-1])).min() > 0.05)
+    q, _ = np.linalg.qr(np.eye(3) + np.cross(np.eye(3), turn))
+    y = x @ (q * np.sign(np.linalg.det(q))).T + shift
+    for item, width in ((Distance([0, 1]), 2), (Angle([0, 1, 2]), 3), (Dihedral([0, 1, 2, 3]), 4)):
+        change = item.measure(y[None, :width], 0.0) - item.measure(x[None, :width], 0.0)
+        assert np.abs(change - 2 * np.pi * np.round(change / (2 * np.pi)) * (width == 4)).max() < 1e-11
+        # Forces along the gradient exert neither force nor torque.
+        g = item.gradient(x[None, :width], 0.0)[0]
+        assert np.abs(g.sum(axis=0)).max() < 1e-11 * max(np.abs(g).max(), 1)
+        assert np.abs(np.cross(x[:width], g).sum(axis=0)).max() < 1e-10 * max(np.abs(g).max(), 1)
+
+
+def test_dihedrals_are_those_of_ase_and_smooth_through_180_degrees():
+    x = np.random.default_rng(0).normal(size=(4, 3))
+    ours = np.degrees(Dihedral([0, 1, 2, 3]).measure(x[None], 0.0)[0]) % 360
+    assert ours == pytest.approx(Atoms("H4", x).get_dihedral(0, 1, 2, 3), abs=1e-10)
+    held = ConstraintSet(Dihedral([0, 1, 2, 3], np.radians(179.9)), twisted(-179.9), np.ones(4))
+    assert held.value(twisted(-179.9))[0] == pytest.approx(np.radians(0.2), rel=1e-10)
+    assert held.value(twisted(179.8))[0] == pytest.approx(np.radians(-0.1), rel=1e-10)
+    turned = ConstraintSet(Dihedral([0, 1, 2, 3], np.radians(30.0) + 4 * np.pi), twisted(30.0), np.ones(4))
+    assert turned.value(twisted(30.0))[0] == pytest.approx(0, abs=1e-13)
+
+
+@pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.0, 0.0, -2.0], [1.0, 2.0, 3.0]])
+def test_a_line_is_two_orthonormal_rows_normal_to_it(direction):
+    point, d = np.array([0.3, 0.1, -0.2]), np.array(direction)
+    item = Line([0], point, direction)
+    rows = item.coefficients[:, 0]
+    assert np.allclose(rows @ rows.T, np.eye(2), atol=1e-15) and np.allclose(rows @ d, 0, atol=1e-15)
+    held = ConstraintSet(item, [point], np.ones(1))
+    off = np.cross(d, [0.2, 0.5, 0.1])
+    assert held.value([point + 2.7 * d]) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert np.linalg.norm(held.value([point + off])) == pytest.approx(np.linalg.norm(off))
+    free = ConstraintSet(Line([0, 1], None, [1.0, 0.0, 0.0]), APART[1:], np.ones(2))
+    assert not free.value(np.add(APART[1:], [[7.0, 0, 0], [-3.0, 0, 0]])).any()
+
+
+def test_targets_are_where_they_are_put():
+    assert ConstraintSet(Plane(0, [0.0, 3.0, 4.0], point=[0.0, 5.0, 5.0]), [UP], np.ones(1)).target()[0] == 7.0
+    places = np.arange(6.0).reshape(2, 3)
+    assert FixedAtoms([5, 2], places).target.tolist() == list(range(6))
+    assert FixedAtoms([5, 2], [1.0, 2.0, 3.0]).target.tolist() == [1, 2, 3, 1, 2, 3]
+    moving = CenterOfMass([[0, 1], [2, 3]], target=lambda t: places * t)
+    assert moving.target_at(2.0).tolist() == (2 * places.ravel()).tolist()
+    assert ConstraintSet(LinearRelation(0, [1, 2], [0.5, 0.5]), APART, np.ones(3)).target().tolist() == [0, 0, 0]
+    assert ConstraintSet(Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [UP], np.ones(1)).scale == pytest.approx([2.0])
+    assert Distance([3, 4]).atoms.tolist() == [[3, 4]] and FixedAtoms(5).atoms.tolist() == [[5], [5], [5]]
+
+
+def test_targets_that_move_enter_the_right_hand_sides():
+    x = [[1.0, 0.0, 0.0]]
+    held = ConstraintSet(Sphere(0, ORIGIN, lambda t: 1 + 0.2 * np.sin(3 * t)), x, np.ones(1))
+    assert held.velocity_target(x, 0.4)[0] == pytest.approx(0.6 * np.cos(1.2), rel=1e-12)
+    assert held.acceleration_target(x, [[0.0, 2.0, 0.0]], 0.4)[0] == pytest.approx(-1.8 * np.sin(1.2) - 4.0, rel=1e-10)
+    held = ConstraintSet(FixedAtoms([0], lambda t: [[np.cos(t), np.sin(t), 0.0]]), x, np.ones(1))
+    assert held.velocity_target(x, 0.3) == pytest.approx([-np.sin(0.3), np.cos(0.3), 0.0], abs=1e-12)
+    assert held.acceleration_target(x, x, 0.3) == pytest.approx([-np.cos(0.3), -np.sin(0.3), 0.0], abs=1e-10)
+
+
+def test_what_depends_on_the_origin():
+    assert LinearRelation(0, [1, 2], [0.5, 0.5]).translation_invariant
+    assert not LinearRelation(0, [1, 2], [0.5, 0.6]).translation_invariant
+    mixed = LinearCombination([[0, 1], [2, 3]], [[UP, [0, 0, -1]], [UP, UP]])
+    assert not mixed.translation_invariant and not mixed.select([0]).translation_invariant
+    x = np.array([[0.1, 0.0, 0.0], [9.7, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    held = ConstraintSet(LinearRelation(0, [1, 2], [0.5, 0.5]), x, np.ones(3), cell=[10.0] * 3)
+    assert held.value(x) == pytest.approx([0, 0, 0], abs=1e-14)
+
+
+def test_groups_in_a_cell_far_away_and_of_many_atoms():
+    x = np.round(scattered(2) * 64) / 64
+    shift = np.array([2.0**20, -(2.0**21), 2.0**20])  # exact in binary
+    wrapped, masses = np.array([[0.1, 5.0, 5.0], [9.8, 5.0, 5.0], [1.3, 5.0, 5.0], [9.1, 5.2, 5.0]]), MASSES[:4]
+    whole = wrapped - [[0, 0, 0], [10.0, 0, 0], [0, 0, 0], [10.0, 0, 0]]
+    for item in (CenterDistance([0, 1], [2, 3]), RadiusOfGyration([0, 1, 2, 3])):
+        near = ConstraintSet(item, x, MASSES).target()
+        assert ConstraintSet(item, x + shift, MASSES).target() == pytest.approx(near, rel=1e-14)
+        found = ConstraintSet(item, wrapped, masses, cell=[10.0] * 3).target()
+        assert found == pytest.approx(ConstraintSet(item, whole, masses).target(), rel=1e-13)
+    n = 100_000
+    x = np.random.default_rng(0).normal(size=(n, 3))
+    held = ConstraintSet([CenterOfMass(np.arange(n)), RadiusOfGyration(np.arange(n))], x, np.ones(n))
+    assert held.target() == pytest.approx([*x.mean(axis=0), np.sqrt(3 * x.var(axis=0).mean())], rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    "item", [RadiusOfGyration(np.arange(40)), CenterDistance(np.arange(20), np.arange(20, 40)),
+             LinearVelocity(np.arange(40), np.arange(120.0).reshape(40, 3))], ids=lambda item: item.family
+)  # fmt: skip
+def test_wide_rows_are_what_narrow_ones_would_be(item, monkeypatch):
+    r, v = np.random.default_rng(0).normal(size=(2, 1, 40, 3))
+    item = item.with_masses(np.arange(1.0, 41.0)[None])
+    wide = (*item.value_and_gradient(r, 0.0), item.curvature(r, v, 0.0))
+    monkeypatch.setattr("kcons.constraints.constraint.WIDE", 100)
+    for one, other in zip(wide, (*item.value_and_gradient(r, 0.0), item.curvature(r, v, 0.0)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-14)
+
+
+def test_parameters_of_the_compiled_rows():
+    relation = LinearRelation(3, [0, 1, 2], [0.2, 0.3, 0.5])
+    assert relation.parameters()[1].tolist() == [0, 1, 0, 0, -0.2, 0, 0, -0.3, 0, 0, -0.5, 0]
+    group = CenterOfMass([[0, 1]], axes=(1,)).with_masses(np.array([[1.0, 3.0]]))
+    assert group.parameters().tolist() == [[0.0, 0.25, 0.0, 0.0, 0.75, 0.0]] and group.kind is RowKind.LINEAR
+    assert Cylinder(0, [1.0, 2.0, 3.0], [0.0, 0.0, 2.0]).parameters().tolist() == [[1.0, 2.0, 3.0, 0.0, 0.0, 1.0]]
+    kinds = [Sphere(0, ORIGIN).kind, Plane(0, UP).kind, Torus(0, ORIGIN, UP, 1.0).kind, KnifeEdge(0, 1, UP).kind]
+    assert kinds == [RowKind.FUNCTION] * 3 + [RowKind.VELOCITY]
+
+
+# -- differences of distances -------------------------------------------------------------------------------
+
+
+def test_a_difference_moves_as_its_formula_does():
+    text = "sqrt((x1-x2)**2+(y1-y2)**2+(z1-z2)**2) - 0.5*sqrt((x2-x3)**2+(y2-y3)**2+(z2-z3)**2)"
+    both = [DistanceDifference(TRANSFER, weights=[1.0, -0.5]), Formula(text, [[0, 1, 2]], target=None)]
+    first, second = (Motion(ConstraintSet(row, APART, [35.0, 1.0, 80.0]), APART) for row in both)
+    y, f, v = (
+        APART + 0.2 * np.random.default_rng(1).normal(size=(3, 3)),
+        *np.random.default_rng(2).normal(size=(2, 3, 3)),
+    )
+    assert first.project_positions(y, APART) == pytest.approx(second.project_positions(y, APART), abs=1e-13)
+    v = first.project_velocities(APART, v)
+    assert first.acceleration(APART, v, f) == pytest.approx(second.acceleration(APART, v, f), abs=1e-13)
+
+
+def test_a_difference_comes_back_from_its_data():
+    row = DistanceDifference([[[1, 0], [1, 2]], [[4, 3], [4, 5]]], [-0.5, 0.25], weights=[1.0, -2.0])
+    again = from_dict(json.loads(json.dumps(row.todict())))
+    x = np.random.default_rng(0).normal(size=(6, 3))
+    lengths = np.linalg.norm(x[[1, 1, 4, 4]] - x[[0, 2, 3, 5]], axis=1)
+    for item in (row, again, row.select([0, 1]), row.renumbered(np.arange(6))):
+        assert item.measure(x[item.atoms], 0.0) == pytest.approx(lengths[[0, 2]] - 2 * lengths[[1, 3]], abs=1e-14)
+        assert item.target.tolist() == [-0.5, 0.25]
+    assert row.select([1]).measure(x[row.select([1]).atoms], 0.0) == pytest.approx(lengths[2] - 2 * lengths[3])
+    held = ConstraintSet([Distance([[0, 1]]), row.with_target(None)], x, np.ones(6))
+    assert rows_like(held, DistanceDifference([[4, 3], [4, 5]], weights=[1.0, -2.0]), "d") == [2]
+    assert rows_like(held, Distance([1, 0]), "d") == [0]
+    with pytest.raises(InputError, match="not among"):
+        rows_like(held, DistanceDifference([[4, 3], [4, 5]]), "d")
+
+
+# -- velocities --------------------------------------------------------------------------------------------
+
+
+def rate(held, x, v, time=0.0):
+    """A v - target, shape (n_rows,)."""
+    return held.jacobian(x, time) @ np.ravel(v) - held.velocity_target(x, time)
+
+
+def test_a_blade_glides_along_itself_and_turns_about_its_contact():
+    x = np.array([ORIGIN, [3.0, 4.0, 1.0]])
+    held = ConstraintSet(KnifeEdge(0, 1, [0.0, 0.0, 2.0]), x, np.ones(2))
+    along, sideways = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
+    # The blade's height does not count.
+    for v, expected in (([along, along], 0), ([0 * along, sideways], 0), ([sideways] * 2, 1), ([UP, [0, 0, -2.0]], 0)):
+        assert rate(held, x, v) == pytest.approx([expected], abs=1e-15)
+    assert held.value(2 * x).tolist() == held.target().tolist() == [0.0]
+    between = ConstraintSet(KnifeEdge(0, 1, UP, contact=0.25), x, np.ones(2))
+    assert rate(between, x, [-sideways, 3 * sideways]) == pytest.approx([0.0], abs=1e-15)
+    wrapped, whole = np.array([[9.9, 0.0, 0.0], [0.4, 0.0, 0.0]]), np.array([[-0.1, 0.0, 0.0], [0.4, 0.0, 0.0]])
+    there = ConstraintSet(KnifeEdge(0, 1, UP), wrapped, np.ones(2), cell=[10.0] * 3).jacobian(wrapped)
+    assert np.allclose(there.toarray(), ConstraintSet(KnifeEdge(0, 1, UP), whole, np.ones(2)).jacobian(whole).toarray())
+
+
+def test_a_blade_on_a_circle_needs_the_centripetal_acceleration():
+    """Contact on a circle of radius R at speed u, blade tangent: sideways acceleration u^2/R."""
+    radius, speed, length = 2.0, 3.0, 0.5
+    x = np.array([[radius, 0.0, 0.0], [radius, length, 0.0]])
+    omega = speed / radius
+    v, a = omega * np.stack([-x[:, 1], x[:, 0], [0.0, 0.0]], axis=1), -(omega**2) * x
+    held = ConstraintSet(KnifeEdge(0, 1, UP), x, np.ones(2))
+    assert rate(held, x, v) == pytest.approx([0.0], abs=1e-14)
+    assert held.jacobian(x) @ a.ravel() == pytest.approx(held.acceleration_target(x, v), rel=1e-13)
+    assert held.acceleration_target(x, v)[0] == pytest.approx(speed**2 / radius)
+
+
+@pytest.mark.parametrize("marker", [0.3, 1.5])
+def test_a_wheel_rolls_one_circumference_a_turn(marker):
+    """Hub at speed R psi' along x; the marker at `marker` from the hub turns from z to x."""
+    radius, spin, psi = 1.5, 0.7, 0.9
+    hub = np.array([4.0, 0.0, radius])
+    x = np.array([hub, hub + marker * np.array([np.sin(psi), 0, np.cos(psi)])])
+    turn = marker * spin * np.array([np.cos(psi), 0, -np.sin(psi)])
+    v = np.array([[radius * spin, 0, 0], np.array([radius * spin, 0, 0]) + turn])
+    a = np.array([[0, 0, 0], -(spin**2) * (x[1] - hub)])
+    held = ConstraintSet([Rolling(0, 1, radius, [2.0, 0.0, 0.3]), Distance([0, 1])], x, np.ones(2))
+    assert rate(held, x, v)[0] == pytest.approx(0.0, abs=1e-14)
+    assert (held.jacobian(x) @ a.ravel())[0] == pytest.approx(held.acceleration_target(x, v)[0], abs=1e-14)
+    # If the marker is on the rim and at the ground, it is at rest.
+    low = np.array([hub, hub - [0, 0, radius]])
+    assert rate(held, low, [[1.0, 0, 0], ORIGIN])[0] == pytest.approx(0.0, abs=1e-14)
+    assert rate(held, low, [[1.0, 0, 0], [1.0, 0, 0]])[0] == pytest.approx(1.0)
+
+
+def test_driven_speeds_and_coefficients_that_turn():
+    x = np.eye(3)[:2]
+    held = ConstraintSet(LinearVelocity([0, 1], [[1, 0, 0], [-1, 0, 0]], target=lambda t: np.sin(2 * t)), x, np.ones(2))
+    assert held.moving and not held.holonomic.any()
+    assert held.velocity_target(x, 0.3) == pytest.approx([np.sin(0.6)])
+    assert held.acceleration_target(x, x, 0.3) == pytest.approx([2 * np.cos(0.6)], rel=1e-11)
+    # a = (cos t, sin t, 0): b = -v . da/dt, at late times as well.
+    row = CustomVelocity(0, lambda r, t: [[np.cos(t), np.sin(t), 0.0]], time_dependent=True)
+    x, v = np.zeros((1, 3)), np.array([[0.6, 0.8, 0.0]])
+    for time in (1.0, 1e6, 1e9):
+        found = ConstraintSet(row, x, [1.0]).acceleration_target(x, v, time)
+        np.testing.assert_allclose(found, [0.6 * np.sin(time) - 0.8 * np.cos(time)], rtol=0, atol=1e-11)
+
+
+# -- what is refused ---------------------------------------------------------------------------------------
+
+LINE = np.array([ORIGIN, [1.0, 0, 0], [3.0, 0, 0]])
+COINCIDENT = np.array([[1.0, 2, 3], [1, 2, 3], UP, [0, 1, 0]])
+CROSS = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, -1.0, 0]])
+BENDS = np.array([[1.0, 0, -0.3], ORIGIN, UP, [0, 0, 2.0]])
+#: Where gradients are undefined, and what is said of it.
+SINGULAR = [
+    (Distance([[2, 3], [0, 1]]), COINCIDENT, r"atoms 0 and 1 coincide: distance gradient undefined \(row 1"),
+    (Angle([0, 1, 2]), COINCIDENT, "atoms 0 and 1 coincide: gradient of row 0, Angle"),
+    (Dihedral([2, 0, 1, 3]), COINCIDENT, "atoms 0 and 1 coincide: gradient of row 0, Dihedral"),
+    (DistanceDifference([[2, 0], [0, 1]]), COINCIDENT, "atoms 0 and 1 of row 0"),
+    # |ab| + |bc| - |ac| is 0 on a line, and least there.
+    (DistanceDifference([[0, 1], [1, 2], [0, 2]], weights=[1, 1, -1]), LINE, "vanishes"),
+    (Angle([0, 1, 2]), bent(180.0), r"singular at 180 deg, use a linear constraint.*row 0, Angle\(0, 1, 2\)"),
+    (Angle([0, 1, 2]), bent(0.0, 1.2, 0.9), r"singular at 0 deg, use a linear constraint.*row 0, Angle\(0, 1, 2\)"),
+    (Angle([0, 1, 2], np.pi), bent(100.0), "singular at 180 deg, .* has the target 180 deg"),
+    (Angle([0, 1, 2], 0.0), bent(100.0), "singular at 0 deg, .* has the target 0 deg"),
+    (Dihedral([0, 1, 2, 3]), BENDS, "atoms 1, 2, 3 of row 0, Dihedral.*collinear"),
+    (Dihedral([3, 2, 1, 0]), BENDS, "atoms 3, 2, 1 of row 0, Dihedral.*collinear"),
+    (Sphere(0, COINCIDENT[0]), COINCIDENT, "atom 0 lies at the center of the sphere.*row 0"),
+    (Cylinder(0, ORIGIN, [1.0, 2.0, 3.0]), COINCIDENT, "atom 0 lies on the axis of the cylinder"),
+    (Torus(0, ORIGIN, [1.0, 2.0, 3.0], 2.0), COINCIDENT, "atom 0 lies on the axis or on the core"),
+    (Torus(1, ORIGIN, UP, 1.0), CROSS, "atom 1 lies on the axis or on the core"),
+    (Ellipsoid(0, COINCIDENT[0], [1.0, 2.0, 3.0]), COINCIDENT, "atom 0 lies at the center of the ellipsoid"),
+    (CenterDistance([0, 1], [2, 3]), CROSS, r"two centers of row 0.*coincide"),
+    (RadiusOfGyration([3, 4]), CROSS, r"all atoms of row 0.*coincide"),
+    (KnifeEdge(1, 2, UP), BENDS, r"row 0, KnifeEdge\(1, 2\): the blade is normal to its plane"),
+    (Rolling(1, 2, 1.0, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), BENDS, "the rim atom lies on the axle"),
+    (CustomVelocity([1], lambda r: r), BENDS, "the coefficients are zero or not finite"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("item", "x", "words"), SINGULAR, ids=lambda value: getattr(value, "family", ""))
+def test_undefined_gradients_are_refused(item, x, words):
+    with pytest.raises(SingularGeometryError, match=words) as caught:
+        ConstraintSet(item, x, np.ones(len(x)))
+    assert set(caught.value.atoms) <= set(item.atoms.ravel().tolist())
+
+
+def test_almost_straight_angles_are_accepted():
+    held = ConstraintSet(Angle([0, 1, 2]), bent(179.9999), np.ones(3))
+    assert held.target()[0] == pytest.approx(np.radians(179.9999), rel=1e-14)
+
+
+DIFFERENCE = DistanceDifference(TRANSFER).todict()
+#: What is no such row, and what is said of it.
+REFUSED = [
+    (lambda: Cylinder(0, ORIGIN, ORIGIN), "axis has a vector that is zero"),
+    (lambda: Plane(0, [0.0, np.nan, 0.0], 0.0), "normal has a vector that is zero or not finite"),
+    (lambda: Plane(0, [0.0, 1.0], 0.0), "normal must be vectors of three numbers"),
+    (lambda: Plane(0, UP, 1.0, point=ORIGIN), "either offset or point"),
+    (lambda: Sphere([0, 1], [ORIGIN] * 3), r"center has shape \(3, 3\)"),
+    (lambda: Sphere(0, [np.inf, 0.0, 0.0]), "center of row 0 is not finite"),
+    (lambda: Torus(0, ORIGIN, UP, -2.0), "major_radius -2 is not positive"),
+    (lambda: Ellipsoid(0, ORIGIN, [1.0, -1.0, 1.0]), "semi_axes -1 is not positive"),
+    (lambda: Ellipsoid(0, ORIGIN, [np.inf] * 3), "no finite positive semi-axis"),
+    (lambda: Ellipsoid(0, ORIGIN, [1.0] * 3, 2 * np.eye(3)), "columns of rotation are not orthonormal"),
+    (lambda: Line([0, 1], [ORIGIN] * 3, UP), r"point has shape \(3, 3\); give \(3,\) or \(2, 3\)"),
+    (lambda: Line(0, [0.0, np.nan, 0.0], UP), "point is not finite"),
+    (lambda: FixedAtoms([1, 4, 1]), "names atom 1 twice"),
+    (lambda: FixedAtoms([5, 2, 5], ORIGIN), "names atom 5 twice"),
+    (lambda: FixedAtoms([1, 4], np.zeros((3, 3))), r"target has shape \(3, 3\)"),
+    (lambda: FixedAtoms([True, False, True]), r"integers, not bool; of a mask give np\.flatnonzero"),
+    (lambda: LinearCombination([[0, 1], [2, 3]], [[UP] * 2, [[0, 0, 0]] * 2]), "coefficients of row 1 are"),
+    (lambda: LinearCombination([0, 1], [1.0, 2.0]), "coefficients has shape"),
+    (lambda: LinearCombination([0, 1], [[0, 0, np.nan], UP]), "coefficients of row 0 is not finite"),
+    (lambda: LinearRelation(0, [1, 2], [0.5, 0.3, 0.2]), "do not fit"),
+    (lambda: LinearRelation(0, [0, 2], [0.5, 0.5]), "names an atom twice"),
+    (lambda: LinearRelation(0.5, [1, 2], [0.5, 0.5]), "must be integers"),
+    (lambda: CenterOfMass([0, 1]).measure(np.zeros((3, 2, 3)), 0.0), "needs the masses of its atoms"),
+    *(
+        (lambda axes=axes: CenterOfMass([0, 1], axes=axes), "axes must be some of 0, 1, 2")
+        for axes in ((0, 3), 0, (0.0, 1.0), (0, 0))
+    ),
+    (lambda: CenterOfMass([[0, 1], [2]]), "different numbers of atoms"),
+    (lambda: CenterDistance([0, 1], [1, 2]), "names an atom twice"),
+    (lambda: CenterDistance([0, 1], np.zeros((1, 0), int)), "a group has no atoms"),
+    (lambda: LinearVelocity([0], [ORIGIN]), "all coefficients of row 0 are zero"),
+    (lambda: KnifeEdge([0, 1], [2], UP), "give one pair a row"),
+    (lambda: Rolling(0, 1, 0.0, [1.0, 0.0, 0.0]), "radius 0 is not positive"),
+    (lambda: Rolling(0, 1, 1.0, UP), "heading is normal to the ground"),
+    (lambda: CustomVelocity([0], [[1.0, 0.0, 0.0]]), "coefficients is .*; give a function of r"),
+    (lambda: CustomVelocity([0], lambda r: r, time_step=0.0), "time_step is 0.0; give a positive number"),
+    (lambda: CustomVelocity([0], lambda r: r[0]).gradient(np.ones((1, 1, 3)), 0.0), r"returned shape \(3,\) for row 0"),
+    (lambda: Distance([[0, 1], [2, 3]], [1.0, np.nan]), "target of row 1 is not finite"),
+    (lambda: DistanceDifference([0, 1, 2]), "pairs of atoms"),
+    (lambda: DistanceDifference([[0.0, 1.0], [1.0, 2.0]]), "pairs of atoms"),
+    (lambda: DistanceDifference([]), "pairs of atoms"),
+    (lambda: DistanceDifference([[0, 1], [2, 2]]), "atom 2 twice"),
+    (lambda: DistanceDifference([[0, 1], [1, 0]]), "add the weights"),
+    (lambda: DistanceDifference([[0, 1]]), "give 1 finite number"),
+    (lambda: DistanceDifference(TRANSFER, weights=[1.0, 0.0]), "give 2 finite numbers"),
+    (lambda: DistanceDifference(TRANSFER, weights=[1.0, np.nan]), "give 2 finite numbers"),
+    (lambda: DistanceDifference([[[0, 1], [1, 2]], [[3, 4], [5, 6]]]), "rows 0 and 1 share atoms"),
+    (lambda: DistanceDifference([[0, -1], [1, 2]]), "negative"),
+    (lambda: from_dict(DIFFERENCE | {"slots": [[0, 1], [1, 3]]}), "do not belong"),
+    (lambda: from_dict(DIFFERENCE | {"slots": 3}), "slots are pairs"),
+    (lambda: from_dict(DIFFERENCE | {"weights": ["a", 1]}), "numbers"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "words"), REFUSED)
+def test_what_is_no_such_row_is_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+#: Targets, masses and cells that do not go with the positions.
+OUT_OF_PLACE = [
+    (Angle([0, 1, 2], 109.5), {}, "target 109.5 is no angle between 0 and pi; targets are in radian"),
+    (Dihedral([0, 1, 2, 3], 60.0), {}, r"60 is over three turns, and in radian; give np\.radians"),
+    (Dihedral([0, 1, 2, 3], -60.0), {}, "-60 is over three turns, and in radian"),
+    (Distance([[0, 1], [2, 3]], [1.0, 0.0]), {}, r"row 1, Distance\(2, 3\): target 0 is not positive"),
+    (Distance([[0, 1], [2, 3]], [1.0, -1.0]), {}, r"row 1, Distance\(2, 3\): target -1 is not positive"),
+    (Distance([0, 1], lambda t: -1.0), {}, "is not positive"),
+    (Sphere([0, 1], [9.0, 9.0, 9.0], [1.0, -1.0]), {}, r"row 1, Sphere\(1\): radius -1 is not positive"),
+    (RadiusOfGyration([0, 1], -1.0), {}, "target -1 is not positive"),
+    (DistanceDifference(TRANSFER, -1.0, weights=[1, 1]), {}, "not positive"),
+    (Ellipsoid(0, ORIGIN, [1.0, 1.0, 1.0], target=-1.5), {}, "lies beyond the center of the ellipsoid"),
+    (LinearCombination([2, 3], [UP, [0, 0, -1]]), {"masses": [1, 1, 0, 1]}, "atom 2 has mass 0; constrained"),
+    *(([FixedAtoms([0, 1]), row], {"masses": [0, 0, 1, 1]}, "all atoms of a group have mass 0; give one")
+      for row in (CenterOfMass([0, 1]), CenterDistance([2], [0, 1]), RadiusOfGyration([0, 1]))),
+    (RadiusOfGyration([1, 3]), {"cell": [3.0] * 3}, "distance .* of atoms 1 and 3 is not shorter than half the box"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("rows", "others", "words"), OUT_OF_PLACE)
+def test_what_does_not_go_with_the_positions_is_refused(rows, others, words):
+    with pytest.raises(InputError, match=words):
+        ConstraintSet(rows, twisted(30.0), **({"masses": np.ones(4)} | others))
+
+
+def test_what_may_be():
+    ConstraintSet(Dihedral([0, 1, 2, 3], lambda t: 60.0 + t), twisted(30.0), np.ones(4))
+    held = ConstraintSet([FixedAtoms([2]), LinearCombination([2, 3], [UP, [0, 0, -1]])], twisted(30.0), [1, 1, 0, 1])
+    assert held.n_rows == 4  # fixed atoms need no mass
+
+
+@pytest.mark.parametrize("explicit", [0.0, 1.0])
+def test_a_wrong_derivative_of_coefficients_is_found_before_it_moves_anything(explicit):
+    """Wrong in the part that motion makes, or in the one of time itself."""
+
+    def coefficients(r, t):
+        return np.array([[r[0, 1] * np.cos(t), 1.0, 0.0]])
+
+    def derivative(r, v, t):
+        motion = v[0, 1] * np.cos(t)
+        return np.array([[(motion if explicit else 2 * motion) - (1 + explicit) * r[0, 1] * np.sin(t), 0.0, 0.0]])
+
+    item = CustomVelocity(0, coefficients, derivative, time_dependent=True)
+    with pytest.raises(InputError, match=r"derivative gives .* for x of its atom 0, but differences .* give"):
+        ConstraintSet(item, np.array([[0.3, 0.7, 0.1]]), np.ones(1), time=0.5)

@@ -1,0 +1,152 @@
+"""Coordinates recorded from ASE's dynamics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import units
+from ase.build import molecule
+from ase.calculators.lj import LennardJones
+from ase.constraints import Hookean
+from ase.io import read, write
+from ase.md.verlet import VelocityVerlet
+
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    MultipleTimeSteps,
+    constrain,
+    draw_velocities,
+)
+from kcons.ase.binding import applied_forces
+from kcons.constraints import Dihedral, Distance, MovingTarget
+from kcons.errors import UnsupportedError
+from kcons.free_energy import AseRecorder, held_coordinates
+
+
+def methanol():
+    atoms = molecule("CH3OH")
+    atoms.calc = LennardJones(sigma=1.0, epsilon=0.02, rc=6.0)
+    return atoms
+
+
+def rows():
+    """The torsion, and the bonds that it turns about."""
+    turn = Dihedral([[2, 0, 1, 3]])
+    return turn, [Distance([[0, 1], [1, 3], [0, 2]])]
+
+
+def test_kcons_dynamics_with_names_on_the_atoms(tmp_path):
+    atoms = methanol()
+    turn, bonds = rows()
+    dynamics = ConstrainedLangevin(
+        atoms,
+        0.5 * units.fs,
+        temperature_K=300,
+        friction=0.02,
+        constraints=[turn, *bonds],
+        rng=np.random.default_rng(1),
+    )
+    recorder = AseRecorder(dynamics, {"turn": turn}, constraint_forces=True)
+    file = tmp_path / "run.xyz"
+    dynamics.attach(recorder, interval=5)
+    dynamics.attach(lambda: write(file, atoms, append=True), interval=5)
+    dynamics.run(20)
+    series = recorder.series
+    assert len(series) == 5 and series.multipliers == {"turn": series.of("turn")[-1]}
+    assert series.off.max() < 1e-10
+    state = dynamics.state
+    direct = dynamics.motion.multipliers(state.positions, state.velocities, state.forces)
+    assert direct[0] == pytest.approx(series.of("turn")[-1], abs=1e-10)
+    frames = read(file, ":")
+    assert [frame.info["multiplier of turn"] for frame in frames] == pytest.approx(series.of("turn").tolist())
+    assert frames[-1].info["ln det Z"] == pytest.approx(series.log_det_z[-1])
+    pushed = frames[-1].arrays["constraint_forces"]
+    assert pushed.shape == (6, 3) and np.abs(pushed.sum(axis=0)).max() < 1e-6 < np.abs(pushed).max()
+
+
+def test_a_dynamics_of_ase_under_kcons_constraints():
+    atoms = methanol()
+    turn, bonds = rows()
+    constrain(atoms, [turn, *bonds])
+    atoms.set_velocities(np.random.default_rng(0).normal(size=(6, 3)) * 0.02)
+    dynamics = VelocityVerlet(atoms, 0.2 * units.fs)
+    recorder = AseRecorder(dynamics, {"turn": turn, "bonds": bonds[0]})
+    dynamics.attach(recorder, interval=1)
+    dynamics.run(3)
+    assert recorder.coordinates.keys() == {"turn", "bonds"}
+    assert recorder.series.names == ("turn", "bonds[0]", "bonds[1]", "bonds[2]")
+    assert atoms.info["bonds[1]"] == pytest.approx(atoms.get_distance(1, 3))
+    motion = atoms.constraints[0].engine(atoms)
+    f = atoms.get_forces(apply_constraint=False)
+    direct = motion.multipliers(atoms.positions, atoms.get_velocities(), f)
+    np.testing.assert_allclose(recorder.series.multiplier[-1], direct, rtol=0, atol=1e-12)
+
+
+def test_a_pull_and_a_change_of_masses():
+    atoms = methanol()
+    start = atoms.get_distance(0, 1)
+    pull = Distance([[0, 1]], MovingTarget(lambda t: start + 0.02 * t))
+    dynamics = ConstrainedDynamics(atoms, 0.1 * units.fs, constraints=[pull])
+    recorder = AseRecorder(dynamics, {"r": pull})
+    dynamics.attach(recorder, interval=1)
+    dynamics.run(150)
+    energy = atoms.get_total_energy()
+    assert recorder.series.work[-1] == pytest.approx(energy - first_energy(start), rel=3e-3)
+    masses = atoms.get_masses()
+    masses[1] *= 2
+    atoms.set_masses(masses)
+    before = recorder.series.log_det_z[-1]
+    dynamics.run(1)
+    assert recorder.series.log_det_z[-1] == pytest.approx(np.log(1 / masses[0] + 1 / masses[1])) and before != 0
+
+
+def first_energy(start):
+    """Of methanol at rest but for the pull, which starts with its speed."""
+    atoms = methanol()
+    dynamics = ConstrainedDynamics(
+        atoms, 0.5 * units.fs, constraints=[Distance([[0, 1]], MovingTarget(lambda t: start + 0.02 * t))]
+    )
+    dynamics.run(0)
+    state = dynamics.state
+    kinetic = 0.5 * np.sum(atoms.get_masses()[:, None] * state.velocities**2)
+    return atoms.get_potential_energy() + kinetic
+
+
+def test_forces_that_ase_constraints_add_count():
+    """Also in dynamics of ASE, which ask the atoms for forces."""
+    atoms = methanol()
+    turn, bonds = rows()
+    held = constrain(atoms, [turn, *bonds])
+    atoms.set_constraint([held, Hookean(4, 3, 5.0, rt=1.0)])
+    recorder = AseRecorder(VelocityVerlet(atoms, 0.5 * units.fs), {"turn": turn})
+    recorder()
+    direct = held.engine(atoms).multipliers(atoms.positions, atoms.get_velocities(), applied_forces(atoms))
+    assert recorder.series.multipliers["turn"] == pytest.approx(direct[0], abs=1e-10)
+    without = held.engine(atoms).multipliers(
+        atoms.positions, atoms.get_velocities(), atoms.get_forces(apply_constraint=False)
+    )
+    assert abs(without[0] - direct[0]) > 0.01
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_velocities_on_spheres_are_refused_where_multipliers_need_thermal_ones(many, monkeypatch):
+    """They have about three quarters of the variance; where the mean over velocities is found, none are needed."""
+    if many:
+        monkeypatch.setattr(held_coordinates, "_MOST_ROWS", 2)
+    atoms = methanol()
+    turn, held = rows()
+    held = [turn, *held]
+    draw_velocities(atoms, 300, 1, constraints=held)
+    fast, slow = (LennardJones(sigma=1.0, epsilon=e, rc=6.0) for e in (0.02, 0.01))
+    how = {"fast": fast, "slow": slow, "fast_steps": 2, "bath": "spheres", "rng": 1, "constraints": held}
+    dynamics = MultipleTimeSteps(atoms, 0.5 * units.fs, temperature_K=300, friction=0.02, **how)
+    recorder = AseRecorder(dynamics, {"turn": turn})
+    dynamics.attach(recorder, interval=1)
+    if many:
+        with pytest.raises(UnsupportedError, match=r"multipliers of turn need them.*bath='langevin'"):
+            dynamics.run(1)
+        assert not len(recorder.series) and recorder.series.multipliers == {}
+    else:
+        dynamics.run(1)
+        assert np.isfinite(recorder.series.mean_kinetic).all()

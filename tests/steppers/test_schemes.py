@@ -1,0 +1,462 @@
+"""Each scheme by itself: order on problems with known solutions, exact maps, fractions, what it conserves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, named, observed_order
+from stepper_systems import (
+    COMPOSED,
+    NYSTROM,
+    PROJECTED,
+    angle_of,
+    growing_rod,
+    planar_pendulum,
+    rotor,
+    skate,
+    slope,
+    spherical_pendulum,
+    system_of,
+    verlet,
+)
+
+from kcons.constraints import Distance, FixedAtoms, LinearVelocity, MovingTarget, Plane, Sphere
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.steppers import (
+    Baumgarte,
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Composition,
+    Geodesic,
+    KahanLi6,
+    ProjectedRungeKutta4,
+    ProjectedVerlet,
+    Rattle,
+    State,
+    Suzuki4,
+    run,
+)
+from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4, YOSHIDA_4
+
+COMPOSITIONS = pytest.mark.parametrize("stepper", COMPOSED[2:], ids=repr)
+SPLITTINGS = pytest.mark.parametrize("stepper", NYSTROM, ids=repr)
+#: Coarse, since these are so accurate that finer steps end in round-off.
+STEPS = {
+    "spherical_pendulum": {4: [4, 8], 6: [1, 3]},
+    "free_rotor": {4: [8, 16], 6: [4, 8]},
+    "growing_rod": {4: [8, 16], 6: [4, 8]},
+    "skate": {4: [4, 8], 6: [2, 4]},
+    "driven_atom": {4: [4, 8], 6: [2, 4]},
+}
+
+
+def orders():
+    """Steppers, problems, and numbers of steps; projections with velocity rows take ten milliseconds."""
+    for problem in (*HOLONOMIC, *VELOCITY_ROWS, *FRICTION):
+        rolls = problem in VELOCITY_ROWS
+        for stepper in (Rattle(), Geodesic(1), Geodesic(3)):
+            yield stepper, problem, [8, 16, 32] if rolls else [16, 32, 64, 128], ()
+        for stepper in COMPOSED[2:]:
+            coarse = {4: 8, 6: 4}[stepper.order]
+            yield stepper, problem, [coarse, 2 * coarse] if rolls else [2 * coarse, 4 * coarse], ()
+        for stepper in NYSTROM if problem not in FRICTION else ():
+            # With velocity rows one of each order, on a skate, which is not integrable, and on an atom that is driven.
+            first = type(stepper) is (BlanesMoan4 if problem is VELOCITY_ROWS[0] else BlanesMoan6)
+            marks = pytest.mark.validation if rolls and not first else ()
+            yield stepper, problem, STEPS[named(problem)][stepper.order], marks
+
+
+@pytest.mark.parametrize(
+    "stepper, problem, steps",
+    [pytest.param(*row, id=f"{row[0]!r}-{named(row[1])}", marks=marks) for *row, marks in orders()],
+)
+def test_observed_order(stepper, problem, steps) -> None:
+    assert observed_order(stepper, problem, steps) == pytest.approx(stepper.order, abs=0.15)
+
+
+@pytest.mark.parametrize("stepper", PROJECTED, ids=repr)
+@pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS, *FRICTION], ids=named)
+def test_observed_order_of_the_projected_equation(stepper, problem) -> None:
+    # The rod that grows is late in reaching its order.
+    dts = 1.0 / np.array([64, 128] if problem is HOLONOMIC[2] else [32, 64])
+    assert slope(dts, [problem(stepper, dt) for dt in dts]) == pytest.approx(stepper.order, abs=0.15)
+
+
+# -- RATTLE -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("omega_dt", [0.1, 0.5, 0.9, 0.99])
+def test_free_rotor_turns_by_asin(omega_dt):
+    system, state = rotor(omega=1.0)
+    total = 0.0
+    for _ in range(50):
+        following = Rattle().step(system, state, omega_dt)
+        total += (angle_of(following) - angle_of(state)) % (2 * np.pi)
+        state = following
+    assert abs(total - 50 * np.arcsin(omega_dt)) <= 1e-11
+
+
+@pytest.mark.parametrize("omega_dt", [1.001, 1.2, 1.5])
+def test_too_large_step_raises_and_changes_nothing(omega_dt):
+    system, state = rotor(omega=1.0)
+    state = State(state.positions, state.velocities, state.time, state.forces, step=41)
+    before = (state.positions.copy(), state.velocities.copy())
+    with pytest.raises(ConvergenceError, match="step 42: time step too large") as caught:
+        Rattle().step(system, state, omega_dt)
+    assert caught.value.step == 42 and caught.value.atoms == (0, 1)
+    assert np.array_equal(state.positions, before[0]) and np.array_equal(state.velocities, before[1])
+
+
+def test_state_off_the_constraints_is_named_as_the_cause():
+    system, _ = rotor()
+    crossed = State(np.array([[0.0, 9.0, 0.0], [0.0, -9.0, 0.0]]), np.array([[90.0, 0, 0], [-90.0, 0, 0]]))
+    with pytest.raises(ConvergenceError, match=r"already off row #0 Distance\(0, 1\) by 16\.8"):
+        Rattle().step(system, crossed, 1.0)
+
+
+@pytest.mark.parametrize(("atoms", "held"), [(1, []), (3, []), (9, [2, 7])])
+def test_what_is_not_held_moves_by_velocity_verlet(atoms, held):
+    rng = np.random.default_rng(3)
+    x, v, masses = rng.normal(size=(atoms, 3)), rng.normal(size=(atoms, 3)), rng.uniform(1, 2, atoms)
+    steps = 50 if held else 1000
+    system = system_of([Distance(held)] if held else [], x, masses, lambda x, t: -x)
+    end = run(system, system.initial_state(x, v, project=True), 0.02, steps)
+    x1, v1 = verlet(x, v, masses, lambda x, t: -x, 0.02, steps)
+    others, scale = np.delete(np.arange(atoms), held), np.abs(x1).max()
+    assert np.abs(end.positions - x1)[others].max() <= 1e-13 * scale
+    assert np.abs(end.velocities - v1)[others].max() <= 1e-13 * scale
+    assert not held or np.abs(end.positions - x1)[held].max() > 1e-3
+
+
+@pytest.mark.parametrize("make", [spherical_pendulum, rotor, skate], ids=lambda f: f.__name__)
+def test_time_reversal(make):
+    system, start = make()
+    steps = 20 if make is skate else 500
+    end = run(system, start, 0.02, steps)
+    back = run(system, end.reversed(), 0.02, steps)
+    negative = run(system, end, -0.02, steps)
+    assert np.abs(back.positions - start.positions).max() <= 1e-10
+    assert np.abs(back.velocities + start.velocities).max() <= 1e-10
+    assert np.abs(negative.positions - start.positions).max() <= 1e-10
+    assert negative.time == pytest.approx(start.time, abs=1e-12)
+    one = Rattle().step(system, Rattle().step(system, start, 0.05), -0.05)
+    assert np.abs(one.positions - start.positions).max() <= 1e-14
+    assert np.abs(one.velocities - start.velocities).max() <= 1e-14
+
+
+def test_energy_has_no_slope():
+    system, state = planar_pendulum(2.0)
+    energies: list[float] = []
+    run(system, state, 0.02, 4000, observers=[lambda s: energies.append(system.total_energy(s))])
+    # Averages over each half under a smooth window: the oscillation cancels, a drift of 1e-6 would not.
+    halves = np.array(energies[:4000]).reshape(2, 2000)
+    window = np.sin(np.pi * (np.arange(2000) + 0.5) / 2000) ** 4
+    means = halves @ window / window.sum()
+    assert abs(means[1] - means[0]) / 40.0 <= 2e-8
+    assert np.ptp(energies) > 1e-6
+
+
+@pytest.mark.parametrize("stepper", COMPOSED, ids=repr)
+def test_a_skate_never_slips(stepper):
+    system, state = skate()
+    held, slips = system.motion.constraint_set, []
+    observe = lambda s: slips.append(held.jacobian(s.positions) @ s.velocities.ravel())  # noqa: E731
+    end = run(system, state, 0.05, 20, stepper=stepper, observers=[observe])
+    assert np.abs(slips).max() <= 1e-13
+    assert abs(system.total_energy(end) - system.total_energy(state)) <= 1e-3
+
+
+def test_huge_force_along_a_bond_cancels():
+    pull = np.array([[1e12, 0, 0], [-1e12, 0, 0]])
+    system, state = rotor(omega=0.0, force=lambda x, t: pull)
+    end = run(system, state, 1e-3, 10)
+    assert np.linalg.norm(end.positions[0] - end.positions[1]) == pytest.approx(1.2, rel=1e-10)
+
+
+def test_unsettled_friction_is_reported():
+    system, state = rotor(force=lambda x, v, t: -1e3 * v, velocity_dependent=True)
+    with pytest.raises(ConvergenceError, match="time step too large") as caught:
+        Rattle().step(system, state, 1.0)
+    assert caught.value.step == 1
+
+
+@pytest.mark.parametrize("stepper", COMPOSED, ids=repr)
+def test_forces_that_depend_on_velocities_are_taken_back(stepper):
+    system, start = rotor(force=lambda x, v, t: -0.4 * v, velocity_dependent=True)
+    back = run(system, run(system, start, 0.05, 20, stepper=stepper), -0.05, 20, stepper=stepper)
+    assert np.abs(back.positions - start.positions).max() <= 1e-12
+    assert np.abs(back.velocities - start.velocities).max() <= 1e-12
+
+
+# -- compositions -----------------------------------------------------------------------------------
+
+
+@COMPOSITIONS
+def test_it_is_rattle_steps_in_turn(stepper) -> None:
+    system, state = rotor(force=lambda x, t: -np.cos(3 * t) * x)
+    whole = stepper.step(system, state, 0.1)
+    for g in stepper.fractions:
+        state = Rattle().step(system, state, g * 0.1)
+    np.testing.assert_allclose(whole.positions, state.positions, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(whole.velocities, state.velocities, rtol=0, atol=2e-15)
+    assert whole.time == pytest.approx(state.time, abs=1e-16)
+
+
+@COMPOSITIONS
+def test_rows_and_forces_are_asked_for_the_times_of_the_stages(stepper) -> None:
+    asked: set[float] = set()
+    forced: list[float] = []
+
+    def radius(t):
+        asked.add(round(float(t), 12))
+        return 1 + 0.1 * t
+
+    def force(x, t):
+        forced.append(t)
+        return 0 * x
+
+    positions = np.array([[1.0, 0.0, 0.0]])
+    target = MovingTarget(radius, lambda t: 0.1, lambda t: 0.0)
+    system = system_of([Sphere(0, [0, 0, 0], target)], positions, [1.0], force)
+    state = system.with_forces(system.initial_state(positions, [[0.1, 1.0, 0.0]]))
+    asked.clear()
+    forced.clear()
+    end = stepper.step(system, state, 0.5)
+    nodes = 0.5 * np.cumsum(stepper.fractions)
+    np.testing.assert_allclose(forced, nodes, rtol=0, atol=1e-15)
+    assert {round(t, 12) for t in nodes.tolist()} <= asked
+    assert end.time == 0.5
+    assert np.linalg.norm(end.positions[0]) == pytest.approx(1.05, abs=1e-15)
+    assert end.positions[0] @ end.velocities[0] == pytest.approx(1.05 * 0.1, abs=1e-15)
+
+
+@COMPOSITIONS
+def test_velocity_rows_and_friction_together(stepper) -> None:
+    """An atom driven by cos t in x, slowed down in y: x = sin t, y = (1 - exp(-t/2))/0.5."""
+    rows = [LinearVelocity(0, [[1, 0, 0]], target=np.cos)]
+    system = system_of(rows, np.zeros((1, 3)), [2.0], lambda x, v, t: -1.0 * v, velocity_dependent=True)
+    start = system.initial_state(np.zeros((1, 3)), [[1.0, 1.0, 0.0]])
+    exact = np.array([np.sin(2.0), 2 * (1 - np.exp(-1.0)), 0.0])
+    steps = [4, 6, 8] if stepper.order == 6 else [8, 16, 32]
+    errors = [np.abs(run(system, start, 2.0 / n, n, stepper=stepper).positions[0] - exact).max() for n in steps]
+    assert slope(1 / np.array(steps), errors) == pytest.approx(stepper.order, abs=0.15)
+
+
+def test_which_stages_leave_the_step() -> None:
+    for fractions, inside in ((SUZUKI_4, True), (KAHAN_LI_6, True), (YOSHIDA_4, False)):
+        nodes = np.cumsum(fractions)
+        assert (nodes.min() >= 0 and nodes.max() <= 1 + 1e-15) == inside
+
+
+@pytest.mark.parametrize(
+    ("fractions", "order", "match"),
+    [
+        ([], 2, "no palindrome"),
+        ([0.3, 0.7], 2, "no palindrome"),
+        ([0.5, 0.4, 0.5], 2, "add up to 1.4"),
+        ([0.25, 0.5, 0.25], 4, "powers of 3 do not cancel"),
+        (SUZUKI_4, 6, "powers of 5 do not cancel"),
+        ([KAHAN_LI_6[k] for k in (1, 0, 2, 3, 4, 5, 6, 8, 7)], 6, "not in this sequence"),
+    ],
+)
+def test_bad_fractions(fractions, order, match) -> None:
+    with pytest.raises(InputError, match=match):
+        Composition(fractions, order)
+
+
+def test_own_fractions() -> None:
+    """Suzuki's fractal within itself: order 4 still, and said so."""
+    stepper = Composition([a * b for a in SUZUKI_4 for b in SUZUKI_4], 4)
+    assert stepper.order == 4 and stepper.force_evaluations == 25
+    system, state = rotor(force=lambda x, t: -x)
+    ends = [run(system, state, 0.1, 10, stepper=each).positions for each in (stepper, KahanLi6())]
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-7)
+
+
+# -- the geodesic splitting -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [spherical_pendulum, rotor, growing_rod, skate])
+@pytest.mark.parametrize("stepper", [Geodesic(1, great_circles=False), Composition([1.0], 2)], ids=repr)
+def test_one_substep_and_one_fraction_are_rattle(stepper, make) -> None:
+    system, state = make()
+    a, b = run(system, state, 0.05, 20, stepper=stepper), run(system, state, 0.05, 20)
+    np.testing.assert_allclose(a.positions, b.positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(a.velocities, b.velocities, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("substeps", "omega_dt"), [(1, 0.7), (2, 0.7), (5, 0.7), (2, 1.2)])
+def test_rotor_turns_by_the_arcsine_of_a_substep(substeps: int, omega_dt: float) -> None:
+    """Also where RATTLE has no solution."""
+    system, state = rotor(omega=1.0)
+    end = run(system, state, omega_dt, 2, stepper=Geodesic(substeps))
+    assert angle_of(end) == pytest.approx(2 * substeps * np.arcsin(omega_dt / substeps), abs=1e-13)
+
+
+def test_moving_rows_are_met_at_the_time_of_each_substep() -> None:
+    """A rod that grows while it turns: with fine substeps the only error left is that of the substeps."""
+    system, state = growing_rod()
+    exact = 2.0 * np.array([np.cos(0.9), np.sin(0.9), 0.0])
+    errors = [np.abs(run(system, state, 0.5, 4, stepper=Geodesic(n)).positions[1] - exact).max() for n in (16, 32, 64)]
+    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 2.0, atol=0.1)
+    assert errors[-1] < 1e-4
+
+
+def sphere(radii=(1.0, 2.0), rest=()):
+    """Atoms on spheres of their own about (1, 2, 3), no two in one place, and atoms at rest."""
+    rng = np.random.default_rng(6)
+    n = rng.normal(size=(len(radii), 3))
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    center = np.array([1.0, 2.0, 3.0])
+    positions = np.concatenate([center + np.array(radii)[:, None] * n, rng.normal(size=(len(rest) + 1, 3))])
+    rows = [Sphere(k, center, r) for k, r in enumerate(radii)]
+    if rest:
+        rows.append(FixedAtoms([len(radii) + k for k in range(len(rest))]))
+    system = system_of(rows, positions, np.linspace(1, 2, len(positions)))
+    return system, system.initial_state(positions, rng.normal(size=positions.shape), project=True), center
+
+
+@pytest.mark.parametrize("rest", [(), (1,)])
+@pytest.mark.parametrize("stepper", [Geodesic(great_circles=True), *NYSTROM], ids=repr)
+def test_great_circles_are_exact_for_any_step(stepper, rest) -> None:
+    system, state, center = sphere(rest=rest)
+    end = run(system, state, 10.0, 3, stepper=stepper)
+    for k, radius in enumerate((1.0, 2.0)):
+        arm, v = state.positions[k] - center, state.velocities[k]
+        angle = np.linalg.norm(v) * 30.0 / radius
+        exact = center + arm * np.cos(angle) + v / np.linalg.norm(v) * radius * np.sin(angle)
+        np.testing.assert_allclose(end.positions[k], exact, rtol=0, atol=3e-13)
+        turned = v * np.cos(angle) - arm / radius * np.linalg.norm(v) * np.sin(angle)
+        np.testing.assert_allclose(end.velocities[k], turned, rtol=0, atol=3e-13)
+    np.testing.assert_allclose(end.positions[-1], state.positions[-1] + 30.0 * state.velocities[-1], atol=1e-13)
+    assert not rest or np.array_equal(end.positions[2], state.positions[2])
+
+
+def test_great_circles_of_an_atom_at_rest() -> None:
+    system, state, _ = sphere()
+    still = system.initial_state(state.positions)
+    end = run(system, still, 1.0, 3, stepper=Geodesic(great_circles=True))
+    np.testing.assert_allclose(end.positions, still.positions, rtol=0, atol=1e-15)
+    assert np.isfinite(end.velocities).all()
+
+
+def test_great_circles_agree_with_substeps() -> None:
+    system, state, _ = sphere()
+    exact = run(system, state, 0.1, 10, stepper=Geodesic()).positions
+    steppers = [Geodesic(n, great_circles=False) for n in (8, 16, 32)]
+    errors = [np.abs(run(system, state, 0.1, 10, stepper=each).positions - exact).max() for each in steppers]
+    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 2.0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [Distance([0, 1])],
+        [Sphere(0, [0, 0, 0], np.sqrt(2)), Plane(1, [0, 0, 1], 0.0)],
+        [Sphere(0, [0, 0, 0], np.sqrt(2)), Sphere(0, [3, 0, 1], 2.0)],
+        [FixedAtoms([0])],
+    ],
+    ids=["distance", "plane", "two spheres", "no sphere"],
+)
+def test_great_circles_are_refused_where_there_are_none(rows) -> None:
+    positions = np.array([[1.0, 0.0, 1.0], [2.0, 1.0, 0.0]])
+    system = system_of(rows, positions, [1.0, 1.0])
+    state = system.initial_state(positions)
+    stepper = Geodesic(great_circles=True)
+    for attempt in (lambda: stepper.check(system), lambda: stepper.step(system, state, 0.1)):
+        with pytest.raises(UnsupportedError, match="Leave great_circles at None"):
+            attempt()
+    run(system, state, 0.1, 3, stepper=Geodesic(2))
+
+
+def test_error_is_that_of_the_splitting_alone() -> None:
+    """A fast rotor in a weak field: the drift is exact, what is left goes with the field."""
+    field = 1e-3 * np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    system, state = rotor(omega=5.0, force=lambda x, t: field)
+    fine = run(system, state, 0.0005, 4000, stepper=Geodesic(32)).positions
+    ends = [run(system, state, 0.05, 40, stepper=stepper).positions for stepper in (Geodesic(32), Rattle())]
+    assert 100 * np.abs(ends[0] - fine).max() < np.abs(ends[1] - fine).max()
+
+
+@pytest.mark.parametrize("substeps", [0, -1, 1.5, np.nan])
+def test_bad_number_of_substeps(substeps) -> None:
+    with pytest.raises(InputError, match="substeps"):
+        Geodesic(substeps)
+
+
+# -- Runge-Kutta-Nystrom ----------------------------------------------------------------------------
+
+
+@SPLITTINGS
+def test_coefficients_are_symmetric_and_complete(stepper) -> None:
+    for fractions in (stepper.kicks, stepper.drifts, stepper.flight):
+        assert fractions == fractions[::-1]
+        assert sum(fractions) == pytest.approx(1, abs=1e-15)
+
+
+def test_fewest_evaluations_of_their_order() -> None:
+    """At the same cost in forces the error is below that of the compositions."""
+    system, state = rotor(omega=1.0, force=lambda x, t: -x + 0.1 * x**3)
+    exact = run(system, state, 0.01, 200, stepper=BlanesMoan6())
+
+    def error(stepper, evaluations: int) -> float:
+        n = evaluations // stepper.force_evaluations
+        return float(np.abs(run(system, state, 2 / n, n, stepper=stepper).positions - exact.positions).max())
+
+    assert 2 * error(BlanesMoan4(), 240) < error(Suzuki4(), 240)
+    assert 10 * error(BlanesMoan6(), 198) < error(KahanLi6(), 198)
+
+
+@SPLITTINGS
+def test_velocity_dependent_forces_are_refused(stepper) -> None:
+    system, state = rotor(force=lambda x, v, t: -v, velocity_dependent=True)
+    seen: list[State] = []
+    for attempt in (
+        lambda: stepper.check(system),
+        lambda: stepper.step(system, state, 0.1),
+        lambda: run(system, state, 0.1, 0, stepper=stepper, observers=[seen.append]),
+    ):
+        with pytest.raises(UnsupportedError, match="depend on the velocities; use Suzuki4 or KahanLi6"):
+            attempt()
+    assert not seen
+
+
+def test_states_between_drifts_carry_no_forces() -> None:
+    system, state = rotor(force=lambda x, t: -x)
+    assert BlanesMoan6a().step(system, state, 0.1).forces is None
+    end = BlanesMoan6().step(system, state, 0.1)
+    np.testing.assert_array_equal(end.forces, -end.positions)
+
+
+# -- the projected equation -------------------------------------------------------------------------
+
+
+def violation(stepper, dt: float, steps: int) -> float:
+    system, state = spherical_pendulum()
+    end = run(system, state, dt, steps, stepper=stepper)
+    return float(np.abs(system.motion.constraint_set.value(end.positions)).max())
+
+
+def test_constraints_drift_without_projection_or_feedback() -> None:
+    free = [violation(ProjectedRungeKutta4(), 0.05, n) for n in (200, 800)]
+    assert free[0] > 1e-9 and free[1] > 3 * free[0]
+    assert violation(ProjectedVerlet(), 0.05, 200) > 1e-5
+    assert violation(ProjectedRungeKutta4(project=True), 0.05, 200) <= 1e-15
+    assert violation(ProjectedVerlet(project=True), 0.05, 200) <= 1e-15
+    assert violation(Baumgarte(2.0), 0.05, 800) < free[1] / 10
+
+
+def test_feedback_brings_a_violation_down() -> None:
+    """Critically damped: (1 + rate t) exp(-rate t) of it is left."""
+    system, state = rotor(omega=0.0)
+    state = State(state.positions * (1 + 1e-6), state.velocities)
+    end = run(system, state, 0.01, 200, stepper=Baumgarte(2.0))
+    left = np.linalg.norm(end.positions[0] - end.positions[1]) - 1.2
+    assert left == pytest.approx(1.2e-6 * 5 * np.exp(-4.0), rel=1e-4)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf])
+def test_bad_rate(rate) -> None:
+    with pytest.raises(InputError, match="rate is"):
+        Baumgarte(rate)
