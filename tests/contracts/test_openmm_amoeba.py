@@ -9,10 +9,11 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app
+from openmm_ensembles import ENSEMBLES
 from openmm_systems import started, state_of, total_energy
 
 from kcons.constraints import Angle, Distance
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.callback_rows.hold import hold
 
 #: A Context with AMOEBA takes OpenMM 13 s here.
@@ -74,10 +75,10 @@ def test_energy_is_conserved_to_second_order_and_as_by_verlet(kind, make):
 
 
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
-@pytest.mark.parametrize("ensemble", [Langevin(300, 1), Isokinetic(300), NoseHoover(300, 5)])
-def test_ensembles_run(ensemble):
+@pytest.mark.parametrize("name", ENSEMBLES)
+def test_ensembles_run(name):
     system, x, v = waters("mutual")
-    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    integrator = ProjectedIntegrator(1e-3, ensemble=ENSEMBLES[name](300))
     context = started(system, integrator, x, v)
     integrator.setVelocitiesToTemperature(context, 300)
     integrator.step(50)

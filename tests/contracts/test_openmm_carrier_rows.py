@@ -8,113 +8,11 @@ import pytest
 from carried_systems import context_of, free, peptide, pull, start, state_of
 
 from kcons.constraints import (
-    Angle,
-    CenterDistance,
-    Custom,
-    Dihedral,
     Distance,
-    DistanceDifference,
-    FixedAtoms,
-    KnifeEdge,
-    LinearRelation,
-    MovingTarget,
-    Plane,
-    RadiusOfGyration,
-    Sphere,
 )
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.callback_rows.hold import hold
-from kcons.steppers import System
-
-# -- kinds of rows --------------------------------------------------------------------------------
-
-CROSS = np.array([[0.0, 0, 0], [0.15, 0, 0], [0.2, 0.14, 0], [0.25, 0.15, 0.13], [0.4, 0.1, 0.1], [0.1, -0.1, 0.3]])
-
-
-def _height(r):
-    return r[0, 2] - 0.3 * r[1, 0] ** 2
-
-
-def _slope(r):
-    return np.array([[0.0, 0.0, 1.0], [-0.6 * r[1, 0], 0.0, 0.0]])
-
-
-KINDS = {
-    "angle": [Angle([[0, 1, 2]]), Distance([[0, 1], [1, 2]])],
-    "dihedral": [Dihedral([[0, 1, 2, 3]])],
-    "surfaces": [Sphere([5], [0, 0, 0]), Plane([4], [0, 0, 1])],
-    "relation": [LinearRelation([3], [1, 2], [0.5, 0.5], None)],
-    "difference": [DistanceDifference([[0, 1], [1, 2], [3, 4]], weights=[1.0, -1.0, 0.5])],
-    "gyration": [RadiusOfGyration([range(6)])],
-    "centers": [CenterDistance([0, 1, 2], [3, 4])],
-    "custom": [Custom([3, 4], _height, _slope)],
-    "fixed and redundant": [FixedAtoms([0]), Distance([[0, 1]]), Distance([[1, 0]])],
-    "knife edge": [KnifeEdge(4, 5, [0.0, 1.0, 0.0]), Distance([[4, 5]])],
-}
-
-
-@pytest.mark.parametrize("rows", KINDS.values(), ids=KINDS)
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-def test_every_kind_is_held(rows, scheme):
-    system = free([12.0, 1.0, 14.0, 16.0, 32.0, 4.0], pull(20.0, 6))
-    part = hold(system, rows, CROSS)
-    context = context_of(system, ProjectedIntegrator(0.001, scheme, parts=[part]))
-    start(context, part, CROSS)
-    # Drifts with velocity rows are solved by iteration, and a step of the composition has five.
-    context.getIntegrator().step(60 if scheme == "suzuki4" and "KnifeEdge" in {row.family for row in rows} else 200)
-    part.check(context)
-    report = part.report(context)
-    assert report.residual <= 1e-12
-    assert report.velocity_residual <= 1e-12
-    assert np.abs(state_of(context)[0] - CROSS).max() > 0.01
-
-
-@pytest.mark.parametrize(("scheme", "steps"), [("rattle", 20), ("suzuki4", 8), ("blanes-moan6", 3)])
-def test_velocity_rows_follow_the_core(scheme, steps):
-    rows = KINDS["knife edge"]
-    masses = [12.0, 1.0, 14.0, 16.0, 32.0, 4.0]
-    system = free(masses, pull(20.0, 6))
-    part = hold(system, rows, CROSS)
-    integrator = ProjectedIntegrator(0.01, scheme, parts=[part])
-    context = context_of(system, integrator)
-    start(context, part, CROSS)
-    x, v = state_of(context)
-    core = System(Motion(ConstraintSet(rows, CROSS, masses), CROSS), lambda x, t: np.tile([0, 0, 20.0], (6, 1)))
-    state = core.initial_state(x, v)
-    for _ in range(steps):
-        state = integrator.scheme.step(core, state, 0.01)
-    integrator.step(steps)
-    assert np.abs(state_of(context)[0] - state.positions).max() <= 1e-11
-
-
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4", "blanes-moan6"])
-def test_moving_target_is_met_at_the_right_time(scheme):
-    length = MovingTarget(
-        lambda t: 1 + 0.1 * np.sin(3 * t), lambda t: 0.3 * np.cos(3 * t), lambda t: -0.9 * np.sin(3 * t)
-    )
-    rows, x = [Distance([[0, 1]], length)], np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    system = free([3.0, 1.0], pull(2.0, 1))
-    part = hold(system, rows, x)
-    integrator = ProjectedIntegrator(0.02, scheme, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    context.setVelocities([[0, 0.1, 0], [0.05, 1.0, 0.3]])
-    part.apply_velocities(context)
-    part.check(context)
-    x0, v0 = state_of(context)
-    core = System(Motion(ConstraintSet(rows, x, [3.0, 1.0]), x), lambda x, t: np.array([[0, 0, 2.0], [0, 0, 0]]))
-    state = core.initial_state(x0, v0)
-    for k in range(1, 51):
-        integrator.step(1)
-        context.getState(energy=True, forces=True)  # evaluates all groups between steps
-        state = integrator.scheme.step(core, state, 0.02)
-        there, speed = state_of(context)
-        assert np.linalg.norm(there[1] - there[0]) == pytest.approx(1 + 0.1 * np.sin(0.06 * k), abs=1e-13)
-    assert np.abs(there - state.positions).max() <= 1e-11
-    assert np.abs(speed - state.velocities).max() <= 1e-10
 
 
 def test_particles_without_mass_are_fixed():

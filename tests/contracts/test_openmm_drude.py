@@ -8,10 +8,11 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app
+from openmm_ensembles import ENSEMBLES
 from openmm_systems import started, state_of
 
 from kcons.errors import UnsupportedError
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
 
 
@@ -41,11 +42,9 @@ def test_drude_particles_are_refused_by_all_schemes(scheme):
     refused(integrator, lambda context: integrator.step(1))
 
 
-@pytest.mark.parametrize(
-    "ensemble", [Langevin(300, 1), Isokinetic(300), NoseHoover(300, 10)], ids=["Langevin", "Isokinetic", "NoseHoover"]
-)
-def test_drude_particles_are_refused_by_thermostats(ensemble):
-    integrator = ProjectedIntegrator(0.0005, ensemble=ensemble)
+@pytest.mark.parametrize("name", ENSEMBLES)
+def test_drude_particles_are_refused_by_thermostats(name):
+    integrator = ProjectedIntegrator(0.0005, ensemble=ENSEMBLES[name](300))
     refused(integrator, lambda context: integrator.step(1))
 
 

@@ -13,15 +13,14 @@ import numpy as np
 import openmm
 import pytest
 from openmm import unit
+from openmm_ensembles import ENSEMBLES
 from openmm_systems import water_box
 
 from kcons.openmm import (
     CollectiveRows,
-    Isokinetic,
     Langevin,
     LangevinRespa,
     NoseHoover,
-    NoseHooverMiddle,
     ProjectedIntegrator,
     RattleIntegrator,
 )
@@ -39,11 +38,8 @@ pytestmark = [
 
 BATHS = {
     "constant energy": lambda kelvin: None,
-    "Langevin": lambda kelvin: Langevin(kelvin, 5.0),
     "LangevinRespa": lambda kelvin: LangevinRespa(kelvin, 5.0, {0: 1, 1: 2}),
-    "NoseHoover": lambda kelvin: NoseHoover(kelvin, 10.0),
-    "NoseHooverMiddle": lambda kelvin: NoseHooverMiddle(kelvin, 10.0),
-    "Isokinetic": lambda kelvin: Isokinetic(kelvin),
+    **ENSEMBLES,
 }
 MAKERS = {
     **{name: lambda kelvin, of=of: ProjectedIntegrator(0.001, ensemble=of(kelvin)) for name, of in BATHS.items()},

@@ -10,21 +10,23 @@ import numpy as np
 import openmm
 import pytest
 from openmm import unit
+from openmm_ensembles import ENSEMBLES
 from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
 
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, NoseHooverMiddle, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import Langevin, ProjectedIntegrator, RattleIntegrator
 
 GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 T = 300.0
 #: 1/ps. <K> of 12 ps then has a standard deviation of 1.8 % over seeds.
-FRICTION = 20.0
+RATE = 20.0
+MOMENTUM = "free"
 MADE = {
     "RattleIntegrator": RattleIntegrator,
     "rattle": ProjectedIntegrator,
-    "Langevin": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Langevin(T, FRICTION), **given),
-    "Isokinetic": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Isokinetic(T, momentum="free"), **given),
-    "NoseHoover": lambda dt, **given: ProjectedIntegrator(dt, ensemble=NoseHoover(T, 10.0), **given),
-    "NoseHooverMiddle": lambda dt, **given: ProjectedIntegrator(dt, ensemble=NoseHooverMiddle(T, 10.0), **given),
+    **{
+        name: lambda dt, make=make, **given: ProjectedIntegrator(dt, ensemble=make(T, RATE, MOMENTUM), **given)
+        for name, make in ENSEMBLES.items()
+    },
 }
 AT_CONSTANT_ENERGY = ("RattleIntegrator", "rattle")
 made = pytest.mark.parametrize("name", MADE)

@@ -15,11 +15,10 @@ from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
-from kcons.openmm.integrator.ensemble import Integrator
+from kcons.openmm.integrator.ensemble import Integrator, Step
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.steps import Step
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of, forces_at, positions_of, velocities_of
 from kcons.steppers.operations import Kick, Operation, Project, Turn

@@ -5,9 +5,8 @@ from __future__ import annotations
 from openmm import unit
 
 from kcons.errors import InputError
-from kcons.openmm.integrator.ensemble import BetweenHalves
+from kcons.openmm.integrator.ensemble import BetweenHalves, Step
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.steps import Step
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 
 

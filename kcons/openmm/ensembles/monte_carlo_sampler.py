@@ -21,13 +21,12 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
-from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Step
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.steps import Step
 from kcons.openmm.integrator.system_checks import forces_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
-from kcons.openmm.states import box_of, energy_of, positions_of, velocities_of
+from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts, best_share
@@ -172,7 +171,6 @@ class HamiltonianMonteCarlo:
         with np.errstate(divide="ignore"):
             self._weights = np.where(self._masses > 0, 1 / self._masses, 0.0)
         self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
-        self._expected: tuple[FloatArray, Any] | None = None
         #: In which total momentum stays, found with the first proposal.
         self._directions: FloatArray | None = None
         #: Proposals so far.
@@ -230,7 +228,6 @@ class HamiltonianMonteCarlo:
             raise InputError("the state is none of a HamiltonianMonteCarlo", item="state")
         self._held, self.number = state.thermostat.copy(), int(state.step)
         self._put(state.positions, state.velocities, state.time)
-        self._expected = None  # the state may be of other forces
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the state; `restart=file` goes on, to the last bit where the platform is reproducible."""
@@ -246,10 +243,9 @@ class HamiltonianMonteCarlo:
         InputError, UnsupportedError
             As for the first step of the integrator.
         """
-        self._expected = None  # forces may be others than in the last call
-        for _ in range(whole_number(proposals, "proposals", 0)):
+        for number in range(whole_number(proposals, "proposals", 0)):
             due = [] if self.simulation is None else [r for r in self.simulation.reporters if self._next(r) == 1]
-            self._propose()
+            self._propose(first=number == 0)
             for reporter in due:
                 asked = _asked(reporter.describeNextReport(self.simulation))
                 found = self.context.getState(
@@ -278,10 +274,10 @@ class HamiltonianMonteCarlo:
         check_proposals(proposals)
         begun = integrator.getStepSize()
         try:
-            for _ in range(proposals):
+            for number in range(proposals):
                 integrator.setStepSize(search.dt * unit.picosecond)
                 before = self._held[SUM]
-                self._propose()
+                self._propose(first=number == 0)
                 search.learn(float(self._held[SUM] - before))
             search.refuse_failure()
         except BaseException:
@@ -293,13 +289,14 @@ class HamiltonianMonteCarlo:
 
     # -- a proposal -----------------------------------------------------------------------------
 
-    def _propose(self) -> None:
+    def _propose(self, *, first: bool) -> None:
+        """One proposal; before the `first` of a call others may have moved particles, or changed forces."""
         held, context = self._held, self.context
         number = self.number + 1
         guard = self.integrator._watch(context)
         guard.enter()  # positions near the constraints are brought onto them
         x, time = positions_of(context), context.getTime()
-        if math.isnan(held[POTENTIAL]) or self._others_acted(x):
+        if first:
             held[POTENTIAL] = self._potential()
             if not math.isfinite(held[POTENTIAL]):
                 raise NonFiniteError(f"the potential energy is {held[POTENTIAL]} at proposal {number}", item="energy")
@@ -333,7 +330,7 @@ class HamiltonianMonteCarlo:
         if reason == ACCEPTED:
             held[POTENTIAL] = potential
             context.setStepCount(number)
-            self._note()
+            guard.leave()
         else:
             # Velocities of the way there, turned round.
             self._put(x, -v, time + count * self.integrator.getStepSize())
@@ -400,19 +397,7 @@ class HamiltonianMonteCarlo:
         context.setVelocities(v)
         context.setTime(time)
         context.setStepCount(self.number)
-        self._note()
-
-    def _note(self) -> None:
         self.integrator._watch().leave()
-        self._expected = positions_of(self.context), self._surroundings()
-
-    def _others_acted(self, x: FloatArray) -> bool:
-        """Whether positions, box or parameters are not what this object left; forces are looked at in each call."""
-        known = self._expected
-        return known is None or not np.array_equal(x, known[0]) or self._surroundings() != known[1]
-
-    def _surroundings(self) -> tuple[Any, dict[str, float]]:
-        return box_of(self.context), dict(self.context.getParameters())
 
     def _next(self, reporter: Any) -> int:
         told = reporter.describeNextReport(self.simulation)

@@ -12,10 +12,9 @@ from kcons.constraints.arguments import positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
-from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, refuse_leapfrog
+from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step, refuse_leapfrog, use
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.integrator.steps import Step, use
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of
 from kcons.steppers.operations import Operation

@@ -11,8 +11,7 @@ from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, friction_and_noise
-from kcons.openmm.integrator.ensemble import Integrator
-from kcons.openmm.integrator.steps import Step
+from kcons.openmm.integrator.ensemble import Integrator, Step
 from kcons.openmm.integrator.system_checks import groups_in, groups_of
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting

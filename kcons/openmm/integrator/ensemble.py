@@ -1,33 +1,98 @@
-"""What an ensemble is to an integrator: its kicks, and what it puts between two halves of the drift."""
+"""Ensembles, and the step that they write: what an ensemble puts into it, and the variables of its program.
+
+What begins and ends a step, and what may be left out of it, goes by a few variables:
+
+- `between` is 1 for all steps of a call but the last ones. A step after which nobody looks at the velocities may end
+  without the second half of its kick and without a projection; it says so in `behind`, and the next makes up for it.
+- `call` is 1 where a call of `step` begins and 2 afterwards. Forces are kept in a variable within a call only. Where it
+  is 0, which is so without Python, they are computed in each step.
+- `failed` is the number of the part whose solve failed; -1 asks Python to look at positions that others have moved.
+  Nothing moves then until Python has read it. Of a step that failed x and v go back to `x_last` and `v_last`; what is
+  kept of x is computed anew (`stale`), and `loose` says that v is not tangent.
+- `ending` is 1 in the last step of a call, which sums `motion` for `Guard.look`.
+- `phase` is other than 0 where virtual sites are placed at the end of an execution of the program only: each execution
+  is then the part of a step from one force evaluation to the next, and counts on by itself.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
 
+import numpy as np
 import openmm
 
 from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of
+from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
-from kcons.steppers.splitting import Splitting
+from kcons.steppers.splitting import Rattle, Splitting
 
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.steps import Step
+#: Schemes whose shortest drifts are less than this part of a step: what rounding does to x, divided by the length of
+#: the drift, must be kept out of v there.
+SHORT_DRIFT = 1 / 30
+
+
+class Variable(NamedTuple):
+    """What a name in a program stands for."""
+
+    kind: str
+    words: str
+    value: float = 0.0
+
+
+VARIABLES = {
+    "phase": Variable("control", "0 for a whole step; else the number of the part of it that is made"),
+    "stage": Variable("number", "number of the drift"),
+    "stop": Variable("number", "the drift that is left to the next part"),
+    "h": Variable("number", "length of the drift"),
+    "per_h": Variable("number", "1/h after the drift"),
+    "kick": Variable("number", "length of a kick as a fraction of the step, with what the last step left out"),
+    "ending": Variable("control", "1 in the last step of a call"),
+    "motion": Variable("number", "sum of squares of velocities where a call ended"),
+    "good_steps": Variable("number", "steps done since the integrator was made"),
+    "call": Variable("control", "1 where a call of step begins, 2 within it, 0 without Python"),
+    "failed": Variable("control", "number of the part whose solve failed, 0 for none"),
+    "loose": Variable("number", "1 where v was taken back to a step at whose end nobody looked: it is not tangent"),
+    "between": Variable("control", "1 if nobody looks at the velocities after this step"),
+    "behind": Variable("control", "1 where v lacks what ends a step"),
+    "led": Variable("number", "the same when the last drift began"),
+    "looked": Variable("control", "1 if somebody may have looked since the last step", 1.0),
+    "coarse": Variable("setting", "1 in single precision: rounding of x over a time step is much beside a kick"),
+    "moving": Variable("setting", "1 where barostats may move x between steps"),
+    "moved": Variable("number", "how far others have moved x since the last step"),
+    "stale": Variable("number", "1 at a fresh start, and where what is kept of x must be computed anew", 1.0),
+    "xu": Variable("vector", "positions before constraints act on them"),
+    "u": Variable("vector", "velocities of the drift"),
+    "x_last": Variable("vector", "positions to come back to"),
+    "v_last": Variable("vector", "velocities to come back to"),
+    "x_start": Variable("vector", "positions where the drift began"),
+    "v_middle": Variable("vector", "velocities after friction and noise, with which x moved last"),
+    "v_end": Variable("vector", "v at the end of the step that has this v_middle"),
+    "v_next": Variable("vector", "velocities with all of (x-xu)/h"),
+    "force": Variable("vector", "applied forces at x, kept within a call where OpenMM would compute them again"),
+    "impulse": Variable("vector", "change of v by the constraints in the last drift"),
+}
+
+
+def use(program: Program, *names: str) -> str:
+    """Declare variables of the list; returns the last name."""
+    for name in names:
+        kind, words, first = VARIABLES[name]
+        getattr(program, kind)(name, words, *(() if kind == "vector" else (first,)))
+    return names[-1]
 
 
 class Integrator(openmm.CustomIntegrator):
     """What ensembles and checks may ask of an integrator; `ProjectedIntegrator` answers, and says what each is."""
 
     scheme: Splitting | None
-    parts: tuple[Any, ...]
+    parts: tuple[Part, ...]
     program: Program
     row_groups: frozenset[int]
     spare: bool
     check_every: int
-    ensemble: Ensemble
-    context: openmm.Context
     _guard: Any
     _watch: Callable[..., Any]
     take_precision: Callable[..., None]
@@ -37,6 +102,14 @@ class Integrator(openmm.CustomIntegrator):
     independent_momenta: Callable[..., int]
     degrees_of_freedom: Callable[..., int]
     kinetic_energy: Callable[..., Any]
+
+    @property
+    def ensemble(self) -> Ensemble:
+        raise NotImplementedError
+
+    @property
+    def context(self) -> openmm.Context:
+        raise NotImplementedError
 
 
 class Ensemble:
@@ -220,3 +293,149 @@ def refuse_leapfrog(ensemble: Ensemble) -> None:
         f"{type(ensemble).__name__} needs velocities at the time of the positions, and those of the leapfrog are half "
         "a step behind; use scheme='rattle'"
     )
+
+
+class Step:
+    """What the functions that write a step share.
+
+    Attributes
+    ----------
+    operations : tuple of Operation
+        What a step consists of.
+    drifts, kicks : list of float
+        Its stages as fractions of the step; see `stages_of`.
+    halves : bool
+        Whether a bath acts between two halves of the only drift.
+    phases : int
+        Executions of the program that a step takes where virtual sites are placed at the end of each only.
+    kept : bool
+        Whether the applied forces are kept in a variable within a call: where parts evaluate row groups, OpenMM
+        remembers the forces of the last groups only.
+    sited : bool
+        Whether parts stand beside virtual sites.
+    single : bool
+        Whether there is one part, whose rows are all there is.
+    lean : bool
+        Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
+    lazy : bool
+        Whether `between` is of use.
+    observed : int
+        How many steps at the end of a call must be complete: two where a part tells the mean over a step.
+    force : str
+        Name of the applied forces.
+    """
+
+    def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
+        self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
+        self.operations = ensemble.operations(scheme)
+        self.drifts, self.kicks = stages_of(self.operations)
+        self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
+        self.one_drift = len(self.drifts) == 1 or self.halves
+        self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
+        self.sited = scheme is not None and any(part.sited for part in self.parts)
+        self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
+        verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
+        self.lean = plain and bool(self.parts) and verlet and not self.sited
+        #: Without parts: the kick that ends a step is made with that which begins the next.
+        self.joined = ensemble.adds_up and not self.parts and verlet
+        self.lazy = self.lean or self.joined or (not self.parts and (ensemble.owes or scheme is None))
+        self.observed = 2 if self.lean and any(hasattr(part, "mean_multipliers") for part in self.parts) else 1
+        self.kept = scheme is not None and any(part.evaluates for part in self.parts) and not self.lean
+        self.force = "f"
+        #: Whether drifts change v by impulses without the rounding errors of positions.
+        self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
+
+    # -- kicks, drifts, projections -------------------------------------------------------------
+
+    def kick(self, h: str, impulse: str = "", tangent: bool = False) -> None:
+        """The applied forces act for h, after the impulse of a drift."""
+        words = "constraint forces act, then the applied ones" if impulse else "applied forces act"
+        self.program.each("v", self.kicked(h, impulse, tangent), f"the {words} (kick)")
+
+    def kicked(self, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
+        """The velocities after a kick, which a drift may begin with."""
+        tangent = tangent and self.scheme is not None  # the leapfrog's velocities belong to half a step before
+        return self.ensemble.kick(self, h, impulse, tangent, unseen)
+
+    def drift(self, h: str, u: str = "v") -> str:
+        """Fly h along all constraints with velocities u; returns the impulse that keeps x on them, to be added to u."""
+        return self.ensemble.drift(self, h, u)
+
+    def flight(self, h: str, u: str) -> str:
+        """The drift itself."""
+        p = self.program
+        if self.filtered:
+            return self._filtered_flight(h)
+        for part in self.parts:
+            part.remember(p)
+        self.land(u, h)
+        if self.scheme is None:
+            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
+            return "impulse"
+        return f"(x-xu)/{h}"
+
+    def _filtered_flight(self, h: str) -> str:
+        """What a drift does to v lies along the gradients where it began: the rest of (x-xu)/h is rounding.
+
+        (x-xu)/h has the rounding errors of x, divided by h. The projector where the drift began tells what of it is
+        along the constraints.
+        """
+        p = self.program
+        use(p, "x_start", "v_next")
+        p.each("x_start", "x", "where the drift begins")
+        p.each("x", f"x+{h}*v", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        p.hold_positions("back onto the constraints of the System")
+        p.each("v_next", f"v+(x-xu)/{h}", "the constraint forces act on v as well, and rounding errors of x")
+        p.each("v", f"(x-xu)/{h}", "to be split")
+        p.each("xu", "x", "where the drift ends")
+        p.each("x", "x_start", "back, for a moment")
+        p.hold_positions("the solver of the System takes its directions from here")
+        p.hold_velocities("what is along the constraints: rounding")
+        p.each("x", "xu", "where the drift ends")
+        p.hold_positions("the solver of the System takes its directions from here")
+        return "v_next-2*v"
+
+    def land(self, u: str, h: str) -> None:
+        """Fly freely for h with velocities u, and go from there back onto all constraints."""
+        p = self.program
+        u = u if u.isidentifier() else f"({u})"
+        p.each("x", f"x+{h}*{u}", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        for part in self.parts:
+            if not (part.meets_system or part.lands_last):
+                part.land(p, h)
+        together = [part for part in self.parts if part.meets_system]
+        if together:
+            together[0].land(p, h)
+        else:
+            p.hold_positions("back onto the constraints of the System")
+        # Until then GPUs keep x as a difference, and forces do not see it.
+        for part in self.parts:
+            if part.lands_last:
+                part.land(p, h)
+        if self.sited and any(part.lands_last for part in self.parts):
+            p.hold_positions("GPUs place virtual sites")
+
+    def project(self) -> None:
+        """Make v tangent to all constraints at x."""
+        self.program.hold_velocities("tangent to the constraints of the System")
+        for part in self.parts:
+            part.project(self.program)
+
+    @property
+    def ends_tangent(self) -> bool:
+        """Whether the last kick leaves v tangent, so that no projection is needed."""
+        return self.ensemble.stays_tangent and self.kicks[-1] != 0 and (not self.parts or self.one_drift)
+
+    # -- the kinetic energy that is reported ----------------------------------------------------
+
+    def note_middle(self, velocities: str) -> None:
+        """The velocities between the last drift of a step and the kick that ends it."""
+        if self.ensemble.noisy:
+            self.program.each("v_middle", velocities, "its kinetic energy is reported")
+
+    def note_end(self) -> None:
+        """The step that has this `v_middle` ends."""
+        if self.ensemble.noisy:
+            self.program.each("v_end", "v", "to see whether others change v")

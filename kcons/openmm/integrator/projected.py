@@ -16,14 +16,14 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive, whole_number
 from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
-from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Integrator
+from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import TOLERANCES, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
-from kcons.openmm.integrator.steps import VARIABLES, Step, write_step
+from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
 from kcons.openmm.quantities import kelvins, number, relative_tolerance
 from kcons.openmm.states import motion_of, positions_of, velocities_of

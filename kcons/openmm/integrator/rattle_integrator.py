@@ -15,16 +15,15 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import whole_number
-from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.ensemble import Step, use
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
-from kcons.openmm.integrator.steps import Step, single_step, use
+from kcons.openmm.integrator.steps import single_step
 
 #: What one execution of the program of `Ends` does.
 _STEP, _BEGIN, _END = 0.0, 1.0, 2.0
 #: Shorter calls are made by the program itself.
 FEW = 2
-_CLOSED = "a RattleIntegrator has its integrators; make a CompoundIntegrator with a ProjectedIntegrator in it"
 
 
 def _step_or_end(step: Step) -> bool:
@@ -212,26 +211,6 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         """As `ProjectedIntegrator.setIntegrationForceGroups`."""
         self._ends.setIntegrationForceGroups(groups)
         self._verlet.setIntegrationForceGroups(self._ends.getIntegrationForceGroups())
-
-    def addIntegrator(self, integrator: openmm.Integrator) -> int:
-        """Refused.
-
-        Raises
-        ------
-        UnsupportedError
-            Always: make a CompoundIntegrator with a ProjectedIntegrator in it.
-        """
-        raise UnsupportedError(_CLOSED)
-
-    def setCurrentIntegrator(self, index: int) -> None:
-        """Refused.
-
-        Raises
-        ------
-        UnsupportedError
-            Always: make a CompoundIntegrator with a ProjectedIntegrator in it.
-        """
-        raise UnsupportedError(_CLOSED)
 
     # -- copies ---------------------------------------------------------------------------------
 

@@ -142,17 +142,10 @@ class SurfaceIntegrator(ProjectedIntegrator):
         parts: Sequence[Part] = (),
         **arguments: Any,
     ) -> None:
-        # Copies are made from the parts alone.
-        ready = (
-            not isinstance(surfaces, Constraint | ExpressionSurface)
-            and not tuple(surfaces)
-            and any(isinstance(part, SurfaceRows) for part in parts)
-        )
+        given = (surfaces,) if isinstance(surfaces, Constraint | ExpressionSurface) else tuple(surfaces)
         held: tuple[SurfaceRows, ...] = ()
-        if not ready:
-            held = surface_parts(
-                surfaces, system=system, n_particles=n_particles, positions=positions, compiled=compiled
-            )
+        if given or not any(isinstance(part, SurfaceRows) for part in parts):  # copies are made from parts alone
+            held = surface_parts(given, system=system, n_particles=n_particles, positions=positions, compiled=compiled)
         together: tuple[Part, ...] = (*held, *parts)
         self.surfaces = tuple(part for part in together if isinstance(part, SurfaceRows))
         super().__init__(picoseconds(timestep) * unit.picosecond, scheme, parts=together, **arguments)

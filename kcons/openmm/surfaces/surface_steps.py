@@ -7,8 +7,8 @@ rounding grows as 1/h.
 
 from __future__ import annotations
 
-from kcons.openmm.integrator.ensemble import ConstantEnergy
-from kcons.openmm.integrator.steps import Step, see_who_moved, use
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Step, use
+from kcons.openmm.integrator.steps import see_who_moved
 from kcons.openmm.surfaces.closed_forms import QuadricRows
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 from kcons.steppers.splitting import Rattle

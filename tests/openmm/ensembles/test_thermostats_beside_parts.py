@@ -7,21 +7,19 @@ import copy
 import numpy as np
 import pytest
 from ensemble_runs import on_their_rows, run, three_on_a_sphere, three_parts, twice_kinetic, warm
+from openmm_ensembles import ENSEMBLES
 from openmm_systems import loose_alanine, state_of
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import Isokinetic, NoseHoover, NoseHooverMiddle, ProjectedIntegrator, SurfaceIntegrator, hold
+from kcons.openmm import ProjectedIntegrator, SurfaceIntegrator, hold
 from kcons.openmm.quantities import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
-BATHS = {
-    "isokinetic": lambda **given: Isokinetic(300.0, **given),
-    "chain": lambda **given: NoseHoover(300.0, 20.0, **given),
-    "chain in the middle": lambda **given: NoseHooverMiddle(300.0, 20.0, **given),
-}
+#: Noise differs between programs.
+WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy]
 
 
-@pytest.mark.parametrize("bath", BATHS)
+@pytest.mark.parametrize("bath", WITHOUT_NOISE)
 def test_rows_that_are_carried_move_as_those_of_the_system(bath):
     """The same bonds held by OpenMM and by kcons: one trajectory of atoms and bath, although others move x."""
     system, x, v = loose_alanine()
@@ -29,7 +27,9 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
     carried = hold(other, [], positions=x, take="all")
     ends = []
     for this, parts in ((system, ()), (other, (carried,))):
-        integrator = ProjectedIntegrator(1e-3, parts=parts, tolerance=1e-13, ensemble=BATHS[bath](momentum="free"))
+        integrator = ProjectedIntegrator(
+            1e-3, parts=parts, tolerance=1e-13, ensemble=ENSEMBLES[bath](300.0, 20.0, momentum="free")
+        )
         context = run(this, integrator, x, v, 10)
         r, u = state_of(context)
         context.setPositions(r + 0.7)
@@ -42,11 +42,11 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
 
 
 @pytest.mark.parametrize(
-    ("bath", "scheme"), [("isokinetic", "rattle"), ("isokinetic", "isokinetic4"), ("chain", "rattle")]
+    ("bath", "scheme"), [("Isokinetic", "rattle"), ("Isokinetic", "isokinetic4"), ("NoseHoover", "rattle")]
 )
 def test_parts_keep_their_rows(bath, scheme):
     system, x, parts = three_parts()
-    ensemble = BATHS[bath]() if bath == "isokinetic" else NoseHoover(300.0, 5.0)
+    ensemble = ENSEMBLES[bath](300.0)
     integrator = ProjectedIntegrator(1e-3, scheme, parts=parts, ensemble=ensemble)
     context = warm(system, integrator, x, 4)
     values = []
@@ -56,13 +56,13 @@ def test_parts_keep_their_rows(bath, scheme):
         values.append(ensemble.conserved_energy(integrator))
         r, u = on_their_rows(*state_of(context))
         # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
-        if bath == "isokinetic":
+        if bath == "Isokinetic":
             assert abs(twice_kinetic(system, u) / ((18 - 3 - 1) * GAS_CONSTANT * 300) - 1) <= 1e-13
         if block == 1:  # somebody moves x between steps
             context.setPositions(r + 0.0)
             integrator.applyConstraints(context)
     assert ensemble.count(integrator) == 15
-    if bath == "chain":
+    if bath == "NoseHoover":
         assert np.ptp(values) < 0.05 < abs(integrator.getGlobalVariableByName("chain_place"))
     with pytest.raises(UnsupportedError, match="multipliers_at"):
         parts[1].multipliers(integrator)
@@ -70,10 +70,10 @@ def test_parts_keep_their_rows(bath, scheme):
         parts[0].step_multipliers()
 
 
-@pytest.mark.parametrize("bath", ["isokinetic", "chain"])
+@pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
 def test_surfaces_alone(bath):
     system, x, spheres = three_on_a_sphere()
-    ensemble = BATHS[bath]()
+    ensemble = ENSEMBLES[bath](300.0, 10.0)
     integrator = SurfaceIntegrator(1e-3, surfaces=spheres, system=system, ensemble=ensemble)
     context = warm(system, integrator, x, 1)
     values = []
@@ -83,7 +83,7 @@ def test_surfaces_alone(bath):
     r, u = state_of(context)
     np.testing.assert_allclose(np.linalg.norm(r, axis=1), 0.5, atol=1e-13)
     assert ensemble.count(integrator) == 6
-    if bath == "isokinetic":
+    if bath == "Isokinetic":
         assert abs(twice_kinetic(system, u) / (5 * GAS_CONSTANT * 300) - 1) <= 1e-13
     else:
         assert np.ptp(values) < 1e-3

@@ -40,7 +40,6 @@ from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.system_checks import SystemRows
 from kcons.openmm.surfaces.formulas import ImplicitRows
 
-gpus = pytest.mark.parametrize("platform", GPUS)
 less_than_double = pytest.mark.parametrize("platform", [p for p in on_gpus("single") if "double" not in str(p.id)])
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
 #: Half a femtosecond, so that what is seen is rounding.
@@ -114,54 +113,49 @@ def held_by_openmm(make, platform):
     return off
 
 
-#: Each program costs seconds where nothing is compiled yet: what a usual run has, by system and precision. Schemes of
-#: more stages meet OpenCL beside parts, below.
-USUAL_PROGRAMS = {
-    (water, "single"): ("rattle",),
-    (water, "mixed"): ("Langevin",),
-    (hydrogens, "mixed"): ("rattle", "Isokinetic"),
-    (bonds, "mixed"): ("leapfrog", "RattleIntegrator"),
-}
+def on_each_gpu(cases, usual):
+    """Each case on each GPU: what is `usual`, by name and platform, runs always, the others in long runs.
+
+    Each program costs seconds where nothing is compiled yet.
+    """
+    return [
+        pytest.param(
+            *case,
+            *p.values,
+            id=f"{name}-{p.id}",
+            marks=p.marks if p.id == "none" or usual(name, p.id) else [*p.marks, LONG],
+        )
+        for name, case in cases.items()
+        for p in GPUS
+    ]
 
 
-def is_usual(name, make, platform):
-    return name in USUAL_PROGRAMS.get((make, platform.split()[-1]), ())
-
-
-def check_against_openmm(make, platform, names):
-    """With tolerances left open, and all checks passed."""
-    if make is bonds and ccma_ends_early(platform):
-        pytest.skip("OpenMM's CCMA ends early on pocl: VerletIntegrator is off by up to 1e-3 at a tolerance of 1e-5")
-    allowed = 2 * held_by_openmm(make, platform) + 2 * Precision(*platform.split()).tolerance
-    for name in names:
-        kind = INTEGRATORS[name]
-        system, x, v = make()
-        integrator = kind(check_every=5)
-        context = started(system, integrator, x, v, platform)
-        integrator.step(20)
-        integrator.check()
-        assert residuals(system, context)[0] <= allowed, name
-        assert integrator.getConstraintTolerance() == Precision(*platform.split()).tolerance
+#: What a usual run has. Schemes of more stages meet OpenCL beside parts, below.
+USUAL = (
+    *("water rattle single", "water Langevin mixed", "hydrogens rattle mixed", "hydrogens Isokinetic mixed"),
+    *("bonds leapfrog mixed", "bonds RattleIntegrator mixed"),
+)
 
 
 @pytest.mark.parametrize(
-    "make, platform",
-    [
-        pytest.param(make, *p.values, id=f"{name}-{p.id}", marks=p.marks)
-        for name, make in SYSTEMS.items()
-        for p in GPUS
-        if p.id == "none" or any(is_usual(each, make, *p.values) for each in INTEGRATORS)
-    ],
+    "make, kind, platform",
+    on_each_gpu(
+        {f"{of} {name}": (make, kind) for of, make in SYSTEMS.items() for name, kind in INTEGRATORS.items()},
+        lambda name, platform: f"{name} {platform.split('-')[-1]}" in USUAL,
+    ),
 )
-def test_no_integrator_is_off_by_more_than_twice_what_openmm_is(make, platform):
-    check_against_openmm(make, platform, [name for name in INTEGRATORS if is_usual(name, make, platform)])
-
-
-@gpus
-@pytest.mark.validation
-@pytest.mark.parametrize("make", SYSTEMS.values(), ids=SYSTEMS)
-def test_nor_is_any_other(make, platform):
-    check_against_openmm(make, platform, [name for name in INTEGRATORS if not is_usual(name, make, platform)])
+def test_no_integrator_is_off_by_more_than_twice_what_openmm_is(make, kind, platform):
+    """With tolerances left open, and all checks passed."""
+    if make is bonds and ccma_ends_early(platform):
+        pytest.skip("OpenMM's CCMA ends early on pocl: VerletIntegrator is off by up to 1e-3 at a tolerance of 1e-5")
+    system, x, v = make()
+    integrator = kind(check_every=5)
+    context = started(system, integrator, x, v, platform)
+    integrator.step(20)
+    integrator.check()
+    tolerance = Precision(*platform.split()).tolerance
+    assert residuals(system, context)[0] <= 2 * held_by_openmm(make, platform) + 2 * tolerance
+    assert integrator.getConstraintTolerance() == tolerance
 
 
 @pytest.mark.parametrize("platform", on_gpus("single", "mixed"))
@@ -299,23 +293,18 @@ def on_surfaces(system, x):
     return list(surface_parts(given, system=system, positions=x))
 
 
-SCHEMES = ("rattle", "geodesic", "suzuki4", "leapfrog")
-PARTS = (rows_of_two_kinds, on_surfaces)
-#: Kinds of rows and schemes of a usual run, in mixed precision.
-USUAL_PARTS = ((rows_of_two_kinds, "suzuki4"), (on_surfaces, "geodesic"))
-
-
-def cases_of(usual):
-    return [
-        pytest.param(held, scheme, *p.values, id=f"{held.__name__}-{scheme}-{p.id}", marks=p.marks)
-        for held in PARTS
-        for scheme in SCHEMES
-        for p in GPUS
-        if usual == ((held, scheme) in USUAL_PARTS and p.id.endswith(("mixed", "none")))
-    ]
-
-
-def check_parts(held, scheme, platform):
+@pytest.mark.parametrize(
+    "held, scheme, platform",
+    on_each_gpu(
+        {
+            f"{held.__name__}-{scheme}": (held, scheme)
+            for held in (rows_of_two_kinds, on_surfaces)
+            for scheme in ("rattle", "geodesic", "suzuki4", "leapfrog")
+        },
+        lambda name, platform: name in ("rows_of_two_kinds-suzuki4", "on_surfaces-geodesic") and "mixed" in platform,
+    ),
+)
+def test_parts_run_in_any_precision(held, scheme, platform):
     """Rows within 2e-6 where forces are single numbers, surfaces of formulas within 1e-8 where they are integers.
 
     By the values that were asked for, not those the program finds.
@@ -333,17 +322,6 @@ def check_parts(held, scheme, platform):
         off = part.residuals(context) if held is rows_of_two_kinds else part.distances(y)
         assert np.abs(off).max() < limit
         assert part.worst_violation(context, velocities=scheme != "leapfrog") is None
-
-
-@pytest.mark.parametrize("held, scheme, platform", cases_of(True))
-def test_parts_run_in_any_precision(held, scheme, platform):
-    check_parts(held, scheme, platform)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("held, scheme, platform", cases_of(False))
-def test_parts_run_in_any_precision_in_the_other_cases(held, scheme, platform):
-    check_parts(held, scheme, platform)
 
 
 @pytest.mark.parametrize("platform", on_gpus("single"))
@@ -508,20 +486,19 @@ BESIDE_WATER = {
     "meeting-leapfrog": ("meeting", {"scheme": "leapfrog"}),
     "meeting-Langevin": ("meeting", {"ensemble": Langevin(300, 1)}),
 }
-#: In mixed precision, in which forces see the least of what moves.
-USUAL = ("carried-leapfrog", "meeting-rattle")
 
 
-def beside_water_on_gpus(usual):
-    return [
-        pytest.param(*case, *p.values, id=f"{name}-{p.id}", marks=p.marks)
-        for name, case in BESIDE_WATER.items()
-        for p in GPUS
-        if "single" not in p.id and usual == ("double" not in p.id and name in USUAL)
-    ]
-
-
-def check_beside_water(kind, options, platform):
+@pytest.mark.parametrize(
+    "kind, options, platform",
+    [
+        param
+        for param in on_each_gpu(
+            BESIDE_WATER, lambda name, gpu: name in ("carried-leapfrog", "meeting-rattle") and "mixed" in gpu
+        )
+        if "single" not in param.id
+    ],
+)
+def test_rows_beside_constraints_of_the_system(kind, options, platform):
     """On GPUs forces see what moves x only when constraints have been applied: those of the System come first."""
     system, x, v, part = beside_water(kind)
     integrator = ProjectedIntegrator(1e-3, parts=[part], check_every=5, **options)
@@ -530,17 +507,6 @@ def check_beside_water(kind, options, platform):
     integrator.step(20)
     integrator.check()
     assert part.worst_violation(context, velocities=False) is None
-
-
-@pytest.mark.parametrize("kind, options, platform", beside_water_on_gpus(True))
-def test_rows_beside_constraints_of_the_system(kind, options, platform):
-    check_beside_water(kind, options, platform)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("kind, options, platform", beside_water_on_gpus(False))
-def test_rows_beside_constraints_of_the_system_in_the_other_cases(kind, options, platform):
-    check_beside_water(kind, options, platform)
 
 
 @mixed

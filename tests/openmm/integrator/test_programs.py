@@ -14,9 +14,9 @@ from tied_cluster import KINDS
 from kcons import thermostats
 from kcons.errors import InputError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
+from kcons.openmm.integrator.ensemble import VARIABLES, use
 from kcons.openmm.integrator.program import Program, forces_at_old_positions
 from kcons.openmm.integrator.schemes import SCHEMES, operations_of, stages_of, to_scheme
-from kcons.openmm.integrator.steps import VARIABLES, use
 from kcons.steppers import Geodesic, Rattle
 
 

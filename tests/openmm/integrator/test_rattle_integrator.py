@@ -243,10 +243,6 @@ def test_arguments():
         integrator.setConstraintTolerance(0.0)
     with pytest.raises(InputError, match="check_every"):
         RattleIntegrator(0.001, check_every=-1)
-    with pytest.raises(UnsupportedError, match="ProjectedIntegrator"):
-        integrator.addIntegrator(openmm.VerletIntegrator(0.001))
-    with pytest.raises(UnsupportedError, match="ProjectedIntegrator"):
-        integrator.setCurrentIntegrator(1)
     with pytest.raises(UnsupportedError, match="belongs to no Context"):
         integrator.step(1)
     integrator.setConstraintTolerance(1e-7)
