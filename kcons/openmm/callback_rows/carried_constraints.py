@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
 
@@ -40,6 +41,9 @@ from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.states import forces_at
 from kcons.openmm.topology import bonds_of
 
+#: Rounding of positions, relative to the shortest row, that a run begins to show.
+COARSE = 1e-11
+
 
 class CarriedConstraints(Part):
     """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
@@ -75,6 +79,7 @@ class CarriedConstraints(Part):
     """
 
     evaluates = lands_last = True
+    _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
 
@@ -190,6 +195,7 @@ class CarriedConstraints(Part):
         self._check_system(system, Precision.of(context))
         refuse_movers(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
+        self._tell_of_rounding(x)
         miss = self._worst(x, v if velocities else None, time)
         if miss is not None:
             raise InputError(
@@ -254,6 +260,21 @@ class CarriedConstraints(Part):
         # What is taken from v where it is carried together with x: all there is of a body at rest.
         lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
         return Violation.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
+
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Warn once of coordinates so large that their rounding adds noise to the velocities."""
+        held = self.motion.constraint_set
+        if self._told or not held.n_rows:
+            return
+        reach = float(np.abs(x[held.touched]).max())
+        grain = self._engine.passage.grain(reach)
+        self._told = grain > COARSE * held.scale.min()
+        if self._told:
+            warnings.warn(
+                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; "
+                "each step turns this into velocity, and the energy wanders. Move the origin nearer",
+                stacklevel=3,
+            )
 
     def apply_positions(self, context: openmm.Context) -> None:
         """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
