@@ -1,7 +1,7 @@
 """The engine: what constraints do to positions, velocities, accelerations and forces.
 
 - `motion`: `Motion`, the engine itself
-- `solver_sequence`: all solvers of a plan, one after another
+- `solver_sequence`: all solvers of a plan, one after another, and what helps where one of them fails
 - `certificate`: results checked by the constraints as they were given
 - `failures`: what to tell the user where a solve failed
 - `report`: what is held, and how well

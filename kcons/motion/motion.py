@@ -31,8 +31,8 @@ from kcons.motion.certificate import certify
 from kcons.motion.report import Report, make_report
 from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
-from kcons.motion.restoring.nearest_point import LEFT_OVER, IterationBudget
-from kcons.motion.solver_sequence import SolverSequence
+from kcons.motion.restoring.nearest_point import LEFT_OVER, FarStart
+from kcons.motion.solver_sequence import IterationBudget, SolverSequence
 from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import Plan, make_plan
 from kcons.plan.second_order.conversion import without_second_order_rows
@@ -396,7 +396,7 @@ class Motion:
             nonlocal left
             result = y.copy()
             local = result if self._atoms is None else result[self._atoms]
-            left = self._solve.nearest(local, time, budget)
+            left = FarStart(self._solve, budget, time).restore(local)
             if self._atoms is not None:
                 result[self._atoms] = local
             return result

@@ -2,134 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
-from kcons.motion.failures import Failures, global_row
-from kcons.plan.plan import Plan
-from kcons.solvers.chains.open_chains import Chains
-from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request
-from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.sparse.distances import sparse_distances
+from kcons.motion.solver_sequence import FAILED, RESCUE_ROWS, IterationBudget, SolverSequence
 from kcons.solvers.tolerances import EPS, MAX_HALVINGS, STALLED
 
-if TYPE_CHECKING:
-    from kcons.motion.solver_sequence import SolverSequence
-
-#: Largest cluster, in rows, that dense damped Newton rescues.
-RESCUE_ROWS = 400
-#: Rescues of single clusters by the damped solver within one call, before the call fails.
-MAX_RESCUES = 20
 #: Rounds of the search for the nearest point on the constraints.
 NEAREST_ROUNDS = 200
-#: Newton iterations that one restoration may take in all; where algebra is dense, fewer by the square of the rows of a
-#: cluster above the second number. The third is what a projection that fails is charged, and the fourth how many
-#: clusters the damped solver may try.
-MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
 #: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
 _STILL, _ROUNDING = 1e-12, 16 * EPS
 #: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
 SLOW, MIXED = 3, 5
 #: Part of the way to the nearest point that may be left along the constraints without a word.
 LEFT_OVER = 1e-6
-
-
-class IterationBudget:
-    """What is left of the Newton iterations and rescues that one restoration may take.
-
-    Parameters
-    ----------
-    plan : Plan
-        Its largest clusters say what an iteration costs.
-    """
-
-    def __init__(self, plan: Plan) -> None:
-        def share(rows: IntArray) -> float:
-            return 1.0 / max(1.0, int(np.bincount(plan.labels[rows]).max(initial=1)) / SMALL_CLUSTER) ** 2
-
-        dense = [share(solver.rows) for solver in plan.solvers if isinstance(solver, GeneralClusters)]
-        self.iterations = max(int(MOST_ITERATIONS * min(dense, default=1.0)), 2 * FAILED)
-        self.rescues = max(int(RESCUED * share(np.flatnonzero(plan.labels >= 0))), 1)
-
-
-class DampedFallback:
-    """Solvers with step control for single clusters whose own solver has none; made when first needed."""
-
-    def __init__(self, rows: ConstraintSet, plan: Plan, failures: Failures) -> None:
-        self._rows, self._plan, self._failures = rows, plan, failures
-        self._made: dict[int, ClusterSolver | None] = {}
-        #: Set during restorations, which try many projections and may do without some of them.
-        self.budget: IterationBudget | None = None
-
-    def solve(
-        self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None
-    ) -> Outcome:
-        """Do what `solver` failed at, or raise what says why there is no way.
-
-        Raises
-        ------
-        ConvergenceError, InputError, SingularGeometryError
-            Positions and velocities are as they were.
-        """
-        x, reference, velocities = request.changed, request.reference, request.velocities
-        saved = x.copy(), None if velocities is None else velocities.copy()
-        error = self._failures.unusable(global_row(outcome, solver), x_new=x, x_ref=reference)
-        if self.budget is not None:
-            self.budget.rescues -= 1
-        if error is None and (self.budget is None or self.budget.rescues >= 0):
-            outcome = self._damped(solver, outcome, request, multipliers)
-            if outcome.converged:
-                return outcome
-        np.copyto(x, saved[0])
-        if velocities is not None and saved[1] is not None:
-            np.copyto(velocities, saved[1])
-        raise error or self._failures.positions(request, outcome, solver)
-
-    def _damped(
-        self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None
-    ) -> Outcome:
-        """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
-        extra = np.zeros(self._rows.n_rows)
-        for _ in range(MAX_RESCUES):
-            if outcome.worst_row < 0:
-                return outcome
-            row = int(solver.rows[outcome.worst_row])
-            damped = self._solver(row)
-            if damped is None:
-                return outcome
-            part = np.zeros(len(damped.rows))
-            found = damped.positions(request, part)
-            if not found.converged:
-                where = int(damped.rows[found.worst_row]) if found.worst_row >= 0 else row
-                index = np.flatnonzero(solver.rows == where)
-                return found._replace(worst_row=int(index[0]) if len(index) else outcome.worst_row)
-            extra[damped.rows] += part
-            outcome = solver.positions(request, multipliers)
-            if outcome.converged:
-                if multipliers is not None:
-                    multipliers += extra[solver.rows]
-                return outcome._replace(iterations=outcome.iterations + found.iterations)
-        return outcome
-
-    def _solver(self, row: int) -> ClusterSolver | None:
-        """A solver with step control for the cluster of `row`; None if its own solver has that already."""
-        plan = self._plan
-        label = int(plan.labels[row])
-        if label not in self._made:
-            rows = np.flatnonzero(plan.labels == label)
-            self._made[label] = None
-            if len(rows) <= RESCUE_ROWS:
-                labels = np.zeros(len(rows), dtype=np.int64)
-                self._made[label] = GeneralClusters(self._rows, rows, labels, plan.inverse_masses)
-            elif any(isinstance(solver, Chains) and row in solver.rows for solver in plan.solvers):
-                self._made[label] = sparse_distances(self._rows, rows, plan.inverse_masses)
-        return self._made[label]
 
 
 class FarStart:
@@ -164,6 +53,16 @@ class FarStart:
         float
             The part of the way that leads along the constraints: 0 where the search has found the nearest point.
         """
+        plan, fallback = self._plan, self._sequence.fallback
+        if len(plan.pinned):
+            x[plan.pinned] = plan.pinned_targets(self._rows.target(self._time) if self._rows.moving else None)
+        fallback.budget = self._budget
+        try:
+            return self._search(x)
+        finally:
+            fallback.budget = None
+
+    def _search(self, x: FloatArray) -> float:
         start = x.copy()
         here = x.copy()
         try:

@@ -3,7 +3,7 @@
 MUTANTS = {
     "motion/solver_sequence.py": [
         (
-            "«np.copyto(velocities, saved[1])→pass»",
+            "«np.copyto(velocities, saved[1])→pass»\n            if isinstance(error",
             "test_motion.py::test_velocities_are_put_back_when_a_later_solver_fails",
         ),
         (

@@ -12,7 +12,7 @@ from kcons import constraints as held
 from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, SingularGeometryError
-from kcons.motion import Motion
+from kcons.motion import Motion, solver_sequence
 from kcons.motion.restoring import nearest_point
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
@@ -243,8 +243,9 @@ def test_each_of_several_molecules_comes_to_its_nearest_point() -> None:
 def test_a_search_that_ends_before_the_nearest_point_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     motion, whole, x = _braced(1)
     start = x + _displaced(np.random.default_rng(0), 0.15)
-    monkeypatch.setattr(nearest_point, "MOST_ITERATIONS", 2)
-    monkeypatch.setattr(nearest_point, "FAILED", 5)
+    monkeypatch.setattr(solver_sequence, "MOST_ITERATIONS", 2)
+    for module in (solver_sequence, nearest_point):
+        monkeypatch.setattr(module, "FAILED", 5)
     with pytest.warns(UserWarning, match=r"fulfil all rows, but are not the nearest.* Start nearer"):
         found = motion.restore_positions(start, bonds=[])
     fulfilled(whole, found)
