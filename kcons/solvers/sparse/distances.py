@@ -106,7 +106,10 @@ class SparseDistances(AddressableSolver):
             )
         )
         self.kernels, self.numbers = Kernels(_positions, _tangents, _apply, resolved=_resolved), np.zeros(3)
-        self._solution = part_of(self.tables, _SOLUTION)
+        self._solution, self._bonds = (
+            part_of(self.tables, _SOLUTION),
+            part_of(self.tables, _STATE).reshape(-1, 8)[:, 1:6:2],
+        )
 
     def __reduce__(self) -> tuple[type[SparseDistances], tuple[object, ...]]:
         return SparseDistances, self._made_of  # addresses are of no use elsewhere
@@ -124,8 +127,9 @@ class SparseDistances(AddressableSolver):
 
     def _multipliers(self) -> FloatArray:
         # The kernels' are those of s . r, and not of |r| - d.
-        bonds = part_of(self.tables, _STATE).reshape(-1, 8)[:, 1:6:2]
-        return np.asarray(self._solution * np.linalg.norm(bonds, axis=1))
+        found: FloatArray = np.sqrt(np.einsum("ki,ki->k", self._bonds, self._bonds))
+        found *= self._solution
+        return found
 
 
 def sparse_distances(
