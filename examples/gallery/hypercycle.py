@@ -20,10 +20,10 @@ print(f"the fractions add up to 1 to {off:.1e}")
 assert off < 1e-10
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(7, 3), layout="constrained", width_ratios=[1, 2])
-colours = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"]
-bars = left.bar(range(1, 6), found.y[:, 0], color=colours)
+colors = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"]
+bars = left.bar(range(1, 6), found.y[:, 0], color=colors)
 left.set(ylim=(0, 1), xlabel="species", ylabel="fraction")
-lines = [right.plot([], [], color=colour)[0] for colour in colours]
+lines = [right.plot([], [], color=color)[0] for color in colors]
 right.set(xlim=(0, 90), ylim=(0, 1), xlabel="time")
 
 

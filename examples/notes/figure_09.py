@@ -16,7 +16,7 @@ fig, panels = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
 for axes, low, number in zip(panels, (0.0, -3.0), (17, 21), strict=True):
     x = np.array(np.meshgrid(np.linspace(low, 5, number), np.linspace(low, 5, number)))
     V = model.velocity(0.0, x.reshape(2, -1)).reshape(2, number, number)
-    # Arrows of equal length, colours for their speed; where nothing moves there is none.
+    # Arrows of equal length, colors for their speed; where nothing moves there is none.
     speed = np.hypot(*V)
     arrows = axes.quiver(
         *x, *(V / np.where(speed > 0, speed, 1.0)), speed, cmap="viridis", angles="xy", pivot="mid", width=0.004

@@ -44,7 +44,7 @@ def skate(steps: int) -> tuple[np.ndarray, np.ndarray]:
 def wheel(steps: int) -> tuple[np.ndarray, np.ndarray]:
     """A point on the rim of a wheel that rolls at speed 1: a cycloid."""
     along, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    turns = np.radians([0, 120, 240])[:, None]  # from the top; the centre of mass is the hub
+    turns = np.radians([0, 120, 240])[:, None]  # from the top; the center of mass is the hub
     rim = np.cos(turns) * up + np.sin(turns) * along
     x = np.vstack([up, up + rim])
     v = along + np.vstack([0 * along, np.cos(turns) * along - np.sin(turns) * up])

@@ -127,19 +127,19 @@ def protein(held: str) -> tuple[np.ndarray, np.ndarray, list[Constraint], Any]:
 
 def _more_rows(pairs: np.ndarray, masses: np.ndarray) -> list[Constraint]:
     """Angles at CH2 groups outside of rings, dihedrals about their bonds, and some atoms held in planes."""
-    neighbours: dict[int, list[int]] = {}
+    neighbors: dict[int, list[int]] = {}
     for i, j in pairs.tolist():
-        neighbours.setdefault(i, []).append(j)
-        neighbours.setdefault(j, []).append(i)
-    heavy = {a: [b for b in bonded if masses[b] > 2] for a, bonded in neighbours.items() if masses[a] > 2}
-    centres = [
-        a for a, bonded in heavy.items() if len(bonded) == 2 and len(neighbours[a]) == 4 and not _in_ring(a, heavy)
+        neighbors.setdefault(i, []).append(j)
+        neighbors.setdefault(j, []).append(i)
+    heavy = {a: [b for b in bonded if masses[b] > 2] for a, bonded in neighbors.items() if masses[a] > 2}
+    centers = [
+        a for a, bonded in heavy.items() if len(bonded) == 2 and len(neighbors[a]) == 4 and not _in_ring(a, heavy)
     ]
-    angles = [(heavy[a][0], a, heavy[a][1]) for a in centres]
-    angles += [(next(b for b in neighbours[a] if masses[b] < 2), a, heavy[a][0]) for a in centres]
+    angles = [(heavy[a][0], a, heavy[a][1]) for a in centers]
+    angles += [(next(b for b in neighbors[a] if masses[b] < 2), a, heavy[a][0]) for a in centers]
     dihedrals = [
         (heavy[a][0], a, b, next(c for c in heavy[b] if c != a))
-        for a in centres[::2]
+        for a in centers[::2]
         for b in heavy[a][1:]
         if len(heavy[b]) > 1 and heavy[a][0] not in heavy[b]
     ]
@@ -147,12 +147,12 @@ def _more_rows(pairs: np.ndarray, masses: np.ndarray) -> list[Constraint]:
     return [Angle(angles), Dihedral(dihedrals), Plane(planes, [0.0, 0.0, 1.0])]
 
 
-def _in_ring(centre: int, heavy: dict[int, list[int]]) -> bool:
-    """Whether one neighbour of the centre is reached from the other in five bonds without it."""
-    first, goal = heavy[centre]
+def _in_ring(center: int, heavy: dict[int, list[int]]) -> bool:
+    """Whether one neighbor of the center is reached from the other in five bonds without it."""
+    first, goal = heavy[center]
     reached = {first}
     for _ in range(5):
-        reached |= {b for a in reached for b in heavy[a] if b != centre}
+        reached |= {b for a in reached for b in heavy[a] if b != center}
     return goal in reached
 
 

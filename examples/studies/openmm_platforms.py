@@ -82,13 +82,13 @@ def placed(system: openmm.System, integrator: openmm.Integrator, place: str) -> 
 
 def start_of(system: openmm.System, positions: Any, place: str, steps: int, seed: int = 1) -> openmm.State:
     """After some steps of a thermostat, from a minimum that the CPU finds: OpenMM's own crashes there with pocl."""
-    minimiser = placed(system, openmm.VerletIntegrator(STEP), "CPU")
-    minimiser.setPositions(positions)
-    openmm.LocalEnergyMinimizer.minimize(minimiser, 50, 100)
+    minimizer = placed(system, openmm.VerletIntegrator(STEP), "CPU")
+    minimizer.setPositions(positions)
+    openmm.LocalEnergyMinimizer.minimize(minimizer, 50, 100)
     integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 5.0, STEP)
     integrator.setRandomNumberSeed(seed)
     context = placed(system, integrator, place)
-    context.setPositions(minimiser.getState(positions=True).getPositions())
+    context.setPositions(minimizer.getState(positions=True).getPositions())
     context.setVelocitiesToTemperature(TEMPERATURE, seed)
     integrator.step(steps)
     context.applyVelocityConstraints(integrator.getConstraintTolerance())

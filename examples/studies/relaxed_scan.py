@@ -4,7 +4,7 @@
     python relaxed_scan.py --out DIR           minutes: 20 molecules by GFN2-xTB, what docs/scans.md shows
 
 In full (needs tblite, geometric and sella, from the package index) every torsion is scanned at 24 values. Each of
-the three programs relaxes each point from the same structure, that of the neighbouring point with the group beyond the
+the three programs relaxes each point from the same structure, that of the neighboring point with the group beyond the
 bond turned, until no force along the constraint is larger than FMAX on any atom; geomeTRIC's other criteria are off,
 all else is left as its authors set it. Counted are calls of energy and forces. Energies are compared with those that
 geomeTRIC comes to from there with a criterion ten times sharper. geomeTRIC also runs a scan of its own, in which each

@@ -96,7 +96,7 @@ def cost(name: str, repeats: int) -> Iterator[dict[str, Any]]:
 
 
 def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    title = "Microseconds of CPU a step in ASE, medians; the middle half of the ratios of neighbouring blocks"
+    title = "Microseconds of CPU a step in ASE, medians; the middle half of the ratios of neighboring blocks"
     forms = {"constant_energy_us": "{:.1f}", "isokinetic_us": "{:.1f}", "ratio": "{:.2f}", "low": "{:.2f}"}
     return {title: harness.shown(table, "cost", system="{}", **forms, high="{:.2f}")}
 

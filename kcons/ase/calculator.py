@@ -31,7 +31,7 @@ class ConstrainedCalculator(Calculator):
     give the Hessian of the energy *on* the constraints, curvature of the constraints included, with
     zeros along the held directions.
 
-    For optimisers, saddle searches and phonons. For dynamics attach the constraints to the atoms, or use
+    For optimizers, saddle searches and phonons. For dynamics attach the constraints to the atoms, or use
     `ConstrainedDynamics`.
 
     Parameters

@@ -50,7 +50,7 @@ def tiled(constraints: Sequence[Constraint], times: tuple[int, int, int], n: int
 def led_across(
     constraints: Sequence[Constraint], atoms: Atoms, times: tuple[int, int, int], n: int
 ) -> tuple[Constraint, ...]:
-    """Rows of a repeated cell of `n` atoms, those across its old boundary led to the neighbouring replica."""
+    """Rows of a repeated cell of `n` atoms, those across its old boundary led to the neighboring replica."""
     copies = times[0] * times[1] * times[2]
     if not atoms.pbc.any() or len(atoms) < n * copies:
         return tuple(constraints)

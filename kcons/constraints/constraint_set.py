@@ -497,7 +497,7 @@ class ConstraintSet:
             k, slot = (int(i) for i in np.unravel_index(int(np.argmax(length)), length.shape))
             if length[k, slot] >= self.half_width:
                 raise InputError(
-                    f"row {start + k}, {item.row_name(k)}: neighbouring atoms are {length[k, slot]:g} apart, not less "
+                    f"row {start + k}, {item.row_name(k)}: neighboring atoms are {length[k, slot]:g} apart, not less "
                     f"than half the box ({self.half_width:g}), although a shorter distance is held between them; "
                     "bring the positions onto the constraints first",
                     item="positions",

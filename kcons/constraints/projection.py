@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 #: float64, or complex128 where a matrix or vector given is complex.
 NumberArray = NDArray[Any]
 
-#: Singular values of the row-normalised matrix below this part of the largest count as zero.
+#: Singular values of the row-normalized matrix below this part of the largest count as zero.
 RANK_TOLERANCE = 1e-10
 #: Rows contradict each other where b leaves the range of A by more than this part of its size.
 SOLVABILITY_TOLERANCE = 1e-9
@@ -67,7 +67,7 @@ class BottDuffinSolution(NamedTuple):
 
 
 def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInverse:
-    """A+, through the singular values of the row-normalised matrix (notes eqs. 154-158).
+    """A+, through the singular values of the row-normalized matrix (notes eqs. 154-158).
 
     The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V
     an orthonormal basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
@@ -90,7 +90,7 @@ def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInv
 
 
 def rank(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> int:
-    """Number of independent rows, by the singular values of the row-normalised matrix."""
+    """Number of independent rows, by the singular values of the row-normalized matrix."""
     return int(row_space(matrix, rtol).shape[1])
 
 
@@ -101,7 +101,7 @@ def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
 
 
 def column_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
-    """Orthonormal basis of the range of the row-normalised matrix, shape (s, rank)."""
+    """Orthonormal basis of the range of the row-normalized matrix, shape (s, rank)."""
     w, singular, _ = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
     return np.ascontiguousarray(w[:, : _count(singular, rtol)])
 

@@ -198,10 +198,10 @@ def first_derivative(function: Function, at: Any, step: Any, period: float | Non
 
 def second_derivative(function: Function, at: Any, step: Any, period: float | None = None) -> FloatArray:
     """d2f/ds2, error of order step^8; best at a step of about 1/50 of the scale of f (11 digits)."""
-    centre, step = function(at), exact_step(step, at)
-    total = np.zeros_like(centre)
+    center, step = function(at), exact_step(step, at)
+    total = np.zeros_like(center)
     for k, c in enumerate(_SECOND_8, start=1):
-        later, earlier = (nearest_image(function(at + sign * k * step) - centre, period) for sign in (1, -1))
+        later, earlier = (nearest_image(function(at + sign * k * step) - center, period) for sign in (1, -1))
         total = total + c * (later + earlier)
     return total / step**2
 

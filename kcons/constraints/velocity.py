@@ -159,7 +159,7 @@ class Rolling(VelocityRows):
     Parameters
     ----------
     hub : int or array_like of int, shape (n_rows,)
-        Atom at the centre of each wheel.
+        Atom at the center of each wheel.
     rim : int or array_like of int, shape (n_rows,)
         Atom that turns with the wheel, in its plane, at any distance from the hub; hold that distance with
         `Distance`, and keep hub and rim in the plane of the wheel with `Plane`.

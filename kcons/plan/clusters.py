@@ -206,7 +206,7 @@ def _small_shapes(
     ends = pairs[rows]
     degree = np.zeros(len(w), dtype=np.int64)
     np.add.at(degree, ends.ravel(), 1)
-    # Canonical orientation and order, so that equal clusters look equal: centre first, then by mass.
+    # Canonical orientation and order, so that equal clusters look equal: center first, then by mass.
     a, b = ends[:, 0], ends[:, 1]
     swap = (
         (degree[a] < degree[b])

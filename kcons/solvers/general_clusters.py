@@ -279,7 +279,7 @@ class GeneralClusters:
         return worst
 
     def _gauss_newton(self, batch: _Batch, state: FloatArray, time: float) -> Outcome:
-        """Minimise |sigma| with the gradients at the current point; Levenberg-Marquardt where that stalls."""
+        """Minimize |sigma| with the gradients at the current point; Levenberg-Marquardt where that stalls."""
         held = self._held[batch.rows]
         scale = self._scale[batch.rows]
         root_w = self._root_w[batch.columns]

@@ -23,7 +23,7 @@ class ReversibilityCheck(Listed):
     stepper : Stepper
         The scheme; must be reversible.
     tolerance : float
-        Largest allowed difference after a step forward and back: of positions relative to the distance travelled
+        Largest allowed difference after a step forward and back: of positions relative to the distance traveled
         or the size of the system, whichever is larger, and of velocities relative to the fastest one. What rounding
         leaves of positions, and of the kick of a step, is allowed besides: at rest there is nothing else.
 

@@ -301,7 +301,7 @@ def momentum_share(masses: FloatArray, velocities: FloatArray, directions: Float
 
 
 def drift_velocity(velocities: FloatArray, masses: FloatArray, directions: FloatArray) -> FloatArray:
-    """Velocity of the centre of mass along `directions`, shape (3,).
+    """Velocity of the center of mass along `directions`, shape (3,).
 
     Raises
     ------

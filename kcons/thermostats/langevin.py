@@ -121,7 +121,7 @@ class Langevin(SeededBath):
     substeps : int
         RATTLE substeps in each of the two drifts.
     conserve_momentum : bool
-        Friction and noise act relative to the centre of mass, in the directions in which no row knows a place in
+        Friction and noise act relative to the center of mass, in the directions in which no row knows a place in
         space; so many degrees of freedom less take part.
 
     Raises
@@ -265,7 +265,7 @@ class LangevinStep(Interpreter):
         self.thermostat = thermostat
 
     def exchange(self, row: Row, begun: bool) -> None:
-        """What friction does not act on, velocities of targets and of the centre of mass, is added to the noise."""
+        """What friction does not act on, velocities of targets and of the center of mass, is added to the noise."""
         system, thermostat, dt, v = self.system, self.thermostat, row.length * self.dt, self.v
         noise = self.numbers[MASSES + 2 * v.size :].reshape(v.shape)
         x, time = self.place(row.here), self.at(row.end)

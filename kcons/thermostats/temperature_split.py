@@ -5,7 +5,7 @@ e^{-U/kT} of the volume that belongs to the metric M, so that for any field X al
 
     kT <div X> = <X . grad U>.
 
-Shifts S_a of a cluster along fixed axes and its turns R_a about fixed axes through its centre of mass are isometries of
+Shifts S_a of a cluster along fixed axes and its turns R_a about fixed axes through its center of mass are isometries of
 M and keep all rows, if no row knows a place or a direction in space. So they have no divergence, and the fields
 S_a(U) S_a / m and J_ab R_a(U) R_b, where J is the inverse of the tensor of inertia, give
 
@@ -63,7 +63,7 @@ class SplitTemperatures:
     Attributes
     ----------
     shift, turn : Estimate or None
-        Of whole clusters that move, and that turn about their centres of mass.
+        Of whole clusters that move, and that turn about their centers of mass.
     internal : Estimate or None
         Of all other motions that the constraints allow: within clusters, and of clusters tied to space.
     shifts, turns : int
@@ -129,10 +129,10 @@ class Clusters:
         return out
 
     def arms(self, x: FloatArray) -> FloatArray:
-        """Places relative to the centres of mass, shape (n_atoms, 3), in pieces put together across the box."""
+        """Places relative to the centers of mass, shape (n_atoms, 3), in pieces put together across the box."""
         y = self._whole(x)
-        centres = self.add_up(self._masses[:, None] * y) / self.mass[:, None]
-        return np.where((self.label >= 0)[:, None], y - self.spread(centres), 0.0)
+        centers = self.add_up(self._masses[:, None] * y) / self.mass[:, None]
+        return np.where((self.label >= 0)[:, None], y - self.spread(centers), 0.0)
 
     def _whole(self, x: FloatArray) -> FloatArray:
         return make_whole(x, *self._tree, self._held.lattice)

@@ -1,8 +1,8 @@
 """Rows that hold all angles between bonds: as many as are independent, and none that is nearly dependent.
 
-An atom with n neighbours has n (n - 1)/2 angles, of which 2n - 3 are independent. Where three neighbours lie in one
+An atom with n neighbors has n (n - 1)/2 angles, of which 2n - 3 are independent. Where three neighbors lie in one
 plane with it, their angles add up to 360 degrees to first order, and do not feel the atom leave the plane. So two
-neighbours are the base of an atom. Their angle is held, and each other neighbour is held by its angles with both of
+neighbors are the base of an atom. Their angle is held, and each other neighbor is held by its angles with both of
 them or, where it lies in their plane, by one angle and an improper dihedral. The angles between two others stay what
 they are, since the geometry does.
 """
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import minimum_image, neighbour_lists
+from kcons.constraints.periodic.one_piece import minimum_image, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross, dot, norm
 from kcons.topology.rigid_groups import body_numbers, inside_bodies
@@ -23,9 +23,9 @@ from kcons.topology.topology import BoolArray, Snapshot, bond_angles
 
 #: Beyond this an angle is held by a linear row, in degrees.
 STRAIGHT = 179.0
-#: A neighbour lies in the plane of the base if its improper dihedral is that close to 0 or 180 degrees; at an atom with
+#: A neighbor lies in the plane of the base if its improper dihedral is that close to 0 or 180 degrees; at an atom with
 #: three equal angles that is a sum of more than 353 degrees.
-FLAT_CENTRE = 30.0
+FLAT_CENTER = 30.0
 #: Sine of an angle that spans no plane.
 _NARROW = 0.1
 #: Part of the largest sine that is as good for the angle of the base.
@@ -48,12 +48,12 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
     triples : ndarray of int, shape (n_angles, 3)
         With the vertex in the middle, sorted by vertex and ends. Beyond `STRAIGHT`, it is the only row of an end.
     quads : ndarray of int, shape (n_dihedrals, 4)
-        Impropers a-j-b-c of an atom j with its neighbours, and dihedrals of flat rings.
+        Impropers a-j-b-c of an atom j with its neighbors, and dihedrals of flat rings.
     """
     n = snapshot.topology.n_atoms
     systems = ring_systems(bonds, n)
     label = _labels(n, bonds, systems, rigid)
-    triples, quads = _centres(snapshot, bonds, label)
+    triples, quads = _centers(snapshot, bonds, label)
     for k, rings in enumerate(systems.rings):
         inside = bonds[systems.of_bond == k]
         every = bond_angles(inside, n)
@@ -80,10 +80,10 @@ def _labels(n: int, bonds: IntArray, systems: RingSystems, rigid: Sequence[IntAr
     return label
 
 
-def _centres(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list[IntArray], list[IntArray]]:
+def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list[IntArray], list[IntArray]]:
     """Rows at each atom, but for those between bonds with the same label."""
     n = snapshot.topology.n_atoms
-    starts, ends = neighbour_lists(bonds, n)
+    starts, ends = neighbor_lists(bonds, n)
     code = bonds[:, 0] * n + bonds[:, 1]
     triples: list[IntArray] = []
     quads: list[IntArray] = []
@@ -117,7 +117,7 @@ def _centres(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list
 
 
 def _second(e: FloatArray, group: IntArray) -> IntArray:
-    """Order in which the second neighbour spans a plane with the first, shape (n_vertices, n_neighbours)."""
+    """Order in which the second neighbor spans a plane with the first, shape (n_vertices, n_neighbors)."""
     many, d = group.shape
     sine = norm(cross(e[:, :1], e[:, 1:]))
     second = 1 + np.argmax(sine >= _WIDE * sine.max(axis=1, keepdims=True), axis=1)
@@ -137,7 +137,7 @@ def _third(
     triples: list[IntArray],
     quads: list[IntArray],
 ) -> None:
-    """Rows of neighbour k beside the base, appended to the lists."""
+    """Rows of neighbor k beside the base, appended to the lists."""
     straight = -np.cos(np.radians(180 - STRAIGHT))
     c = np.stack([dot(e[:, 0], e[:, k]), dot(e[:, 1], e[:, k])], axis=1)
     s = np.stack([norm(cross(e[:, 0], e[:, k])), norm(cross(e[:, 1], e[:, k]))], axis=1)
@@ -147,7 +147,7 @@ def _third(
     row = np.arange(len(vertex))
     volume = np.abs(dot(cross(e[:, 0], e[:, 1]), e[:, k]))
     plane = norm(cross(e[:, 0], e[:, 1]))
-    flat = volume < np.sin(np.radians(FLAT_CENTRE)) * s[row, axis] * plane
+    flat = volume < np.sin(np.radians(FLAT_CENTER)) * s[row, axis] * plane
     flat &= (plane > _NARROW) & (s[row, axis] > _NARROW)
     alone = opposite.any(axis=1)
     for b in (0, 1):
@@ -161,7 +161,7 @@ def _impropers(snapshot: Snapshot, bonds: IntArray) -> IntArray:
     """Improper dihedrals where three or more of the bonds meet in one plane."""
     triples: list[IntArray] = []
     quads: list[IntArray] = [np.zeros((0, 4), np.int64)]
-    starts, ends = neighbour_lists(bonds, snapshot.topology.n_atoms)
+    starts, ends = neighbor_lists(bonds, snapshot.topology.n_atoms)
     for vertex in np.flatnonzero(np.diff(starts) > 2)[:, None]:
         others = ends[starts[vertex[0]] : starts[vertex[0] + 1]][None]
         e = _directions(snapshot, vertex[:, None], others)

@@ -23,14 +23,14 @@ FAR = 2.0
 #: Atoms closer than this, in angstrom, are one atom twice.
 COINCIDENT = 0.3
 #: Without elements: a bond is shorter than this times the geometric mean of its atoms' distances to their nearest
-#: neighbours. C-C beside C-H has 1.40, C-S 1.51, Si-Si 1.59; hydrogen bonds begin at 1.7.
+#: neighbors. C-C beside C-H has 1.40, C-S 1.51, Si-Si 1.59; hydrogen bonds begin at 1.7.
 NEAREST = 1.62
 #: A pair this much longer than both distances to a third atom is bonded to that one, not to each other.
 ACROSS = 1.2
-#: What is no picture of molecules: atoms with more of such neighbours (a fluid, a metal), angles sharper than this
+#: What is no picture of molecules: atoms with more of such neighbors (a fluid, a metal), angles sharper than this
 #: (three-membered rings have 48 to 75 degrees), pairs that are this little further apart than bonded ones.
 MOST_BONDS, SHARPEST, GAP = 6, np.radians(47.0), 1.02
-#: Nearest neighbours further off than this times the median are at no bond length.
+#: Nearest neighbors further off than this times the median are at no bond length.
 _LONE = 2.5
 
 
@@ -38,7 +38,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     """Bonds that the distances suggest, shape (n, 2).
 
     Two atoms are bonded if they are closer than 1.25 times the sum of their covalent radii, under minimum images. A
-    hydrogen keeps its nearest neighbour only. Metals and noble gases get no bonds.
+    hydrogen keeps its nearest neighbor only. Metals and noble gases get no bonds.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     """Bonds that the distances alone suggest, where neither elements nor the unit of length are known, shape (n, 2).
 
     Two atoms are bonded if they are closer than `NEAREST` times the geometric mean of the distances of each to its
-    nearest neighbour. Nothing is guessed where the molecules of `atoms` then do not look like molecules.
+    nearest neighbor. Nothing is guessed where the molecules of `atoms` then do not look like molecules.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     if len(finite) < 2:
         return nothing
     y = x[finite]
-    # Atoms may be stored in any image: the nearest neighbour is looked for among the wrapped ones.
+    # Atoms may be stored in any image: the nearest neighbor is looked for among the wrapped ones.
     wrapped = y if lattice is None else wrapped_into(y, lattice)[1]
     near = cKDTree(wrapped).query(wrapped, k=2)[0][:, 1]
     typical = float(np.median(near))
@@ -190,7 +190,7 @@ def across(pairs: IntArray, lengths: FloatArray) -> BoolArray:
 
 
 def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:
-    """Which pairs stay when every hydrogen keeps only its nearest neighbour."""
+    """Which pairs stay when every hydrogen keeps only its nearest neighbor."""
     best = np.full(len(hydrogen), np.inf)
     for side in (0, 1):
         np.minimum.at(best, pairs[:, side], away)

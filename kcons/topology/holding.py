@@ -59,7 +59,7 @@ class Holding:
     ----------
     constrain : {'hbonds', 'allbonds', 'hangles', 'allangles', 'none'} or None
         Bonds with hydrogens; all bonds; these and the angles H-X-H and H-O-X; all bonds and angles. The first three
-        are what they are in OpenMM. The rows of the last are independent: not every angle is one, and flat centres and
+        are what they are in OpenMM. The rows of the last are independent: not every angle is one, and flat centers and
         rings have dihedrals, see `kcons.topology.angle_rows`.
     rigid_water : bool
         Hold water by three distances; found by residue name and composition. Sites without mass (TIP4P) are placed,

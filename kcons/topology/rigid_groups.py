@@ -48,7 +48,7 @@ GEOMETRIES: dict[str, tuple[float, float, float]] = {
 #: Extent across a line or a plane, relative to the extent along it, that still counts as flat: what three decimals
 #: of a file leave of a ring that was planar.
 FLAT = 2e-3
-#: Bodies in space of more atoms than this are braced by neighbours instead of by four bases.
+#: Bodies in space of more atoms than this are braced by neighbors instead of by four bases.
 LARGE = 50
 #: Among how many atoms nearby three are looked for, and what volume of three unit vectors is enough.
 _NEAR, _ENOUGH = 12, 0.2

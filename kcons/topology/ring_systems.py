@@ -14,7 +14,7 @@ import numpy as np
 
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.periodic.one_piece import lined_up, neighbour_lists
+from kcons.constraints.periodic.one_piece import lined_up, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.topology.topology import BoolArray, Snapshot, connected
 
@@ -52,7 +52,7 @@ def ring_systems(bonds: IntArray, n_atoms: int) -> RingSystems:
     keep = _without_ends(bonds, n_atoms)
     if not keep.any():
         return RingSystems(of_bond, ())
-    starts, ends = neighbour_lists(bonds[keep], n_atoms)
+    starts, ends = neighbor_lists(bonds[keep], n_atoms)
     number = {pair: k for k, pair in enumerate(map(tuple, bonds.tolist()))}
     found: dict[tuple[int, ...], IntArray] = {}
     for i, j in bonds[keep].tolist():
@@ -88,7 +88,7 @@ def ring_rows(
     Parameters
     ----------
     bonds, triples, impropers : ndarray of int
-        Those within the system: its bonds, its angles, impropers at its flat centres.
+        Those within the system: its bonds, its angles, impropers at its flat centers.
     rings : sequence of ndarray of int
         Its rings, whose dihedrals are candidates where they are flat.
     within : callable

@@ -368,7 +368,7 @@ def _internal(
     straight = value > np.radians(STRAIGHT)
     rows.append(Angle(triples[~straight]))
     if straight.any():
-        # At 180 degrees an angle is singular: the vertex divides the line between its neighbours.
+        # At 180 degrees an angle is singular: the vertex divides the line between its neighbors.
         lu, lw = np.linalg.norm(u[straight], axis=1), np.linalg.norm(w[straight], axis=1)
         weights = np.stack([lw, lu], axis=1) / (lu + lw)[:, None]
         i, j, k = triples[straight].T

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import BoolArray, lattice_of, neighbour_lists
+from kcons.constraints.periodic.one_piece import BoolArray, lattice_of, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -42,7 +42,7 @@ _IONS = {
 }  # fmt: skip
 #: Names of massless sites.
 _SITES = ("MW", "EP", "EPW", "LP", "M", "OM", "VS", "XX", "X", "DUM")
-#: How far a mass may be from that of its element; hydrogens heavier than this took mass from their neighbours.
+#: How far a mass may be from that of its element; hydrogens heavier than this took mass from their neighbors.
 _NEAR, _HEAVY = 0.06, 1.2
 
 
@@ -236,15 +236,15 @@ def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
 
 def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
     """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
-    starts, ends = neighbour_lists(bonds, n_atoms)
+    starts, ends = neighbor_lists(bonds, n_atoms)
     degree = np.diff(starts)
     found = []
     for d in np.unique(degree[degree > 1]).tolist():
         vertex = np.flatnonzero(degree == d)
-        neighbours = ends[starts[vertex][:, None] + np.arange(d)]
+        neighbors = ends[starts[vertex][:, None] + np.arange(d)]
         a, b = np.triu_indices(d, 1)
-        centre = np.repeat(vertex, len(a))
-        found.append(np.stack([neighbours[:, a].ravel(), centre, neighbours[:, b].ravel()], axis=1))
+        center = np.repeat(vertex, len(a))
+        found.append(np.stack([neighbors[:, a].ravel(), center, neighbors[:, b].ravel()], axis=1))
     if not found:
         return np.zeros((0, 3), np.int64)
     triples = np.concatenate(found)
@@ -331,7 +331,7 @@ def elements_of(names: StrArray, residues: IntArray, residue_names: StrArray, ma
     nearest = np.abs(standard[None, :] - distinct[:, None]).argmin(axis=1)
     sure = np.abs(standard[nearest] - distinct) < _NEAR
     known = (sure & (symbols[nearest] != "He"))[which.ravel()]
-    # Where hydrogens are heavier than they are, their neighbours are lighter, as light as other elements.
+    # Where hydrogens are heavier than they are, their neighbors are lighter, as light as other elements.
     if ((found == "H") & (masses > _HEAVY) & (masses < MASSES["Li"])).any():
         known &= found == ""
     # Nothing else is lighter than helium; Drude particles are lighter than hydrogen.

@@ -18,7 +18,7 @@ _ROUNDING = 1e-3
 def whole_groups(snapshot: Snapshot, atoms: IntArray) -> FloatArray:
     """Positions of groups, each made whole, shape (n, width, 3).
 
-    By minimum images from atom to atom; atoms of one molecule, whose neighbours in the group may be farther away than
+    By minimum images from atom to atom; atoms of one molecule, whose neighbors in the group may be farther away than
     half the cell, lie where its bonds say.
     """
     r = lined_up(snapshot.positions[atoms], snapshot.lattice)

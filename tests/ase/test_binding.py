@@ -155,7 +155,7 @@ def test_rows_that_are_given_anew_are_held():
 
 
 def test_copies_in_cells_of_their_own():
-    """Centres that nothing ties together, whose images are followed over a tenth of a cell vector and no more."""
+    """Centers that nothing ties together, whose images are followed over a tenth of a cell vector and no more."""
     atoms = loose_waters(2)
     atoms.cell, atoms.pbc = np.full(3, 12.0), True
     constrain(atoms, [rigid_water(atoms), CenterDistance([0, 1, 2], [3, 4, 5])])
@@ -347,7 +347,7 @@ def test_forces_of_the_same_calculator_that_changed(change):
 
 
 def test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these():
-    """All these lengths are 1, so that the rows that are meant cannot be told from their neighbours by length."""
+    """All these lengths are 1, so that the rows that are meant cannot be told from their neighbors by length."""
     line = Atoms("H5", positions=np.arange(5)[:, None] * [1.0, 0.0, 0.0], calculator=Free())
     for options in ({"constraints": [Distance([[2, 3]])]}, {"friction": [1.0, 2.0, 3.0, 4.0, 5.0]}):
         atoms = line.copy()

@@ -1,4 +1,4 @@
-"""The calculator on the constraints: forces, energies, caching, stress, optimisers without a constraint object."""
+"""The calculator on the constraints: forces, energies, caching, stress, optimizers without a constraint object."""
 
 from __future__ import annotations
 
@@ -134,15 +134,15 @@ def test_stays_where_the_positions_are_if_asked():
     assert np.array_equal(atoms.get_forces(), expected)
 
 
-@pytest.mark.parametrize("optimiser", [BFGS, FIRE])
-def test_optimiser_without_a_constraint_object(optimiser):
+@pytest.mark.parametrize("optimizer", [BFGS, FIRE])
+def test_optimizer_without_a_constraint_object(optimizer):
     peer = molecule("CH3CH2OH")
     peer.calc = EMT()
     held = constrain(peer, ROWS)
-    optimiser(peer, logfile=None).run(fmax=0.01, steps=300)
+    optimizer(peer, logfile=None).run(fmax=0.01, steps=300)
 
     atoms, calculator = ethanol()
-    assert optimiser(atoms, logfile=None).run(fmax=0.01, steps=300)
+    assert optimizer(atoms, logfile=None).run(fmax=0.01, steps=300)
     assert atoms.get_potential_energy() == pytest.approx(peer.get_potential_energy(), abs=1e-3)
     energy = atoms.get_potential_energy()
     calculator.restore(atoms)

@@ -20,7 +20,7 @@ from kcons.ase.topology import bonds_of
 from kcons.constraints import CenterDistance, Dihedral, Distance, FixedAtoms
 from kcons.errors import ContradictionError, InfeasibleError, InputError
 
-# -- dynamics and optimisation ----------------------------------------------------------------------
+# -- dynamics and optimization ----------------------------------------------------------------------
 
 
 def test_velocity_verlet_goes_back_and_does_not_stand_still():
@@ -245,10 +245,10 @@ def test_explicit_target_off_is_refused_with_its_size():
 
 def test_project_moves_to_the_nearest_point():
     atoms = molecule("H2O")
-    centre = atoms.get_center_of_mass()
+    center = atoms.get_center_of_mass()
     held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
     assert off(atoms, held) <= 1e-15
-    assert atoms.get_center_of_mass() == pytest.approx(centre, abs=1e-14)
+    assert atoms.get_center_of_mass() == pytest.approx(center, abs=1e-14)
     assert atoms.get_distance(0, 1) == pytest.approx(0.9572, abs=1e-14)
     assert atoms.get_angle(1, 0, 2) == pytest.approx(104.52, abs=1e-11)
 

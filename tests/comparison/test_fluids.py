@@ -38,8 +38,8 @@ def test_shifts_and_turns_of_molecules():
 
     def moved(k, shift, turn):
         y, s = x.copy(), slice(3 * k, 3 * k + 3)
-        centre = (m[s, None] * x[s]).sum(axis=0) / m[s].sum()
-        y[s] = centre + shift + (x[s] - centre) @ Rotation.from_rotvec(turn).as_matrix().T
+        center = (m[s, None] * x[s]).sum(axis=0) / m[s].sum()
+        y[s] = center + shift + (x[s] - center) @ Rotation.from_rotvec(turn).as_matrix().T
         return fluid.potential(y)
 
     none, h, middle, sums = np.zeros(3), 1e-4, fluid.potential(x), np.zeros(4)

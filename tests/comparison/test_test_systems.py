@@ -209,7 +209,7 @@ def test_equilibrated_water_needs_no_relaxation(size):
     d = x[::3][:, None] - x[::3]
     distance = np.linalg.norm(d - box * np.round(d / box), axis=2)[np.triu_indices(size, 1)]
     assert 2.3 < distance.min() < 2.7
-    # First shell: four to five neighbours within 3.3 Å.
+    # First shell: four to five neighbors within 3.3 Å.
     assert 4.0 < 2 * np.sum(distance < 3.3) / size < 5.5
 
 

@@ -136,7 +136,7 @@ WAYS = {
     "a moving target": lambda m, bad: FixedAtoms([0, 1, 2], lambda t: bad).target_at(0.0),
     "normals": lambda m, bad: Plane([0, 1, 2], bad),
     "points": lambda m, bad: Plane([0, 1, 2], [0, 0, 1], point=bad),
-    "centres": lambda m, bad: Sphere([0, 1, 2], bad),
+    "centers": lambda m, bad: Sphere([0, 1, 2], bad),
     "semi-axes": lambda m, bad: Ellipsoid([0, 1, 2], np.zeros(3), bad),
     "coefficients": lambda m, bad: LinearVelocity([0, 1, 2], bad),
     "weights": lambda m, bad: LinearRelation([3], [0, 1, 2], bad if isinstance(bad, list) else bad[0]),

@@ -235,7 +235,7 @@ def bend(b: Builder) -> list[int]:
     return a
 
 
-def centres(b: Builder) -> list[int]:
+def centers(b: Builder) -> list[int]:
     rng = b.rng
     sizes = rng.integers(1, 4, 2)
     parts = [cloud(rng, int(s)) for s in sizes]
@@ -290,7 +290,7 @@ def fixed_pair(b: Builder) -> list[int]:
 
 
 def surface(b: Builder) -> list[int]:
-    """A chain of which one atom, or the centre of mass, keeps to a place."""
+    """A chain of which one atom, or the center of mass, keeps to a place."""
     a = b.atoms(zigzag(b.rng, int(b.rng.integers(1, 5))))
     if len(a) > 1:
         b.distances(list(itertools.pairwise(a)))
@@ -328,7 +328,7 @@ def places(b: Builder) -> list[int]:
 
 
 def _place(b: Builder, a: list[int]) -> None:
-    """The first atom on a surface, or the centre of all or a combination of them at a place."""
+    """The first atom on a surface, or the center of all or a combination of them at a place."""
     rng = b.rng
     what = rng.integers(4)
     if what == 0:
@@ -382,7 +382,7 @@ KINDS: dict[str, tuple[float, Callable[[Builder], list[int]]]] = {
     "site": (2.0, site),
     "combination": (2.0, combination),
     "bend": (1.5, bend),
-    "centres": (1.5, centres),
+    "centers": (1.5, centers),
     "gyration": (0.5, gyration),
     "fixed": (1.0, fixed),
     "fixed pair": (0.2, fixed_pair),

@@ -18,7 +18,7 @@ import numpy as np
 
 Array = np.ndarray
 EPS = float(np.finfo(float).eps)
-#: Singular values of the row-normalised B below this many times the largest are zero; `World` leaves a gap around it.
+#: Singular values of the row-normalized B below this many times the largest are zero; `World` leaves a gap around it.
 RANK = 1e-8
 #: A correction longer than this, in units of the molecules' bonds, is no solution near the start.
 FAR = 20.0
@@ -45,7 +45,7 @@ class Row:
     coefficients : dict
         {atom: three numbers} of a linear row.
     place : array, optional
-        What is subtracted from the vector of a 'norm' (the centre of a sphere).
+        What is subtracted from the vector of a 'norm' (the center of a sphere).
     """
 
     kind: str
@@ -127,9 +127,9 @@ class Dense:
 
     @contextmanager
     def rounded(self, noise: Array, slip: float) -> Iterator[None]:
-        """Meanwhile targets are off by `noise`, and centres of gyration, in gradients, by `slip` times the extent.
+        """Meanwhile targets are off by `noise`, and centers of gyration, in gradients, by `slip` times the extent.
 
-        The engine subtracts the centre once, in double precision and from positions about an atom of the row: each
+        The engine subtracts the center once, in double precision and from positions about an atom of the row: each
         x - c of a gradient w (x - c)/q is off by the same eps times the extent D. So is the part w . v of A v that the
         common speed V of the atoms has, by eps D V/q, and the speed of an atom at d from c by eps D V d/q^2. Where a
         heavy atom makes q small, this is more than what rounding the positions does, as these shift c with that atom.
@@ -167,9 +167,9 @@ class Dense:
         return np.arctan2(s, c)
 
     def _spread(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Sum of w (x - c) . (y - c'), and x - c, with the centres c and c' of x and y.
+        """Sum of w (x - c) . (y - c'), and x - c, with the centers c and c' of x and y.
 
-        What rounds is c, by eps |c|, and with it all of x - c, so that they are taken about their own centre again:
+        What rounds is c, by eps |c|, and with it all of x - c, so that they are taken about their own center again:
         heavy atoms lie next to c, at a distance that may be eps |c| times 1e13 and less.
         """
         w = self.blocks["gyration"][0][0]

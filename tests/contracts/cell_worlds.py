@@ -18,7 +18,7 @@ from cell_oracle import Array, Dense, Row, wave
 
 from kcons import constraints as families
 
-#: Condition of the row-normalised B up to which cases are made; singular values below DEPENDENT are exact zeros.
+#: Condition of the row-normalized B up to which cases are made; singular values below DEPENDENT are exact zeros.
 WORST_CONDITION = 300.0
 DEPENDENT = 1e-10
 #: Shares of half the cell above which a refusal is justified: of links that may grow, and of those that cannot.
@@ -93,7 +93,7 @@ class World:
     def links(self, x: Array, cell: Array | None = None, every: bool = False) -> tuple[float, float]:
         """The longest vectors whose image is taken as the shortest one, in units of half the cell's width.
 
-        First between neighbours in a row (`every`: any two atoms of a row) that nothing ties, then of what ties: for
+        First between neighbors in a row (`every`: any two atoms of a row) that nothing ties, then of what ties: for
         each molecule the longest of the shortest distances that make it whole, and bonds through the boundary.
         """
         cell = self.cell if cell is None else cell
@@ -323,7 +323,7 @@ def _mapped(table, new: Array):
 
 
 def _weigh(item: Item, masses: Array) -> None:
-    """Weights of centres of mass, known once the masses are."""
+    """Weights of centers of mass, known once the masses are."""
     if item.family == "CenterDistance":
         vector = item.rows[0].vectors[0]
         for sign in (1.0, -1.0):

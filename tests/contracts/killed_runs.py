@@ -52,7 +52,7 @@ def windows(folder: Path) -> dict[str, object]:
 
 
 def relaxed(folder: Path) -> dict[str, object]:
-    """121 points of the same torsion relaxed, from both neighbours; relaxations that are there are noted."""
+    """121 points of the same torsion relaxed, from both neighbors; relaxations that are there are noted."""
     atoms = molecule("H2O2")
     atoms.calc = EMT()
 

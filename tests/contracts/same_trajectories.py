@@ -81,7 +81,7 @@ Built = tuple[System, State]
 
 
 def springs(x, t):
-    """Each atom in a harmonic well of its own strength, and an attraction of neighbours."""
+    """Each atom in a harmonic well of its own strength, and an attraction of neighbors."""
     return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
 
 
@@ -188,7 +188,7 @@ def skates(**more) -> Built:
 
 
 def crystal(sides=(4, 4, 4), *, angle=False, **more) -> Built:
-    """A dense cluster: nearest neighbours of a lattice, for the sparse solvers."""
+    """A dense cluster: nearest neighbors of a lattice, for the sparse solvers."""
     places = np.indices(sides).reshape(3, -1).T
     number = {tuple(p): k for k, p in enumerate(places.tolist())}
     steps = np.eye(3, dtype=int).tolist()

@@ -76,7 +76,7 @@ def test_dynamics(name, case, tmp_path):
 
 @pytest.mark.parametrize("case", FAILURES)
 @pytest.mark.parametrize("cls", [BFGS, LBFGS, FIRE, MDMin], ids=lambda c: c.__name__)
-def test_optimiser(cls, case):
+def test_optimizer(cls, case):
     class Spoiled(EMT):
         left = 3
 

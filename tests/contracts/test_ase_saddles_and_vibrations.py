@@ -88,7 +88,7 @@ def test_no_search_is_forgotten():
     assert set(classes_in(ase.mep, Dynamics)) == {"MinModeTranslate", "DimerTranslate", "NEBOptimizer"}
 
 
-def test_the_optimiser_of_bands(rigid_path):
+def test_the_optimizer_of_bands(rigid_path):
     first, last = (image.copy() for image in (rigid_path[0], rigid_path[-1]))
     images = [first, first.copy(), first.copy(), first.copy(), last]
     for image in images:

@@ -36,7 +36,7 @@ MASSES = np.array([16.0, 1.0, 1.5, 2.0])
 
 
 def body(shape: str) -> tuple[System, State]:
-    """A rigid body that tumbles, its centre flying off at a speed of 0.4."""
+    """A rigid body that tumbles, its center flying off at a speed of 0.4."""
     x = np.array(SHAPES[shape])
     pairs = [[i, j] for i in range(len(x)) for j in range(i + 1, len(x))]
     system = system_of([Distance(pairs)], x, MASSES[: len(x)])
@@ -46,7 +46,7 @@ def body(shape: str) -> tuple[System, State]:
 
 
 def invariants(system: System, state: State) -> list[np.ndarray]:
-    """Kinetic energy, momentum, and angular momentum about the centre."""
+    """Kinetic energy, momentum, and angular momentum about the center."""
     x, v, m = state.positions, state.velocities, system.masses[:, None]
     if state.remainder is not None:
         x = (x - x[0]) + state.remainder
@@ -125,9 +125,9 @@ def energy_slope(stepper: Stepper, dt: float, steps: int) -> float:
     time = dt * np.arange(len(energies))
     u = 2 * time / time[-1] - 1
     window = np.cos(0.5 * np.pi * u) ** 8
-    centre = np.sum(window * u) / np.sum(window)
-    spread = np.sum(window * (u - centre) ** 2)
-    return float(np.sum(window * (u - centre) * np.array(energies)) / spread * 2 / time[-1])
+    center = np.sum(window * u) / np.sum(window)
+    spread = np.sum(window * (u - center) ** 2)
+    return float(np.sum(window * (u - center) * np.array(energies)) / spread * 2 / time[-1])
 
 
 #: Steps of 0.01; enough for the window to take out what oscillates.

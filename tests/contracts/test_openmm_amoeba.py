@@ -26,7 +26,7 @@ verlets = pytest.mark.parametrize("make", [ProjectedIntegrator, RattleIntegrator
 
 @cache
 def waters(kind, rigid=True):
-    """Four molecules of AMOEBA water, minimised, and velocities of 200 K."""
+    """Four molecules of AMOEBA water, minimized, and velocities of 200 K."""
     topology, x = app.Topology(), []
     chain = topology.addChain()
     for k in range(4):

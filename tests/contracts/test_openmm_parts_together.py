@@ -59,7 +59,7 @@ def test_what_cannot_be_reached_leaves_positions_as_they_were():
     (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=RADIUS), system=system)
     integrator = ProjectedIntegrator(0.002, parts=(carried, sphere))
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    x[5] = 0.0  # the centre: no nearest point
+    x[5] = 0.0  # the center: no nearest point
     context.setPositions(x)
     with pytest.raises(Exception, match=r"Sphere\(5\)|particle 5|row") as caught:
         integrator.applyConstraints(context)

@@ -103,7 +103,7 @@ def test_everything_that_a_simulation_does(name, platform, tmp_path):
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_minimised_states_are_held(name):
+def test_minimized_states_are_held(name):
     """By the Simulation, and as OpenMM's users do it, with velocities drawn by the Context."""
     made = simulation_of(MADE[name](), "CPU")
     made.context.setPositions(alanine("HBonds")[1])

@@ -90,7 +90,7 @@ NOTHING = np.zeros(0, int), np.zeros((0, 3)), np.zeros((3, 0, 3))
 
 
 def test_the_oracle_is_as_precise_as_the_engine_where_masses_differ():
-    """A heavy atom near the centre that a radius of gyration is about; heavy molecules beside light ones."""
+    """A heavy atom near the center that a radius of gyration is about; heavy molecules beside light ones."""
     masses = np.array([0.01, 1.0, 1e4])
     weights = {a: float(m / masses.sum()) for a, m in enumerate(masses)}
     rng = np.random.default_rng(0)

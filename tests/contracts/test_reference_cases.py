@@ -123,7 +123,7 @@ def test_oracle_accelerations_and_constraint_forces(name: str) -> None:
         a = projection.acceleration(A, case.masses, f, b)
         check(case, s, a, projection.constraint_force(A, case.masses, f, b))
         check(case, s, *projection.bott_duffin(A, case.masses, f, b))
-        # Gauss: the stored solution itself is the least among its admissible neighbours.
+        # Gauss: the stored solution itself is the least among its admissible neighbors.
         least = projection.gauss_function(s.accelerations, case.masses, f)
         assert least == pytest.approx(projection.gauss_function(a, case.masses, f), rel=1e-9, abs=1e-12)
 

@@ -149,7 +149,7 @@ def test_one_end_to_end_length_beside_two_bonds(sphere):
 
 
 def test_two_coordinates_with_z_off_the_diagonal():
-    """r and s = r^2 + x in a plane with a fixed centre: P of both in closed form."""
+    """r and s = r^2 + x in a plane with a fixed center: P of both in closed form."""
     rng = np.random.default_rng(4)
     r, s, mass = 1.4, 2.5, 2.0
     masses = np.array([1.0, mass])

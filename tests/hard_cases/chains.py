@@ -31,27 +31,27 @@ def _mass_ratio(program: Program, ratio: float, quick: bool) -> Outcome:
     n = 20
     x = truths.rotated(zigzag(n, 156.0, 0.15))
     masses = np.where(np.arange(n) % 2 == 0, 1.0, ratio)
-    # In the frame of the centre of mass: rounding of large coordinates would be seen otherwise.
+    # In the frame of the center of mass: rounding of large coordinates would be seen otherwise.
     x -= masses @ x / masses.sum()
     v = 0.0075 * np.random.default_rng(0).standard_normal((n, 3)) / np.sqrt(masses)[:, None]
     v -= masses @ v / masses.sum()
     problem = Problem(x, masses, bonds(n))
     problem = problem.but(velocities=problem.tangent(v))
     seen = Seen(problem)
-    centres: list[Array] = []
+    centers: list[Array] = []
     steps = program.length(quick, 500, 10_000)
-    watch = together(seen, lambda frame: centres.append(masses @ frame.x / masses.sum()))
+    watch = together(seen, lambda frame: centers.append(masses @ frame.x / masses.sum()))
     program.run(problem, 0.01, steps, watch, every=5)
     return outcome(
         ("residual", seen.residual, 1e-10),
-        ("centre of mass", np.abs(np.array(centres) - centres[0]).max(), 1e-12),
+        ("center of mass", np.abs(np.array(centers) - centers[0]).max(), 1e-12),
         ("energy", energy_off(seen.energies), 1e-3),
         remark=f"{steps} steps",
     )
 
 
 @case(
-    "H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; centre of mass 1e-12 over 1e4 steps; |J a| 1e-14"
+    "H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; center of mass 1e-12 over 1e4 steps; |J a| 1e-14"
 )
 def mass_ratio_12(program: Program, quick: bool) -> Outcome:
     found = _mass_ratio(program, 1e12, quick)
@@ -81,7 +81,7 @@ def _register_ratios() -> None:
         case(
             number,
             f"Chain of 20, masses 1 and 1e{power} in turn",
-            "residual 1e-10; centre of mass 1e-12; energy 1e-3 over 1e4 steps",
+            "residual 1e-10; center of mass 1e-12; energy 1e-3 over 1e4 steps",
         )(run)
 
 

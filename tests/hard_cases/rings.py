@@ -36,7 +36,7 @@ PARA = [(i, i + 3) for i in range(3)]
 @case(
     "X10",
     "Planar hexagon by 9 distances (sides and para)",
-    "right, or refused: a mechanism at a dead centre",
+    "right, or refused: a mechanism at a dead center",
     "warn-or-raise",
 )
 def hexagon_9(program: Program, quick: bool) -> Outcome:
@@ -114,14 +114,14 @@ def honeycomb(program: Program, quick: bool) -> Outcome:
 
 @case("X18", "Flat porphyrin-like ring system, bonds and 1-3 distances", "right, or refused", "warn-or-raise")
 def porphyrin(program: Program, quick: bool) -> Outcome:
-    """Four five-rings joined by four bridging atoms: bonds and distances of second neighbours."""
+    """Four five-rings joined by four bridging atoms: bonds and distances of second neighbors."""
     atoms: list[Array] = []
     pairs: list[tuple[int, int]] = []
     for k in range(4):
-        centre = 3.1 * np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2), 0])
+        center = 3.1 * np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2), 0])
         turn = np.pi + k * np.pi / 2 + 2 * np.pi * np.arange(5) / 5
         first = len(atoms)
-        atoms += [centre + 1.18 * np.array([np.cos(t), np.sin(t), 0]) for t in turn]
+        atoms += [center + 1.18 * np.array([np.cos(t), np.sin(t), 0]) for t in turn]
         pairs += [(first + i, first + (i + 1) % 5) for i in range(5)]
     for k in range(4):
         here, there = 5 * k + 4, 5 * ((k + 1) % 4) + 1
@@ -129,8 +129,8 @@ def porphyrin(program: Program, quick: bool) -> Outcome:
         atoms.append(middle * (1 + 0.25 / np.linalg.norm(middle)))
         pairs += [(here, len(atoms) - 1), (there, len(atoms) - 1)]
     bonded = {frozenset(p) for p in pairs}
-    neighbours = {i: [j for j in range(len(atoms)) if frozenset((i, j)) in bonded] for i in range(len(atoms))}
-    seconds = {tuple(sorted(p)) for near in neighbours.values() for p in ((a, b) for a in near for b in near if a != b)}
+    neighbors = {i: [j for j in range(len(atoms)) if frozenset((i, j)) in bonded] for i in range(len(atoms))}
+    seconds = {tuple(sorted(p)) for near in neighbors.values() for p in ((a, b) for a in near for b in near if a != b)}
     return _flexible(program, np.array(atoms), sorted({*(tuple(sorted(p)) for p in pairs), *seconds}), quick, "flat")  # type: ignore[arg-type]
 
 

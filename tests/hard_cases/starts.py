@@ -39,20 +39,20 @@ def _tangent_checks(problem: Problem, first: Frame) -> list[tuple[str, float, fl
 @case(
     "H10",
     "Rigid water stretched by 20 %",
-    "residual 1e-12; centre 1e-14; mass-weighted way 0.2771281292; unique velocities",
+    "residual 1e-12; center 1e-14; mass-weighted way 0.2771281292; unique velocities",
 )
 def stretched_water(program: Program, quick: bool) -> Outcome:
     masses = np.array([16.0, 1.0, 1.0])
     proper = truths.rotated([[0, 0, 0], [0.8, 0.6, 0], [-0.8, 0.6, 0]])
-    centre = masses @ proper / masses.sum()
-    x = centre + 1.2 * (proper - centre)
+    center = masses @ proper / masses.sum()
+    x = center + 1.2 * (proper - center)
     v = np.random.default_rng(4).standard_normal((3, 3))
     problem = Problem(x, masses, TRIANGLE, [1.0, 1.0, 1.6], velocities=v)
     first, end = _first(program, problem, 20)
     moved = first.x - x
     return outcome(
         ("residual", first_residual(problem, first, end), 1e-12),
-        ("centre moved by", np.abs(masses @ moved / masses.sum()).max(), 1e-14),
+        ("center moved by", np.abs(masses @ moved / masses.sum()).max(), 1e-14),
         ("mass-weighted way off by", abs(np.sqrt(np.sum(masses[:, None] * moved**2)) - 0.2771281292), 2e-10),
         *_tangent_checks(problem, first),
     )

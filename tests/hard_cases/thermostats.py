@@ -104,7 +104,7 @@ def conserved_momentum(program: Program, quick: bool) -> Outcome:
     "Minimum image with a cutoff above half the box",
     "refused",
     "raise",
-    ase="its neighbour lists count all images",
+    ase="its neighbor lists count all images",
     in_ase="no potentials of its own",
     in_openmm="OpenMM's own forces",
 )

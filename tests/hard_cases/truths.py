@@ -50,13 +50,13 @@ def rotated(x: Numbers, seed: int = 0) -> Array:
 
 
 def spinning(x: Array, masses: Array, omega: Numbers, drift: ArrayLike = (0, 0, 0)) -> Array:
-    """Velocities of a rotation about the centre of mass, and of the centre itself."""
+    """Velocities of a rotation about the center of mass, and of the center itself."""
     return np.asarray(np.cross(omega, x - masses @ x / masses.sum()) + np.asarray(drift, dtype=float))
 
 
 @_remembered
 def rigid_flight(x: Array, masses: Array, omega: Array, time: float) -> Array:
-    """Positions of a free rigid body after `time`, by Euler's equations; its centre rests."""
+    """Positions of a free rigid body after `time`, by Euler's equations; its center rests."""
     return flight(x, spinning(x, masses, omega), masses, time).positions
 
 
@@ -67,8 +67,8 @@ def rigid_rattle(x: Array, masses: Array, omega: Array, dt: float, steps: int) -
     With P the rotation of one step in the body's frame, P J - J P^T = dt hat(L), J = sum m y y^T and L the angular
     momentum in the body's frame (McLachlan and Zanna, Found. Comput. Math. 5, 87 (2005)).
     """
-    centre = masses @ x / masses.sum()
-    y = x - centre
+    center = masses @ x / masses.sum()
+    y = x - center
     J = np.einsum("i,ij,ik->jk", masses, y, y)
     inertia = np.trace(J) * np.eye(3) - J
     momentum = inertia @ omega
@@ -86,7 +86,7 @@ def rigid_rattle(x: Array, masses: Array, omega: Array, dt: float, steps: int) -
             if np.abs(change).max() < 1e-16:
                 break
         turn = turn @ _turn(w)
-    return np.asarray(centre + y @ turn.T)
+    return np.asarray(center + y @ turn.T)
 
 
 def _turn(w: Array) -> Array:
@@ -97,12 +97,12 @@ def _turn(w: Array) -> Array:
 
 
 def linear_flight(x: Array, v: Array, masses: Array, time: float) -> Array:
-    """Positions of a free straight rigid body: each atom on a circle about the centre of mass."""
-    centre, drift = masses @ x / masses.sum(), masses @ v / masses.sum()
-    d, u = x - centre, v - drift
+    """Positions of a free straight rigid body: each atom on a circle about the center of mass."""
+    center, drift = masses @ x / masses.sum(), masses @ v / masses.sum()
+    d, u = x - center, v - drift
     k = int(np.argmax(np.sum(d * d, axis=1)))
     omega = np.linalg.norm(u[k]) / np.linalg.norm(d[k])
-    return np.asarray(centre + drift * time + d * np.cos(omega * time) + u / omega * np.sin(omega * time))
+    return np.asarray(center + drift * time + d * np.cos(omega * time) + u / omega * np.sin(omega * time))
 
 
 @_remembered

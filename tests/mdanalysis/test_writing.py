@@ -355,7 +355,7 @@ def test_what_a_file_cannot_hold_is_not_written(tmp_path, away):
 
 
 def test_fine_grids_are_written_only_where_they_are_read_again(tmp_path):
-    """Beyond 2^23 steps it depends on the distances of neighbours whether XTC's packing is right."""
+    """Beyond 2^23 steps it depends on the distances of neighbors whether XTC's packing is right."""
     rng = np.random.default_rng(1)
     far = rng.uniform(0, 60, size=(200, 3))
     near = np.repeat(rng.uniform(0, 60, size=(70, 3)), 3, axis=0)[:200] + rng.normal(size=(200, 3)) * 0.5

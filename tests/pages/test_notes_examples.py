@@ -63,7 +63,7 @@ def check_labels(figure):
 
 
 def check_legends(figure):
-    """No legend lies on a panel, its labels or its curves; curves of several colours in a panel have one."""
+    """No legend lies on a panel, its labels or its curves; curves of several colors in a panel have one."""
     figure.draw_without_rendering()
     assert not [axes for axes in figure.axes if axes.get_legend()]
     boxes = [legend.get_window_extent() for legend in figure.legends]

@@ -231,7 +231,7 @@ def test_dependent_rows_are_eliminated_last():
         start = x + 1e-2 * rng.normal(size=x.shape)
         out = motion.project_positions(start, x, multipliers=lam)
         assert np.abs(lam).max() < 10.0
-        # The shift is a combination of the gradients: it moves no centre of mass and turns nothing.
+        # The shift is a combination of the gradients: it moves no center of mass and turns nothing.
         push = masses[:, None] * (out - start)
         assert np.abs(push.sum(axis=0)).max() < 1e-14 * masses.sum()
         assert np.abs(np.cross(x, push).sum(axis=0)).max() < 1e-13 * masses.sum()

@@ -25,7 +25,7 @@ SHAPE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
 
 
 def springs(x, t):
-    """Each atom in a harmonic well of its own strength, and an attraction of neighbouring molecules."""
+    """Each atom in a harmonic well of its own strength, and an attraction of neighboring molecules."""
     return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
 
 
@@ -101,7 +101,7 @@ MIXED = {
     "dihedral and a surface": ([Distance(BONDS), Dihedral([[0, 1, 2, 3]]), Sphere([4], [0.0, 0, 0])], {}),
     "distances apart": ([Distance([*BONDS, [4, 5]]), Angle([[0, 1, 2]])], {}),
     "rigid triangles, and a plane": ([Distance([[0, 1], [0, 2], [1, 2]]), Plane([5], [0, 0.6, 0.8])], {}),
-    "centres": ([CenterDistance([[0, 1], [2, 3]], [[4], [5]])], {}),
+    "centers": ([CenterDistance([[0, 1], [2, 3]], [[4], [5]])], {}),
     "rows beside fixed atoms": (
         [Distance(BONDS), Angle([[0, 1, 2]]), Sphere([4], [0.0, 0, 0]), FixedAtoms([0, 5])],
         {},

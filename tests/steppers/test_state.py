@@ -363,7 +363,7 @@ def test_energy_far_from_the_origin(stepper, offset) -> None:
 
 
 def test_a_body_that_flies_away_is_as_accurate_as_one_at_home() -> None:
-    """Turning while the centre moves off at 20 a unit of time: its angle does not depend on where it is."""
+    """Turning while the center moves off at 20 a unit of time: its angle does not depend on where it is."""
     home, still = rotor(omega=1.0)
     _, moving = rotor(omega=1.0)
     moving = State(moving.positions, moving.velocities + np.array([20.0, 0.0, 0.0]))

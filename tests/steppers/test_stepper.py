@@ -375,7 +375,7 @@ def test_check_finds_a_stepper_that_is_not_reversible() -> None:
 
 
 def test_check_finds_forces_with_a_memory() -> None:
-    """As by neighbour lists that are out of date: not a function of the positions."""
+    """As by neighbor lists that are out of date: not a function of the positions."""
     counter = itertools.count()
     system, state = rotor(force=lambda x, t: -x * (1 + 1e-4 * next(counter)))
     with pytest.raises(ReversibilityError, match="not reversible"):

@@ -65,7 +65,7 @@ def test_lammps_holds_clusters_and_refuses_chains():
         solver = BY_NAME["lammps"].make(SYSTEMS[name], 1e-10)
         assert solver.timing("P").residual < 1e-8
         assert solver.timing("V").residual < 1e-12
-    with pytest.raises(UnsupportedError, match="centre"):
+    with pytest.raises(UnsupportedError, match="center"):
         BY_NAME["lammps"].make(SYSTEMS["chain"], 1e-10)
 
 

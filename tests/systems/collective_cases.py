@@ -98,7 +98,7 @@ def points(expression, atoms):
     return force
 
 
-def centres(a, b, weights=()):
+def centers(a, b, weights=()):
     force = openmm.CustomCentroidBondForce(2, "distance(g1, g2)")
     force.addGroup(list(a), weights)
     force.addGroup(list(b))
@@ -122,7 +122,7 @@ FORCES = {
     "bond": lambda: [bond(0, 3)],
     "angle": lambda: [angle(1, 2, 4)],
     "dihedral": lambda: [dihedral(0, 1, 2, 3)],
-    "centres": lambda: [centres([0, 1], [3, 4, 5])],
+    "centers": lambda: [centers([0, 1], [3, 4, 5])],
     "gyration": lambda: [openmm.RGForce([0, 1, 2, 3, 4])],
     "rmsd": lambda: [rmsd()],
     "cosine": lambda: [points("cos(angle(p1, p2, p3))", (0, 2, 5))],

@@ -18,7 +18,7 @@ TIME = 0.7
 
 
 def scattered(seed: int) -> np.ndarray:
-    """Random positions, atoms at least 0.8 apart and no three neighbours in the list nearly in a line."""
+    """Random positions, atoms at least 0.8 apart and no three neighbors in the list nearly in a line."""
     rng = np.random.default_rng(seed)
     while True:
         x = rng.uniform(-2.0, 2.0, size=(N_ATOMS, 3))

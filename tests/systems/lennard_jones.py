@@ -191,19 +191,19 @@ def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-de
 def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-def]
     """Squares of forces, laplacian over shifts, squares of torques, laplacian over turns; summed over molecules.
 
-    A turn about the axis e moves a site at p from the centre by e x p, and bends its path by e x (e x p). Summed over
+    A turn about the axis e moves a site at p from the center by e x p, and bends its path by e x (e x p). Summed over
     three axes, the first gives |e x p|^2 -> |p x d|^2 along the line d of a pair and 2 p^2 in all, the second -2 p.
     """
     n, cut2, inverse = x.shape[0], cutoff * cutoff, 1.0 / box
     f, p = np.zeros_like(x), np.empty_like(x)
     for k in range(len(first) - 1):
         for c in range(3):
-            mass = centre = 0.0
+            mass = center = 0.0
             for i in range(first[k], first[k + 1]):
                 mass += sites[i, 3]
-                centre += sites[i, 3] * x[i, c]
+                center += sites[i, 3] * x[i, c]
             for i in range(first[k], first[k + 1]):
-                p[i, c] = x[i, c] - centre / mass
+                p[i, c] = x[i, c] - center / mass
     shifts = turns = 0.0
     for i in range(n):
         for j in range(i + 1, n):
@@ -257,18 +257,18 @@ def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _proposed(y, moves, rng):  # type: ignore[no-untyped-def]
-    """A molecule at places y, turned about its centre and moved, in place; shape (n, 3)."""
-    centre = np.zeros(3)
+    """A molecule at places y, turned about its center and moved, in place; shape (n, 3)."""
+    center = np.zeros(3)
     for i in range(len(y)):
-        centre += y[i] / len(y)
+        center += y[i] / len(y)
     axis = rng.normal(0.0, 1.0, 3)
     axis /= np.sqrt((axis * axis).sum())
     angle = moves[1] * (2.0 * rng.random() - 1.0)
     sine, cosine = np.sin(angle), np.cos(angle)
     move = moves[0] * (2.0 * rng.random(3) - 1.0)
     for i in range(len(y)):
-        p = y[i] - centre
-        y[i] = centre + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
+        p = y[i] - center
+        y[i] = center + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
 
 
 # That of near molecules is written out beside it: what takes a function as an argument is compiled by every process.

@@ -13,7 +13,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 EPS = float(np.finfo(float).eps)
-#: Condition of the row-normalised mass-weighted matrix up to which sets are compared.
+#: Condition of the row-normalized mass-weighted matrix up to which sets are compared.
 WORST_CONDITION = 1e3
 
 

@@ -25,14 +25,14 @@ ROWS = {
     "combination": [LinearCombination([0, 1, 2], [[1.0, 0.5, 0.2], [-0.4, -0.5, 0.3], [-0.6, 0, -0.5]])],
     "free angle": [Angle([[0, 1, 2]])],
     "free dihedral": [Dihedral([[0, 1, 2, 3]]), Distance([[3, 4]])],
-    "centres": [CenterDistance([0, 1, 2], [3, 4, 5])],
+    "centers": [CenterDistance([0, 1, 2], [3, 4, 5])],
     "difference of lengths": [DistanceDifference([[0, 1], [1, 2]]), Distance([[3, 4]])],
     "difference of held lengths": [Distance([[0, 1], [1, 2]]), DistanceDifference([[1, 2], [2, 3]])],
     "difference of a star and a pair": [
         DistanceDifference([[0, 2], [2, 3], [1, 2], [4, 5]], weights=[1.0, -1.0, 0.5, -2.0]),
         Distance([[0, 1]]),
     ],
-    "centre of a molecule": [
+    "center of a molecule": [
         Distance([[0, 1], [1, 2], [2, 3]]),
         Dihedral([[0, 1, 2, 3]]),
         CenterDistance([0, 3], [4, 5]),

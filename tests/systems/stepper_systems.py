@@ -75,7 +75,7 @@ def planar_pendulum(angle: float) -> tuple[System, State]:
 
 
 def rotor(omega=1.0, force=None, offset=0.0, **options) -> tuple[System, State]:
-    """Two unlike masses at distance 1.2, turning in the xy plane about their centre."""
+    """Two unlike masses at distance 1.2, turning in the xy plane about their center."""
     masses = np.array([1.0, 2.5])
     arms = 1.2 * np.array([2.5, -1.0]) / 3.5
     positions = np.zeros((2, 3)) + offset
@@ -87,7 +87,7 @@ def rotor(omega=1.0, force=None, offset=0.0, **options) -> tuple[System, State]:
 
 
 def skate() -> tuple[System, State]:
-    """A skate (two equal masses, blade under their centre) on a slope: a closed cycloid-like motion."""
+    """A skate (two equal masses, blade under their center) on a slope: a closed cycloid-like motion."""
     positions = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
     rows = [Distance([0, 1]), KnifeEdge([0], [1], [0, 0, 1], contact=0.5)]
     system = system_of(

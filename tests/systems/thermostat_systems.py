@@ -91,7 +91,7 @@ def integrated(system: System, state: State, end: float) -> tuple[Array, Array]:
 
 
 def springs(x, t):
-    """Each atom in a harmonic well of its own strength, and an attraction of neighbouring molecules."""
+    """Each atom in a harmonic well of its own strength, and an attraction of neighboring molecules."""
     return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
 
 

@@ -72,8 +72,8 @@ def begun(system, integrator, restore=None, part=None):
     return Made(integrator, context, part)
 
 
-#: Radius of the sphere that holds particle 0, about a centre that is not the origin.
-RADIUS, CENTRE = 0.2, X[0] - [0.2, 0, 0]
+#: Radius of the sphere that holds particle 0, about a center that is not the origin.
+RADIUS, CENTER = 0.2, X[0] - [0.2, 0, 0]
 
 
 def bond(i=0, j=7):
@@ -88,7 +88,7 @@ def rattle(strength=200.0):
 
 def on_a_sphere(radius=RADIUS, strength=200.0, **options):
     system = cluster(strength)
-    surface = Sphere([0], CENTRE, radius)
+    surface = Sphere([0], CENTER, radius)
     integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
     return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
 

@@ -19,11 +19,11 @@ def water(n: int, frames: int, side: float = 12.0, seed: int = 0) -> np.ndarray:
     half = ANGLE / 2
     shape = OH * np.array([[0.0, 0, 0], [np.sin(half), np.cos(half), 0], [-np.sin(half), np.cos(half), 0]])
     x = np.zeros((frames, n, 3, 3))
-    centres = rng.random((n, 1, 3)) * side
+    centers = rng.random((n, 1, 3)) * side
     for k in range(frames):
         turns, _ = np.linalg.qr(rng.normal(size=(n, 3, 3)))
-        centres = centres + 0.3 * rng.normal(size=centres.shape)
-        x[k] = centres + shape @ turns
+        centers = centers + 0.3 * rng.normal(size=centers.shape)
+        x[k] = centers + shape @ turns
     return x.reshape(frames, 3 * n, 3) % side
 
 

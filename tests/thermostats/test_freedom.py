@@ -64,7 +64,7 @@ COUNTED = {
     "methanes, redundant": (methanes(swirling), 36 - 18 - 3, 3),
     "methanes in a field": (methanes(waves), 36 - 18, 0),
     "mixed": (mixed(swirling), 36 - 3 - 1 - 1 - 1 - 2, 0),
-    "centre of mass held": (
+    "center of mass held": (
         (system([CenterOfMass([list(range(12))])], SCATTERED, WEIGHTS, swirling), SCATTERED),
         36 - 3,
         0,

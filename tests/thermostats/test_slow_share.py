@@ -38,7 +38,7 @@ def test_signs_do_not_cancel():
 
 
 def test_a_rigid_pair_turns_freely_in_a_trap():
-    """All of the stiffness is that of its centre; what pulls along the pair does nothing, wherever it has turned to."""
+    """All of the stiffness is that of its center; what pulls along the pair does nothing, wherever it has turned to."""
     x = np.array([[0.3, -0.2, 0.1], [0.3, -0.2, 1.5]])
 
     def along(x, t):

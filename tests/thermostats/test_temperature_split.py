@@ -37,8 +37,8 @@ def test_a_dumbbell_on_springs():
     for _ in range(40):
         split.add(x)
     above, below = (np.array(split._series)[:, row, :, 0] for row in (0, 1))
-    centre = x.mean(axis=0)
-    assert above[:, 0] == pytest.approx((2 * k) ** 2 * (centre @ centre) / (2 * m), rel=1e-12)
+    center = x.mean(axis=0)
+    assert above[:, 0] == pytest.approx((2 * k) ** 2 * (center @ center) / (2 * m), rel=1e-12)
     assert below[:, 0] == pytest.approx(3 * 2 * k / (2 * m), rel=1e-6)  # signs along the axes: no noise
     assert np.abs(above[:, 1:]).max() < 1e-20 and np.abs(below[:, 1:]).max() < 1e-5
     found = split.result()
@@ -155,12 +155,12 @@ def _inverse_metric(angle: float, masses: np.ndarray) -> float:
 # -- against a sampler without forces ---------------------------------------------------------------
 
 
-def bent(centres: np.ndarray, turns: np.ndarray, angle: np.ndarray, masses: np.ndarray) -> np.ndarray:
+def bent(centers: np.ndarray, turns: np.ndarray, angle: np.ndarray, masses: np.ndarray) -> np.ndarray:
     """Two arms of length 1 about a hub, shape (copies, 3, 3)."""
     shape = np.zeros((len(angle), 3, 3))
     shape[:, 1, 0], shape[:, 2, 0], shape[:, 2, 1] = 1.0, np.cos(angle), np.sin(angle)
     shape -= np.einsum("a,nak->nk", masses / masses.sum(), shape)[:, None]
-    return centres[:, None] + np.einsum("nij,naj->nai", turns, shape)
+    return centers[:, None] + np.einsum("nij,naj->nai", turns, shape)
 
 
 def rotations(vectors: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import kcons.openmm
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.topology.angle_rows import FLAT_CENTRE, angle_rows
+from kcons.topology.angle_rows import FLAT_CENTER, angle_rows
 from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.rows_by_name import held_rows
 from kcons.topology.topology import bond_angles, sorted_pairs
@@ -48,7 +48,7 @@ def of_ase(name):
 
 
 def star(directions, elements=None):
-    """An atom with neighbours in these directions."""
+    """An atom with neighbors in these directions."""
     e = np.array(directions, dtype=float)
     e = e / np.linalg.norm(e, axis=1, keepdims=True)
     n = len(e)
@@ -56,7 +56,7 @@ def star(directions, elements=None):
 
 
 def pyramid(improper):
-    """Three neighbours at equal angles, with this improper dihedral in degrees."""
+    """Three neighbors at equal angles, with this improper dihedral in degrees."""
     # Unit vectors of elevation h below the plane; the dihedral of two about the third.
     heights = np.linspace(0.0, 1.5, 20_001)
     a, b, c = (
@@ -103,7 +103,7 @@ def test_every_angle_stays_also_those_that_are_no_rows(name):
 
 
 def test_a_piece_of_villin_with_its_rings_is_well_conditioned():
-    """NLPLWKQ: proline, tryptophan, amides; before, three angles at each flat centre and all six elsewhere."""
+    """NLPLWKQ: proline, tryptophan, amides; before, three angles at each flat center and all six elsewhere."""
     pdb = app.PDBFile(str(VILLIN))
     some = [atom.index for atom in pdb.topology.atoms() if 18 <= atom.residue.index <= 24]
     rows = kcons.openmm.constraints_of(pdb.topology, pdb.positions, "allangles", select=some, rigid_water=False)
@@ -118,7 +118,7 @@ def test_a_piece_of_villin_with_its_rings_is_well_conditioned():
     assert before > 5000
 
 
-def test_a_flat_centre_has_an_improper_dihedral():
+def test_a_flat_center_has_an_improper_dihedral():
     made = star([[1, 0, 0], [-0.5, 0.9, 0.01], [-0.5, -0.8, 0]])
     rows = held_rows(made, "allangles")
     assert [item.family for item in rows] == ["Distance", "Angle", "Dihedral"]
@@ -128,7 +128,7 @@ def test_a_flat_centre_has_an_improper_dihedral():
 
 @pytest.mark.parametrize(("away", "dihedrals"), [(-1.0, 1), (+1.0, 0)])
 def test_flat_is_an_improper_of_150_degrees(away, dihedrals):
-    triples, quads = angle_rows(made := pyramid(180 - FLAT_CENTRE - away), made.topology.bonds, [])
+    triples, quads = angle_rows(made := pyramid(180 - FLAT_CENTER - away), made.topology.bonds, [])
     assert (len(triples), len(quads)) == (3 - dihedrals, dihedrals)
     # 353 degrees, as the documentation has it.
     x = made.positions / 1.2
@@ -145,7 +145,7 @@ def test_flat_is_an_improper_of_150_degrees(away, dihedrals):
         ([[1, 0, 0], [0.2, 1, 0], [-1, 0.3, 0], [0, -1, 0]], 5),
     ],
 )
-def test_centres_of_four_and_five_have_two_n_minus_three_rows(directions, rows):
+def test_centers_of_four_and_five_have_two_n_minus_three_rows(directions, rows):
     made = star(directions)
     found = held_rows(made, "allangles")
     assert found.constraint_set.n_rows == len(directions) + rows

@@ -18,15 +18,15 @@ def test_the_unit_of_length_does_not_matter():
     assert guess_bonds(snapshot(["O", "H", "H"], WATER / 10, angstrom=0.1)).tolist() == [[0, 1], [0, 2]]
 
 
-def test_a_hydrogen_keeps_its_nearest_neighbour():
+def test_a_hydrogen_keeps_its_nearest_neighbor():
     # A short hydrogen bond: 1.05 and 1.15 angstrom to two oxygens.
     x = [[0, 0, 0], [1.05, 0, 0], [2.2, 0, 0]]
     assert guess_bonds(snapshot(["O", "H", "O"], x)).tolist() == [[0, 1]]
-    # Also where only the farther one is asked about: the nearest neighbour may have its bonds already.
+    # Also where only the farther one is asked about: the nearest neighbor may have its bonds already.
     assert guess_bonds(snapshot(["O", "H", "O"], x), np.array([False, False, True])).tolist() == []
 
 
-def test_hydrogen_molecule_and_neighbouring_hydrogens():
+def test_hydrogen_molecule_and_neighboring_hydrogens():
     assert guess_bonds(snapshot(["H", "H"], [[0, 0, 0], [0.74, 0, 0]])).tolist() == [[0, 1]]
     assert guess_bonds(snapshot(["H", "H"], [[0, 0, 0], [1.0, 0, 0]])).tolist() == []
 

@@ -51,7 +51,7 @@ def test_masses_that_were_read_decide():
     assert found.tolist() == ["Cl", "O", "H", "", "C"]  # 3.024: hydrogens made heavier stay hydrogens
 
 
-def test_names_decide_where_hydrogens_took_mass_from_their_neighbours():
+def test_names_decide_where_hydrogens_took_mass_from_their_neighbors():
     """Amide N then weighs as much as C, hydroxyl O as N, CH as Be, the oxygen of water as C."""
     names = np.array(["CB", "HB1", "HB2", "OG", "HG", "N", "HN", "CA", "HA", "OH2"])
     masses = np.array([7.979, 3.024, 3.024, 13.983, 3.024, 11.991, 3.024, 8.987, 4.032, 11.967])

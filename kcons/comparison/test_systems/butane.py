@@ -79,7 +79,7 @@ def torsion(x: FloatArray) -> tuple[float, FloatArray]:
 def twist(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Reference:
     """Free flight of a body whose last atom turns about the bond before it.
 
-    In axes fixed to the first three atoms, r(s) are the places relative to the centre of mass after a twist by s.
+    In axes fixed to the first three atoms, r(s) are the places relative to the center of mass after a twist by s.
     With I = inertia, h = sum m r x r', G = sum m r'^2 (primes: d/ds), momenta Pi = I omega + h s_t and
     p = h . omega + G s_t obey Pi_t = Pi x omega and p_t = dT/ds - dV/ds.
     """

@@ -95,10 +95,10 @@ def _sites(start: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _springs(start: FloatArray) -> Evaluate:
-    k, centre = _sites(start)
+    k, center = _sites(start)
 
     def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
-        d = x - centre
+        d = x - center
         return 0.5 * float(np.sum(k * d * d)), -k * d
 
     return evaluate
@@ -107,13 +107,13 @@ def _springs(start: FloatArray) -> Evaluate:
 def _system(start: FloatArray, pairs: IntArray, masses: FloatArray) -> Any:
     import openmm
 
-    k, centre = _sites(start)
+    k, center = _sites(start)
     field = openmm.CustomExternalForce("0.5*(kx*(x-x0)^2+ky*(y-y0)^2+kz*(z-z0)^2)")
     for name, value in zip(("kx", "ky", "kz"), k / ASE_TIME**2, strict=True):
         field.addGlobalParameter(name, value)
     for name in ("x0", "y0", "z0"):
         field.addPerParticleParameter(name)
-    for atom, site in enumerate(centre * ASE_LENGTH):
+    for atom, site in enumerate(center * ASE_LENGTH):
         field.addParticle(atom, site.tolist())
     return system_of(masses, field, pairs=pairs, lengths=BOND * ASE_LENGTH)
 

@@ -1,6 +1,6 @@
 """Two rigid Lennard-Jones dumbbells that collide, in reduced units.
 
-Solution: each dumbbell's own equations of motion for its centre and its axis.
+Solution: each dumbbell's own equations of motion for its center and its axis.
 """
 
 from __future__ import annotations
@@ -81,13 +81,13 @@ def _collision_system() -> Any:
 
 
 def encounter(time: float) -> Reference:
-    """Centres C and unit axes n: C'' = F/M and n'' = (K - (K . n) n)/I - |n'|^2 n.
+    """Centers C and unit axes n: C'' = F/M and n'' = (K - (K . n) n)/I - |n'|^2 n.
 
     With the atoms at C + a_i n, K = sum a_i f_i and I = sum m_i a_i^2.
     """
     masses = MASSES.reshape(2, 2)
     shares = masses / masses.sum(axis=1)[:, None]
-    # Places of the atoms on the axis, from the centre.
+    # Places of the atoms on the axis, from the center.
     arms = np.stack([-shares[:, 1], shares[:, 0]], axis=1) * LENGTHS[:, None]
     inertia = np.sum(masses * arms * arms, axis=1)[:, None]
 
@@ -113,7 +113,7 @@ def encounter(time: float) -> Reference:
         np.sum(weights * v, axis=1),
         (v[:, 1] - v[:, 0]) / LENGTHS[:, None],
     ]
-    return integrated(rate, np.concatenate(start).ravel(), time, place, "equations of the centres and axes")
+    return integrated(rate, np.concatenate(start).ravel(), time, place, "equations of the centers and axes")
 
 
 add_system("dumbbells", build, "collision of two rigid dumbbells", size=2, unit="collision of two dumbbells", only=True)

@@ -52,7 +52,7 @@ def spin(q: FloatArray, omega: FloatArray) -> FloatArray:
 
 
 def turned(q: FloatArray, r: FloatArray) -> FloatArray:
-    """Vectors r, shape (n, 3), from body axes to space axes; q need not be normalised."""
+    """Vectors r, shape (n, 3), from body axes to space axes; q need not be normalized."""
     axis, scalar = q[:3] / np.linalg.norm(q), q[3] / np.linalg.norm(q)
     across = np.cross(axis, r)
     return np.asarray(r + 2.0 * (scalar * across + np.cross(axis, across)))

@@ -38,7 +38,7 @@ FEW_ATOMS, MANY_ATOMS = 200, 3000
 TORN = 0.5
 
 
-#: File (of the package, or of OpenMM where none is named), what is held, steps of minimisation, and what it is.
+#: File (of the package, or of OpenMM where none is named), what is held, steps of minimization, and what it is.
 STRUCTURES: Mapping[str, tuple[str, str, int, str]] = {
     "alanine": ("alanine-dipeptide-implicit.pdb.xz", "allbonds", 100, "alanine dipeptide in vacuum"),
     "dhfr": ("5dfr_minimized.pdb.xz", "allbonds", 20, "dihydrofolate reductase in vacuum"),
@@ -106,7 +106,7 @@ def from_file(
     platform : str
         Of OpenMM; by default Reference, in double precision, up to 200 atoms and CPU above.
     relax : int
-        Steps of minimisation, at most.
+        Steps of minimization, at most.
 
     Raises
     ------
@@ -374,7 +374,7 @@ def _refuse_torn(rows: Any, x: FloatArray, topology: Any) -> None:
 
 
 def _relaxed(flexible: Any, x: FloatArray, platform: str, iterations: int) -> FloatArray:
-    """Fewer overlaps, by OpenMM's minimiser with nothing held."""
+    """Fewer overlaps, by OpenMM's minimizer with nothing held."""
     import openmm
     from openmm import unit
 

@@ -3,11 +3,11 @@
 Minimum images say it for a vector that is shorter than half the cell, and for no other. So rows are sorted at
 set-up:
 
-* A row is *plain* if a constant distance shorter than `NEARLY` half the cell is held between each two neighbours in
+* A row is *plain* if a constant distance shorter than `NEARLY` half the cell is held between each two neighbors in
   its list of atoms. Minimum images along the list are then right at any time, whatever images are stored. Of a row that
-  names its `Constraint.links` these are the neighbours; where they do not follow the list, the row is no plain one.
+  names its `Constraint.links` these are the neighbors; where they do not follow the list, the row is no plain one.
 * All other rows are *whole* rows: distances nearly as long as half the cell and more (across a ring or an adsorbate),
-  linear rows, free dihedrals and angles, centres of groups, moving targets. Their atoms are made whole along a
+  linear rows, free dihedrals and angles, centers of groups, moving targets. Their atoms are made whole along a
   spanning tree of the shortest links that the set has, held distances first, and the row takes positions in
   the images found there.
 
@@ -35,7 +35,7 @@ from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, mini
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import ImageError, InputError
 
-#: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbours in the list.
+#: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbors in the list.
 ALL_PAIRS_WIDTH = 12
 #: A link that closes a framework through the boundary is a bond: not much longer than the longest of the tree.
 BOND_LIKE = 1.5
@@ -194,9 +194,9 @@ def find_images(
             _refuse_long(given, table.start + int(k), table.item.atoms[k], long, half_width)
     pairs = np.concatenate([t.item.atoms for t in held] or [np.zeros((0, 2), np.int64)])
     ends = np.concatenate([pairs, pairs[:, ::-1]]).T
-    neighbours = sp.csr_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(n_atoms, n_atoms))
+    neighbors = sp.csr_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(n_atoms, n_atoms))
     for table in tables:
-        table.settle(component, frameworks, neighbours)
+        table.settle(component, frameworks, neighbors)
     needed = np.zeros(len(frameworks), bool)
     for table in tables:
         needed[component[table.item.atoms[table.whole].ravel()]] = True
@@ -209,7 +209,7 @@ def find_images(
 
 
 class _Links:
-    """The links that the rows of one constraint offer, between neighbours in the list and others.
+    """The links that the rows of one constraint offer, between neighbors in the list and others.
 
     `whole` and `unsure` (distances whose target is still to be taken from one image or another) are by row.
     """
@@ -221,8 +221,8 @@ class _Links:
         chain = np.stack([np.arange(item.width - 1), np.arange(1, item.width)], axis=1)
         self.links = chain if item.links is None else item.links
         self._in_line = np.array_equal(self.links, chain)
-        self.neighbours = item.linked
-        raw = x[self.neighbours[..., 1]] - x[self.neighbours[..., 0]]
+        self.neighbors = item.linked
+        raw = x[self.neighbors[..., 1]] - x[self.neighbors[..., 0]]
         nearest = minimum_image(raw, lattice)
         self.lengths = np.linalg.norm(nearest, axis=2)
         #: Held at one length for good.
@@ -256,7 +256,7 @@ class _Links:
         """Rows along links that are not among the held ones are whole rows."""
         if self.held:
             return
-        pairs = np.sort(self.neighbours, axis=2)
+        pairs = np.sort(self.neighbors, axis=2)
         wanted = pairs[..., 0] * n_atoms + pairs[..., 1]
         place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
         found = keys[place] == wanted if len(keys) else np.zeros(wanted.shape, bool)
@@ -266,7 +266,7 @@ class _Links:
     def offered(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Pairs of atoms, lengths (NaN: to be measured) and rows of the links offered to the tree."""
         rows = np.repeat(np.arange(self.item.n_rows), len(self.links))
-        pairs, lengths = self.neighbours.reshape(-1, 2), self.lengths.ravel()
+        pairs, lengths = self.neighbors.reshape(-1, 2), self.lengths.ravel()
         if self.item.links is None and 2 < self.item.width <= ALL_PAIRS_WIDTH and self.whole.any():
             a, b = np.triu_indices(self.item.width, 2)
             more = self.item.atoms[self.whole]
@@ -444,7 +444,7 @@ def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: 
     raise InputError(
         f"row {row}, {item.row_name(row - first)}: {what} is not shorter than half the box ({half_width:g}), and no "
         "shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
-        "the atoms so that neighbours in the row are neighbours in space",
+        "the atoms so that neighbors in the row are neighbors in space",
         item="target" if item.holds_length else "positions",
         atoms=atoms,
     )

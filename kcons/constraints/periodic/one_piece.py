@@ -66,8 +66,8 @@ def lined_up(r: FloatArray, lattice: FloatArray | None) -> FloatArray:
     return r
 
 
-def neighbour_lists(pairs: IntArray, n_atoms: int) -> tuple[IntArray, IntArray]:
-    """Where the neighbours of each atom begin, shape (n_atoms + 1,), and all of them, those of one atom ascending."""
+def neighbor_lists(pairs: IntArray, n_atoms: int) -> tuple[IntArray, IntArray]:
+    """Where the neighbors of each atom begin, shape (n_atoms + 1,), and all of them, those of one atom ascending."""
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     start = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=n_atoms))])

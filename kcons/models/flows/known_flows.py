@@ -194,7 +194,7 @@ class ParticleOnSphere(Flow):
         x0, v0 = np.split(self._state(np.concatenate([np.ravel(numbers(x0, "x0")), np.ravel(numbers(v0, "v0"))])), 2)
         speed = float(np.linalg.norm(v0))
         if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
-            raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the centre, not {self.radius:.9g}", item="x0")
+            raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the center, not {self.radius:.9g}", item="x0")
         if abs(x0 @ v0) > 1e-9 * self.radius * speed:
             raise InputError("v0 leaves the sphere: give its part along it, v - x (x.v)/R^2", item="v0")
         angle = numbers(t, "t")[..., None] * speed / self.radius

@@ -272,7 +272,7 @@ class Geometry:
         """Atoms bonded to both of two that are not bonded to each other."""
         if self.pieces.bonded(i, k):
             return []
-        return np.intersect1d(self.pieces.neighbours(i), self.pieces.neighbours(k)).tolist()
+        return np.intersect1d(self.pieces.neighbors(i), self.pieces.neighbors(k)).tolist()
 
     def _lengths(self, x: FloatArray, pairs: IntArray) -> FloatArray:
         return np.linalg.norm(minimum_image(x[pairs[:, 1]] - x[pairs[:, 0]], self.held.lattice), axis=1)
@@ -284,8 +284,8 @@ class Geometry:
 
     def _follows(self, x: FloatArray, atoms: IntArray) -> bool:
         """Whether the rows hold a bond or an angle: its gradient lies in the span of theirs."""
-        centre = x[atoms[1]]
-        arms = [minimum_image(x[a] - centre, self.held.lattice) for a in atoms[[0, -1]]]
+        center = x[atoms[1]]
+        arms = [minimum_image(x[a] - center, self.held.lattice) for a in atoms[[0, -1]]]
         gradient = np.zeros((len(atoms), 3))
         if len(atoms) == 2:
             gradient[0] = arms[0]

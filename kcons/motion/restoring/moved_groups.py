@@ -304,7 +304,7 @@ class _Motions:
                 row = int(first) + n
                 part, atoms = held.subset(np.array([row]))
                 if item.family == "CenterDistance":
-                    move, across = self._centres(item.atoms[n], getattr(item, "split"), part, atoms), None  # noqa: B009
+                    move, across = self._centers(item.atoms[n], getattr(item, "split"), part, atoms), None  # noqa: B009
                 else:
                     move, across = self._own(item.family, item.atoms[n])
                 if move is not None:
@@ -327,8 +327,8 @@ class _Motions:
         """All atoms of the molecules of some atoms."""
         return np.unique(np.concatenate([self.pieces.molecule(a) for a in atoms.tolist()]))
 
-    def _centres(self, atoms: IntArray, split: int, part: ConstraintSet, own: IntArray) -> Move | None:
-        """Shift the molecules of two groups along the line of their centres."""
+    def _centers(self, atoms: IntArray, split: int, part: ConstraintSet, own: IntArray) -> Move | None:
+        """Shift the molecules of two groups along the line of their centers."""
         mine = np.isin(own, atoms[:split])
 
         def axis(x: FloatArray) -> FloatArray:

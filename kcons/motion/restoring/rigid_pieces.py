@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import make_whole, neighbour_lists, spanning_tree
+from kcons.constraints.periodic.one_piece import make_whole, neighbor_lists, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.plan.independent_blocks import edge_blocks
@@ -45,11 +45,11 @@ class MoleculeGraph:
         kept = np.zeros(n_atoms, dtype=bool)
         kept[np.isin(label, label[atoms])] = True
         self.bonds = pairs[kept[pairs].all(axis=1)] if len(pairs) else pairs
-        self._starts, self._ends = neighbour_lists(self.bonds, n_atoms)
+        self._starts, self._ends = neighbor_lists(self.bonds, n_atoms)
         order, parents = spanning_tree(self.bonds, n_atoms)
         self._lay_out(order[kept[order]], parents[kept[order]], n_atoms)
 
-    def neighbours(self, atom: int) -> IntArray:
+    def neighbors(self, atom: int) -> IntArray:
         """Atoms bonded to one."""
         return self._ends[self._starts[atom] : self._starts[atom + 1]]
 
@@ -94,7 +94,7 @@ class MoleculeGraph:
 
     def bonded(self, j: int, k: int) -> bool:
         """Whether two atoms are."""
-        return bool(np.any(self.neighbours(j) == k))
+        return bool(np.any(self.neighbors(j) == k))
 
     def beyond(self, j: int, k: int) -> IntArray | None:
         """Atoms on the side of k when the bond j-k is cut; None if there is no bond, or one in a ring."""
@@ -184,7 +184,7 @@ def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
 
 
 def stretch(atoms: IntArray, others: IntArray, masses: FloatArray, axis: Callable[[FloatArray], FloatArray]) -> Move:
-    """Shift one piece along an axis and the other against it, their common centre at rest.
+    """Shift one piece along an axis and the other against it, their common center at rest.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
 from kcons.steppers.state import START_TOLERANCE
 
-#: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbour list, and v is rounded to
+#: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
 #: no digit.
 SPEED_SCALE = 1024.0

@@ -135,7 +135,7 @@ def hold(
     chosen |= _sharing(table, touched[touched < n])
     taken = _as_rows(table, chosen, angles)
     part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
-    links = [_neighbours(item.atoms) for item in given] if join else []
+    links = [_neighbors(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
     refuse_movers(system, part.motion.constraint_set, lambda: _molecules(system, joined))
     # Nothing can fail from here on.
@@ -286,7 +286,7 @@ def _tie(system: openmm.System, pairs: IntArray) -> None:
         force.addBond(i, j, 0.0, 0.0)
 
 
-def _neighbours(atoms: IntArray) -> IntArray:
+def _neighbors(atoms: IntArray) -> IntArray:
     """Pairs of atoms that follow each other in rows, shape (n, 2)."""
     return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
 

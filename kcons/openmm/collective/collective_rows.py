@@ -276,7 +276,7 @@ class CollectiveRows(GroupRows):
         """Bring the positions of the context onto the rows and the System's constraints; returns the iterations.
 
         Newton with step control. Where rows are distances, angles or dihedrals of particles or distances of
-        centres of mass and the targets are far, groups are moved whole first, by the same code as `hold`
+        centers of mass and the targets are far, groups are moved whole first, by the same code as `hold`
         (`Motion.restore_positions`): bonds and angles stay as they are. Velocities stay as they are.
 
         Parameters

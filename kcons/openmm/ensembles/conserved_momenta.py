@@ -18,7 +18,7 @@ from kcons.openmm.integrator.system_checks import (
     groups_in,
     groups_of,
     knows_a_place,
-    removes_centre_of_mass_motion,
+    removes_center_of_mass_motion,
 )
 from kcons.openmm.quantities import held_without_mass, masses_of
 from kcons.openmm.states import box_of, forces_at, positions_of, velocities_of
@@ -131,7 +131,7 @@ class CountsMomenta(Ensemble):
                 "would not follow; use Langevin, or a thermostat of kcons.ase"
             )
         masses, v = self.masses(integrator), velocities_of(context)
-        if self.everyone(integrator) and removes_centre_of_mass_motion(context.getSystem()):
+        if self.everyone(integrator) and removes_center_of_mass_motion(context.getSystem()):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
         self.ready(integrator, context, masses, v)
         momenta = self.momenta(integrator)
@@ -161,7 +161,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     if momentum == "free":
         return NONE
     system, x = context.getSystem(), positions_of(context)
-    masses, removed = masses_of(system), removes_centre_of_mass_motion(system)
+    masses, removed = masses_of(system), removes_center_of_mass_motion(system)
     turns = RigidMotions(x, turn=not system.usesPeriodicBoundaryConditions())
     broken: list[FloatArray] = []
     fixed = held_without_mass(system)
@@ -186,7 +186,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
                 broken.append(_totals(context, force, x, fixed, turns))
             elif turns.found and not _carries(force):  # what Python computes is taken for forces between particles
                 _totals(context, force, x, fixed, turns)
-    if removed:  # the centre of mass rests
+    if removed:  # the center of mass rests
         turns.keep(np.tensordot(masses, turns.fields(x).reshape(-1, 3, 6), 1) / masses.sum())
     directions = np.eye(3)
     if broken:

@@ -35,7 +35,7 @@ def molecular_pressure(
         Of a periodic System.
     temperature : Quantity or float, optional
         In K if a float, for N kT/V of the N molecules that have a mass, instead of the present kinetic energy of the
-        centres: the same mean, with less noise.
+        centers: the same mean, with less noise.
     strain : float
         Change of all lengths.
 
@@ -67,9 +67,9 @@ def molecular_pressure(
     n = len(molecules)
     cells = _cells_to_whole(system, x, box, label)
     # As OpenMM's barostats: the mean of positions, which sites without mass take part in.
-    centres = _sums(x + cells @ box, label, n) / np.bincount(label, minlength=n)[:, None]
+    centers = _sums(x + cells @ box, label, n) / np.bincount(label, minlength=n)[:, None]
     # Atoms stay in the images that they are stored in.
-    change = centres[label] - cells @ box
+    change = centers[label] - cells @ box
     energies = []
     groups = context.getIntegrator().getIntegrationForceGroups()
     try:

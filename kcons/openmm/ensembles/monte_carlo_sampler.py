@@ -127,7 +127,7 @@ class HamiltonianMonteCarlo:
     keep : float
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     conserve_momentum : bool
-        Velocities are drawn relative to the centre of mass, in the directions in which no row knows a place in space.
+        Velocities are drawn relative to the center of mass, in the directions in which no row knows a place in space.
     tolerance : float
         Distance in nm by which a way back may miss its start; other solutions are off by a part of a bond.
     restart : path, optional

@@ -28,7 +28,7 @@ from kcons.openmm.integrator.system_checks import (
     knows_a_place,
     parts_of_steps,
     refuse_forgotten_parts,
-    removes_centre_of_mass_motion,
+    removes_center_of_mass_motion,
     warn_of_barostat,
 )
 from kcons.openmm.quantities import held_without_mass
@@ -95,7 +95,7 @@ class Guard:
         self.undisturbed = not (
             any(isinstance(force, openmm.AndersenThermostat) for force in applied)
             or (
-                removes_centre_of_mass_motion(self.system)
+                removes_center_of_mass_motion(self.system)
                 and (any(map(knows_a_place, applied)) or held_without_mass(self.system))
             )
         )
@@ -303,7 +303,7 @@ class Guard:
     def _refuse(self, miss: Violation | None) -> None:
         if miss is not None:
             raise InputError(
-                f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimiser is one: take "
+                f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimizer is one: take "
                 "integrator.minimizeEnergy); call integrator.applyConstraints(context) and "
                 "integrator.applyVelocityConstraints(context)",
                 item=miss.what,
@@ -481,7 +481,7 @@ class Guard:
 
     def degrees_of_freedom(self) -> int:
         """Also less three where a CMMotionRemover acts."""
-        return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+        return self.independent_momenta() - (3 if removes_center_of_mass_motion(self.system) else 0)
 
 
 def _size(system: openmm.System) -> tuple[int, int, int]:

@@ -1,4 +1,4 @@
-"""Minimisation of the energy on the constraints."""
+"""Minimization of the energy on the constraints."""
 
 from __future__ import annotations
 

@@ -477,9 +477,9 @@ class ProjectedIntegrator(Integrator):
         tolerance: unit.Quantity | float = 10.0,
         maxIterations: int = 0,
     ) -> None:
-        """Minimise the energy with all constraints kept.
+        """Minimize the energy with all constraints kept.
 
-        Without parts this is OpenMM's LocalEnergyMinimizer, followed by `applyConstraints`; OpenMM's minimiser knows
+        Without parts this is OpenMM's LocalEnergyMinimizer, followed by `applyConstraints`; OpenMM's minimizer knows
         nothing of parts.
 
         Parameters
@@ -508,7 +508,7 @@ class ProjectedIntegrator(Integrator):
     def degrees_of_freedom(self, context: openmm.Context | None = None) -> int:
         """Three for each particle with a mass, less the rank of all constraints.
 
-        Also less three where a CMMotionRemover keeps the centre of mass at rest. Found at the first call.
+        Also less three where a CMMotionRemover keeps the center of mass at rest. Found at the first call.
         """
         return self._watch(context).degrees_of_freedom()
 

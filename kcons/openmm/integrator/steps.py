@@ -171,7 +171,7 @@ def _declare_guards(step: Step) -> None:
 def see_who_moved(step: Step) -> None:
     """How far x is from where the last step ended; where a call begins, Python has to look at what others moved."""
     p = step.program
-    p.sum("moved", "(x-x_last)^2", "barostats, setPositions and minimisers move x between steps")
+    p.sum("moved", "(x-x_last)^2", "barostats, setPositions and minimizers move x between steps")
     asks = "select(call-1, failed, select(moved, -1, 0))"
     p.let("failed", f"select(failed+stale, failed, {asks})", "a call begins: ask Python to look at x")
 

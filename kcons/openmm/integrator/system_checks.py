@@ -214,17 +214,17 @@ def worst_length(context: openmm.Context) -> tuple[str, float]:
 def _settled(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:
     """Which rows are isolated triangles with two equal sides; OpenMM's own rule."""
     count = np.bincount(pairs.ravel(), minlength=n)
-    neighbours: dict[int, dict[int, np.float32]] = {}
+    neighbors: dict[int, dict[int, np.float32]] = {}
     for (i, j), d in zip(pairs.tolist(), lengths.astype(np.float32), strict=True):
         if count[i] == 2 and count[j] == 2:
-            neighbours.setdefault(i, {})[j] = d
-            neighbours.setdefault(j, {})[i] = d
+            neighbors.setdefault(i, {})[j] = d
+            neighbors.setdefault(j, {})[i] = d
     held = np.zeros(n, bool)
-    for i, around in neighbours.items():
+    for i, around in neighbors.items():
         if len(around) == 2:
             j, k = around
-            if k in neighbours[j]:
-                sides = {around[j], around[k], neighbours[j][k]}
+            if k in neighbors[j]:
+                sides = {around[j], around[k], neighbors[j][k]}
                 held[[i, j, k]] = len(sides) < 3
     return held[pairs[:, 0]] & held[pairs[:, 1]] if len(pairs) else np.zeros(0, bool)
 
@@ -258,7 +258,7 @@ def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
     return (system.getForce(k) for k in range(system.getNumForces()))
 
 
-def removes_centre_of_mass_motion(system: openmm.System) -> bool:
+def removes_center_of_mass_motion(system: openmm.System) -> bool:
     return any(isinstance(force, openmm.CMMotionRemover) for force in forces_of(system))
 
 

@@ -123,7 +123,7 @@ class QuadricRows(SurfaceRows):
 
     def declare(self, program: Program) -> None:
         p = program
-        self._parameter(p, "s_c", "centre of the surface", self.centers)
+        self._parameter(p, "s_c", "center of the surface", self.centers)
         if self._k == "s_k":
             self._parameter(p, "s_k", "level of the quadric 2s(d) = d.Qd + 2g.d - k, d = x - c", self.levels)
         if self._tilted:
@@ -174,7 +174,7 @@ class QuadricRows(SurfaceRows):
         )
 
     def fly(self, p: Program, u: str, h: str) -> None:
-        p.vector("s_d", "where the particle would fly, from the centre")
+        p.vector("s_d", "where the particle would fly, from the center")
         p.each("s_d", f"x+{h}*{u}-s_c", "where it would fly")
         if self._tilted:
             p.vector("s_gradient", "gradient of the surface where the drift began")
@@ -216,7 +216,7 @@ class QuadricRows(SurfaceRows):
         p.vector("s_dv", "d.v")
         p.vector("s_w", "angular velocity w, never quite 0")
         on, safe = ("(1-s_other)*", self._safe) if self._others else ("", "")
-        p.each("s_d", "x-s_c", "from the centre")
+        p.each("s_d", "x-s_c", "from the center")
         p.each("s_dd", "dot(s_d, s_d)", "length")
         p.each("s_dv", "dot(s_d, v)", "velocity across the sphere")
         p.each("v", f"v-{on}s_d*s_dv/(s_dd{safe})", "along the sphere")
@@ -397,14 +397,14 @@ class TorusRows(SurfaceRows):
 
     def declare(self, program: Program) -> None:
         p = program
-        self._parameter(p, "t_c", "centre of the torus", self._centers)
+        self._parameter(p, "t_c", "center of the torus", self._centers)
         self._parameter(p, "t_n", "unit normal of its plane", self._axes)
         self._parameter(p, "t_major", "radius R of its core", self._major)
         self._parameter(p, "t_minor", "radius r of its tube", self._minor)
         self._parameter(p, "t_on", "1 for particles on a torus", np.ones(len(self.atoms)))
         p.setting("t_solved", "relative residual that counts as solved", _SOLVED)
         p.vector("t_u", "z and U, height over the plane")
-        p.vector("t_d", "D, square of the distance from the centre")
+        p.vector("t_d", "D, square of the distance from the center")
         p.vector("t_z", "Z, height over the plane where the particle flew")
         p.vector("t_t", "T, du.G0")
         p.vector("t_l", "l, way back along the kept gradient")
@@ -428,7 +428,7 @@ class TorusRows(SurfaceRows):
 
     def fly(self, p: Program, u: str, h: str) -> None:
         self.remember(p)
-        p.vector("t_x", "where the particle would fly, from the centre")
+        p.vector("t_x", "where the particle would fly, from the center")
         p.each("t_x", f"x+{h}*{u}-t_c", "where it would fly")
         self._solve(p, "t_x")
 

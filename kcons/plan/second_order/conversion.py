@@ -37,7 +37,7 @@ DENSE_LIMIT = 900
 DENSE_ENTRIES = 4_000_000
 #: Triangles whose targets are as flat as this are linear groups wherever their atoms are at the start.
 _FLAT_TARGETS = 1e-12
-#: Blocks of one shape that start off their targets are analysed where they belong, until this many in a
+#: Blocks of one shape that start off their targets are analyzed where they belong, until this many in a
 #: row turn out regular.
 _REGULAR_SAMPLES = 100
 _INTERNAL = frozenset({"Distance", "Angle", "Dihedral", "LinearRelation", "LinearCombination"})

@@ -212,15 +212,15 @@ def _fitted(
     Gauss-Newton within the plane, where the rows are regular; starts from the present positions.
     """
     y = x[atoms]
-    centre = y.mean(axis=0)
-    axes = np.linalg.svd(y - centre)[2][:flat]
-    plane = (y - centre) @ axes.T
+    center = y.mean(axis=0)
+    axes = np.linalg.svd(y - center)[2][:flat]
+    plane = (y - center) @ axes.T
     columns = (3 * atoms[:, None] + np.arange(3)).ravel()
     scale = block.part.scale[inside]
     whole = x.copy()
     best, miss = plane, np.inf
     for _ in range(30):
-        whole[atoms] = centre + plane @ axes
+        whole[atoms] = center + plane @ axes
         sigma = block.part.value(whole, block.time)[inside]
         size = float(np.max(np.abs(sigma) / scale))
         if not size < miss:
@@ -233,7 +233,7 @@ def _fitted(
         step = np.linalg.lstsq(a / scale[:, None], -sigma / scale, rcond=STEP_CUT)[0]
         plane = plane + step.reshape(plane.shape)
     if not miss <= MISFIT:
-        whole[atoms] = centre + best @ axes
+        whole[atoms] = center + best @ axes
         worst = int(np.argmax(np.abs(block.part.value(whole, block.time)[inside]) / scale))
         row = int(block.rows[inside[worst]])
         raise SingularGeometryError(

@@ -126,7 +126,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         The part a of the velocities that is kept, v = a v + sqrt(1 - a^2) noise. 0: all are drawn anew. Near 1, with
         few steps of a proposal: generalised Hamiltonian Monte Carlo, which is near to Langevin dynamics.
     conserve_momentum : bool
-        Velocities are drawn relative to the centre of mass, in the directions in which no row knows a place in space;
+        Velocities are drawn relative to the center of mass, in the directions in which no row knows a place in space;
         so many degrees of freedom less take part.
     tolerance : float
         Largest difference of a step taken back, relative as for `kcons.steppers.ReversibilityCheck`.

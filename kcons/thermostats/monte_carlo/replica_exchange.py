@@ -1,4 +1,4 @@
-"""Configurations exchanged between neighbouring temperatures."""
+"""Configurations exchanged between neighboring temperatures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTE
 def exchange(
     states: Sequence[State], thermal_energies: Sequence[float], seed: int, number: int
 ) -> tuple[list[State], list[bool | None]]:
-    """Offer neighbours an exchange: with probability min(1, exp((1/kT_i - 1/kT_j) (U_i - U_j))) it is made.
+    """Offer neighbors an exchange: with probability min(1, exp((1/kT_i - 1/kT_j) (U_i - U_j))) it is made.
 
     Configurations change places and velocities are scaled with sqrt(T), which leaves the product of all densities as it
     is. Pairs (0, 1), (2, 3), ... take turns with (1, 2), (3, 4), ... Numbers, clocks and counts stay with their

@@ -42,7 +42,7 @@ class DualAveraging:
 
     def __init__(self, dt: float, wanted: float) -> None:
         self.wanted = wanted_share(wanted)
-        self._centre = self._log = math.log(positive(dt, "dt"))
+        self._center = self._log = math.log(positive(dt, "dt"))
         self._sum = self._mean = 0.0
         self._told: list[float] = []
         self.made = 0
@@ -75,7 +75,7 @@ class DualAveraging:
         self.made += 1
         self._told.append(probability)
         self._sum += self.wanted - probability
-        self._log = self._centre - math.sqrt(self.made) / PULL * self._sum / (self.made + BEFORE)
+        self._log = self._center - math.sqrt(self.made) / PULL * self._sum / (self.made + BEFORE)
         share = self.made**-FORGET
         self._mean += share * (self._log - self._mean)
 

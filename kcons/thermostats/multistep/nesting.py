@@ -222,16 +222,16 @@ def _level(
         yield Evaluate(group)
         yield push(0.5 * length, group)
         return
-    centre = len(drifts) // 2
+    center = len(drifts) // 2
     odd = len(drifts) % 2 == 1
     for k, fraction in enumerate(kicks):
-        if not odd and k == centre:
+        if not odd and k == center:
             yield from (push(0.5 * fraction * length, group), Exchange(length), push(0.5 * fraction * length, group))
         else:
             yield push(fraction * length, group)
         if k < len(drifts):
             yield from _drift(next(flights), turns)
-            if odd and k == centre:
+            if odd and k == center:
                 yield Exchange(length)
                 yield from _drift(next(flights), turns)
             yield Evaluate(group)

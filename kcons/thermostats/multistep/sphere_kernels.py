@@ -14,8 +14,8 @@ from kcons.constraints.compilation import njit
 
 
 @njit(cache=True, nogil=True)
-def centres(v, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
-    """Velocity of the centre of mass of each cluster that has a sphere for it, else 0, shape (n_clusters, 3)."""
+def centers(v, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
+    """Velocity of the center of mass of each cluster that has a sphere for it, else 0, shape (n_clusters, 3)."""
     found = np.zeros((len(totals), 3))
     for i in range(len(cluster)):
         c = cluster[i]
@@ -68,7 +68,7 @@ def combine(v, a, middle_v, middle_a, keep, push, cluster, spheres):  # type: ig
 def rescale(v, w, squares, with_w, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
     """Bring y back onto its sphere: all of it, or u alone, with w as it is."""
     n = len(squares)
-    middle = centres(v, cluster, spheres, masses, totals)
+    middle = centers(v, cluster, spheres, masses, totals)
     has = products(v, v, middle, middle, n, cluster, spheres, masses, totals)
     keep, push = np.ones(n), np.zeros(n)
     for s in range(n):
@@ -94,8 +94,8 @@ def turn(v, w, a, t, squares, cluster, spheres, masses, totals):  # type: ignore
         y(t) = (y e^-z + e R [(1 - e^-2z) + c (1 - e^-z)^2]/2)/d,    d = [(1 + c) + (1 - c) e^-2z]/2.
     """
     n = len(squares)
-    middle_v = centres(v, cluster, spheres, masses, totals)
-    middle_a = centres(a, cluster, spheres, masses, totals)
+    middle_v = centers(v, cluster, spheres, masses, totals)
+    middle_a = centers(a, cluster, spheres, masses, totals)
     along = products(v, a, middle_v, middle_a, n, cluster, spheres, masses, totals)
     strength = products(a, a, middle_a, middle_a, n, cluster, spheres, masses, totals)
     keep, push = np.ones(n), np.zeros(n)

@@ -1,6 +1,6 @@
-"""Which velocities share a sphere: clusters of atoms that rows tie together, their centres of mass, or everything.
+"""Which velocities share a sphere: clusters of atoms that rows tie together, their centers of mass, or everything.
 
-A cluster's kinetic energy is conserved in free flight, that of its centre of mass alone as well unless a row knows a
+A cluster's kinetic energy is conserved in free flight, that of its center of mass alone as well unless a row knows a
 place in space. Each part that is conserved by itself may have a sphere of its own.
 """
 
@@ -33,7 +33,7 @@ class SphereLayout:
     cluster : ndarray of int, shape (n_atoms,)
         Cluster of each atom, -1 for fixed ones.
     spheres : ndarray of int, shape (n_clusters, 4)
-        Those of the centre of mass along x, y and z, all -1 where it has none of its own; that of the rest, or -1.
+        Those of the center of mass along x, y and z, all -1 where it has none of its own; that of the rest, or -1.
     masses : ndarray, shape (n_atoms,)
         0 for fixed atoms.
     totals : ndarray, shape (n_clusters,)

@@ -53,8 +53,8 @@ class IsokineticSpheres(SeededBath):
     steps : mapping of str to int, optional
         As for `LangevinRespa`.
     spheres : {'split', 'axes', 'cluster', 'global'}
-        Atoms that constraints tie together are a cluster, a free atom is its own. 'split': one sphere for the centre of
-        mass of each cluster and one for the motion about it; 'axes': one for each of x, y and z of the centre of mass;
+        Atoms that constraints tie together are a cluster, a free atom is its own. 'split': one sphere for the center of
+        mass of each cluster and one for the motion about it; 'axes': one for each of x, y and z of the center of mass;
         'cluster': one for each cluster; 'global': one for everything. A cluster that a row ties to a place in space
         has one sphere in the first three.
     auxiliary : int

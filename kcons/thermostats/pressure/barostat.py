@@ -202,7 +202,7 @@ class Attempt(NamedTuple):
 class Barostat:
     """Base of the barostats: pieces, trial cells, acceptance. Give one to `ConstantPressure`, or to dynamics of ASE.
 
-    Pieces - clusters tied by constraints, molecules where bonds are given, free atoms - move by their centres, with
+    Pieces - clusters tied by constraints, molecules where bonds are given, free atoms - move by their centers, with
     shape, orientation and velocities kept, so that all stays held. A trial is accepted with the probability
     min(1, exp(-(dU + P dV - gamma dA)/kT) (V'/V)^(N+1) w), N being the number of pieces and w what the proposals ask
     for: the isothermal-isobaric distribution is sampled without error of a step, whatever the thermostat does between.
@@ -483,7 +483,7 @@ class MonteCarloBarostat(Barostat):
     Chow and Ferguson, Comput. Phys. Commun. 91, 283 (1995); Aqvist et al., Chem. Phys. Lett. 384, 288 (2004).
     """
 
-    what = "scale cell and centres of pieces at random, accept by energy"
+    what = "scale cell and centers of pieces at random, accept by energy"
 
     def __init__(self, pressure: float, *, width: float = 0.01, **kwargs: Any) -> None:
         super().__init__(pressure, **kwargs)
@@ -531,7 +531,7 @@ class CellRescaling(Barostat):
     Sci. 12, 1139 (2022); acceptance: Roberts and Tweedie, Bernoulli 2, 341 (1996).
     """
 
-    what = "scale cell and centres of pieces by the stress and by noise, accept by energy"
+    what = "scale cell and centers of pieces by the stress and by noise, accept by energy"
     needs_stress = True
 
     def __init__(self, pressure: float, tau: float, compressibility: float, **kwargs: Any) -> None:
@@ -570,9 +570,9 @@ class CellRescaling(Barostat):
 
 
 def energy_by_strain(system: CellSystem, pieces: BarostatBodies, place: Place) -> FloatArray:
-    """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centres.
+    """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centers.
 
-    The stress is that of all atoms moving along; what they would move relative to the centre of their piece does work
+    The stress is that of all atoms moving along; what they would move relative to the center of their piece does work
     against the forces, and is taken out again.
     """
     assert place.forces is not None and place.stress is not None

@@ -28,7 +28,7 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
 
     z is the instantaneous constraint force, the velocity-dependent part of b included. Rows that depend on
     differences of positions only enter with these differences, so that the origin does not matter. Rows
-    with a place in space (fixed atoms, surfaces, centres of mass) are external forces, like walls, and
+    with a place in space (fixed atoms, surfaces, centers of mass) are external forces, like walls, and
     have no share.
 
     References
@@ -122,7 +122,7 @@ def instantaneous_pressure(
     if pieces is None:
         pieces = find_pieces(system, x, np.ones(3, dtype=bool), time=state.time)
     if thermal_energy is None:
-        u = pieces.centres(v) * pieces.open
+        u = pieces.centers(v) * pieces.open
         kinetic = (pieces.mass[:, None] * u).T @ u
     else:
         kinetic = positive(thermal_energy, "thermal_energy") * np.diag(pieces.moving).astype(float)
@@ -134,7 +134,7 @@ def instantaneous_pressure(
 
 
 def _slope(system: CellSystem, state: State, pieces: BarostatBodies, cell: FloatArray) -> float:
-    """dU/d ln(length) where the cell is scaled along the axes it changes along, and pieces move by their centres."""
+    """dU/d ln(length) where the cell is scaled along the axes it changes along, and pieces move by their centers."""
     lattice, energies = lattice_of(system), []
     try:
         for h in (STRAIN, -STRAIN):

@@ -71,8 +71,8 @@ class BarostatBodies:
         n = len(self)
         return np.stack([np.bincount(self.label, values[:, k], n) for k in range(3)], axis=1)
 
-    def centres(self, y: FloatArray) -> FloatArray:
-        """Centres of mass of positions in one piece (or their velocities), shape (n_pieces, 3)."""
+    def centers(self, y: FloatArray) -> FloatArray:
+        """Centers of mass of positions in one piece (or their velocities), shape (n_pieces, 3)."""
         return self.sums(self.weight[:, None] * y)
 
     def moved(self, x: FloatArray, change: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -88,7 +88,7 @@ class BarostatBodies:
         if atom >= 0:
             raise UnsupportedError(
                 f"atom {atom} is held in its place across a face of the cell that the barostat moves: the constraint "
-                "would mean another place. Store what is held with its neighbours on the same side"
+                "would mean another place. Store what is held with its neighbors on the same side"
             )
         return d
 
@@ -273,17 +273,17 @@ def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):
 
 @njit(cache=True, nogil=True)
 def work_of_shapes(x, f, label, weight, opened, atoms, parents, lattice):  # type: ignore[no-untyped-def]
-    """Sum of (r_i - R) (x) f_i over atoms, R the centre of their piece or zero where it stays, shape (3, 3)."""
+    """Sum of (r_i - R) (x) f_i over atoms, R the center of their piece or zero where it stays, shape (3, 3)."""
     y = x.copy()
     follow_parents(y, atoms, parents, lattice)
-    centres = np.zeros((len(opened), 3))
+    centers = np.zeros((len(opened), 3))
     for i in range(len(x)):
         for k in range(3):
-            centres[label[i], k] += weight[i] * y[i, k]
+            centers[label[i], k] += weight[i] * y[i, k]
     work = np.zeros((3, 3))
     for i in range(len(x)):
         p = label[i]
         for j in range(3):
             for k in range(3):
-                work[j, k] += (y[i, j] - centres[p, j] if opened[p, k] else y[i, j]) * f[i, k]
+                work[j, k] += (y[i, j] - centers[p, j] if opened[p, k] else y[i, j]) * f[i, k]
     return work

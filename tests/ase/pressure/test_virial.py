@@ -186,9 +186,9 @@ def test_a_molecular_crystal_relaxes(name):
 
 def test_what_scales_atoms_past_their_constraints_is_refused():
     atoms = crystal()
-    optimiser = BFGS(StrainFilter(atoms), logfile=None)
+    optimizer = BFGS(StrainFilter(atoms), logfile=None)
     with pytest.raises(UnsupportedError, match="StrainFilter"):
-        optimiser.run(fmax=0.01, steps=5)
+        optimizer.run(fmax=0.01, steps=5)
 
 
 @pytest.mark.parametrize("name", FILTERS)

@@ -32,7 +32,7 @@ FAMILIES = {
         Formula("6**(1/3)*(sqrt(x1**2 + y1**2/4 + z1**2/9) - 1)", 7, target=None),
         Ellipsoid(7, [0.0, 0.0, 0.0], [1.0, 2.0, 3.0], target=None),
     ),
-    "centres": (
+    "centers": (
         Formula(f"sqrt({' + '.join(f'((m1*{c}1 + m2*{c}2)/(m1 + m2) - {c}3)**2' for c in 'xyz')})", [0, 1, 2],
                 {"m1": MASSES[0], "m2": MASSES[1]}, None),
         CenterDistance([0, 1], [2]),

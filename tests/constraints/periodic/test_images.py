@@ -148,7 +148,7 @@ def test_atoms_that_nothing_ties_raise_before_their_image_flips(wrapped):
     assert np.array_equal(state.positions % 10.0 if wrapped else state.positions, before)
 
 
-def test_a_molecule_across_the_boundary_held_by_its_centre():
+def test_a_molecule_across_the_boundary_held_by_its_center():
     x = np.array([[9.5, 5.0, 5.0], [10.5, 5.0, 5.0], [10.0, 5.8, 5.0]])
     rows = [Distance([[0, 1], [1, 2]]), LinearCombination([0, 2], [[0, 1.0, 0], [0, -1.0, 0]]), CenterOfMass([0, 1, 2])]
     masses = np.array([1.0, 2.0, 3.0])

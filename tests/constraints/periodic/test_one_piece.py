@@ -11,7 +11,7 @@ from kcons.constraints.periodic.one_piece import (
     lined_up,
     make_whole,
     minimum_image,
-    neighbour_lists,
+    neighbor_lists,
     spanning_tree,
 )
 from kcons.errors import InputError
@@ -64,9 +64,9 @@ def test_lists_follow_their_first_atom():
     np.testing.assert_array_equal(found[:, 0], wrapped[:, 0])
 
 
-def test_neighbours_ascend():
-    start, neighbours = neighbour_lists(np.array([[4, 1], [0, 3], [1, 0], [2, 1]]), 6)
-    lists = [neighbours[start[a] : start[a + 1]].tolist() for a in range(6)]
+def test_neighbors_ascend():
+    start, neighbors = neighbor_lists(np.array([[4, 1], [0, 3], [1, 0], [2, 1]]), 6)
+    lists = [neighbors[start[a] : start[a + 1]].tolist() for a in range(6)]
     assert lists == [[1, 3], [0, 2, 4], [1], [0], [1], []]
 
 

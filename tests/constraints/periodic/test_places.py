@@ -74,7 +74,7 @@ TIES = {
     "gyration": RadiusOfGyration([[0, 1, 2]]),
     "angle": Angle([[0, 1, 2]]),
     "dihedral": Dihedral([[0, 1, 2, 3]]),
-    "centres": CenterDistance([0, 3], [1, 2], None),
+    "centers": CenterDistance([0, 3], [1, 2], None),
     "distances": Distance([[0, 1], [1, 2], [2, 3]]),
     "angle in a framework": [Distance([[1, 2], [2, 3]]), Angle([[0, 1, 2]])],
 }
@@ -127,7 +127,7 @@ def test_a_molecule_is_the_same_in_the_cell_as_in_open_space(place, tie):
     np.testing.assert_allclose(ends[0].positions, ends[1].positions - moved, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("tie", ["angle", "centres", "distances"])
+@pytest.mark.parametrize("tie", ["angle", "centers", "distances"])
 def test_a_place_of_several_atoms_does_not_hang_on_what_ties_them(tie):
     row = CenterOfMass([[0, 1, 2]], axes=(0,))
     stored = [np.average(STORED[:3, 0], weights=MASSES[:3])]

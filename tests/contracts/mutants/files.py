@@ -78,8 +78,8 @@ MUTANTS = {
     ],
     "topology/angle_rows.py": [
         (
-            "flat = volume < «→-»np.sin(np.radians(FLAT_CENTRE))",
-            "test_angle_rows.py::test_a_flat_centre_has_an_improper_dihedral",
+            "flat = volume < «→-»np.sin(np.radians(FLAT_CENTER))",
+            "test_angle_rows.py::test_a_flat_center_has_an_improper_dihedral",
         ),
         (
             "«-→+»snapshot.topology.masses[others], rank",

@@ -44,7 +44,7 @@ MUTANTS = {
         ("np.all(real > «off→0»)", "test_linear.py::test_what_is_said_is_so"),
         (
             "certain = «closer == 1.0 and →»kept",
-            "test_linear.py::test_neighbours_that_rounding_joins_are_told_as_uncertain",
+            "test_linear.py::test_neighbors_that_rounding_joins_are_told_as_uncertain",
         ),
     ],
     "models/flows/mechanics.py": [

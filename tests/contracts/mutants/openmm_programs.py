@@ -153,7 +153,7 @@ MUTANTS = {
         ),
         (
             "«turns.keep→»(np.tensordot(",
-            "test_conserved_momenta.py::test_a_motion_remover_leaves_turns_about_the_centre_of_mass",
+            "test_conserved_momenta.py::test_a_motion_remover_leaves_turns_about_the_center_of_mass",
         ),
     ],
     "openmm/ensembles/respa_ensemble.py": [

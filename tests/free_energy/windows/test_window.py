@@ -44,7 +44,7 @@ def test_groups_are_turned_and_keep_their_shape():
         assert np.linalg.norm(x[i] - x[j]) == pytest.approx(np.linalg.norm(X[i] - X[j]), rel=2e-3)
 
 
-#: A ring of four, puckered by 16 degrees, with a neighbour on each atom.
+#: A ring of four, puckered by 16 degrees, with a neighbor on each atom.
 CORNERS = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, -0.1], [-1.0, 0.0, 0.1], [0.0, -1.0, -0.1]])
 RING = np.concatenate([CORNERS, 2.0 * CORNERS])
 AROUND = [[0, 1], [1, 2], [2, 3], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]]

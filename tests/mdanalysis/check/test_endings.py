@@ -1,4 +1,4 @@
-"""Every file that can be wrong: what was readable is analysed, and messages name file, item and remedy."""
+"""Every file that can be wrong: what was readable is analyzed, and messages name file, item and remedy."""
 
 import importlib
 import struct
@@ -33,7 +33,7 @@ def cut(path, lost):
 
 
 @pytest.mark.parametrize("ending,lost", [("dcd", 7), ("dcd", 700), ("xtc", 7), ("xtc", 90), ("trr", 700), ("xyz", 700)])
-def test_a_truncated_file_is_analysed_up_to_the_break(tmp_path, x, ending, lost):
+def test_a_truncated_file_is_analyzed_up_to_the_break(tmp_path, x, ending, lost):
     whole = files.write(tmp_path / f"whole.{ending}", files.whole(x))
     assert checked(whole).broken is None
     path = cut(whole, lost)

@@ -50,7 +50,7 @@ def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
     assert moved.units[0].rate_largest is not None and moved.units[0].rate_largest > 0.1
 
 
-def test_a_moving_centre_of_mass_counts(tmp_path):
+def test_a_moving_center_of_mass_counts(tmp_path):
     x = files.water(N, 3)
     rng = np.random.default_rng(1)
     v = rng.normal(size=x.shape) + 3.0

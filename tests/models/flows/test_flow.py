@@ -63,7 +63,7 @@ def test_volume_by_the_variational_equation_is_the_integral_of_the_divergence(gi
     found = phase_volume(flow, [0.7, 0.3], [0.0, 1.0, 3.0])
     assert abs(found.log_volume[1:]).min() > 0.05
     assert found.log_volume == pytest.approx(found.integrated_divergence, abs=1e-9)
-    # The propagator is what neighbouring trajectories do.
+    # The propagator is what neighboring trajectories do.
     h = 1e-5
     ends = [flow.solve((0.0, 3.0), np.array([0.7, 0.3]) + h * e).y[:, -1] for e in (*np.eye(2), *-np.eye(2))]
     differences = np.stack([(ends[0] - ends[2]) / (2 * h), (ends[1] - ends[3]) / (2 * h)], axis=1)
@@ -175,7 +175,7 @@ def test_pendulum_alternates_between_stable_and_unstable():
         assert e.classification.kind is (Kind.CENTER if k % 2 == 0 else Kind.SADDLE)
         wanted = [1.3j, -1.3j] if k % 2 == 0 else [1.3, -1.3]
         assert sorted(e.classification.eigenvalues, key=lambda z: (-z.real, -z.imag)) == pytest.approx(wanted, abs=1e-9)
-        # The linear flow does not decide about a centre.
+        # The linear flow does not decide about a center.
         assert e.classification.hyperbolic == (k % 2 == 1)
 
 

@@ -164,9 +164,9 @@ def test_free_particle_on_a_sphere():
     given = case("A01_sphere_free")
     x0, v0 = (np.array(given["initial"][key])[0] for key in ("positions", "velocities"))
     spec = given["constraints"][0]
-    centre = np.array(spec.get("point", [0.0, 0.0, 0.0]))
+    center = np.array(spec.get("point", [0.0, 0.0, 0.0]))
     flow = ParticleOnSphere(spec["target"])
-    found = flow.great_circle(given["times"], x0 - centre, v0) + centre
+    found = flow.great_circle(given["times"], x0 - center, v0) + center
     assert abs(found - np.array(given["reference"]["positions"])[:, 0]).max() < 1e-10
 
 

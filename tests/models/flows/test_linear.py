@@ -225,7 +225,7 @@ def test_structures_that_rounding_allows():
     assert [b.sizes for b in blocks_of(A, 1e-5)] == [(2,)]
 
 
-def test_neighbours_that_rounding_joins_are_told_as_uncertain():
+def test_neighbors_that_rounding_joins_are_told_as_uncertain():
     # A block of size 4 scatters by 1e-4: an eigenvalue 1e-3 away may belong to it, or not.
     A = in_skew_basis(np.random.default_rng(2), [jordan_block(1.0, 4), [[1.0 + 2**-10]]])
     found = blocks_of(A)

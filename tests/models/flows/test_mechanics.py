@@ -191,7 +191,7 @@ def test_action_is_stationary_on_the_true_path():
     path = Pendulum(omega).exact(t, [0.3, 0.5])[:, 0]
     bump = np.sin(np.pi * t / 0.4)
     S = [action(pendulum, t, path + e * bump) for e in (-0.02, 0.0, 0.02)]
-    # Least: both neighbours are larger, by equal amounts.
+    # Least: both neighbors are larger, by equal amounts.
     assert S[0] > S[1] < S[2]
     assert abs(S[2] - S[0]) < 1e-2 * (S[0] + S[2] - 2 * S[1])
 

@@ -19,7 +19,7 @@ from kcons.topology.guessed_bonds import bonds_without_elements
 
 
 def bond_table(atoms: Atoms) -> list[tuple[int, int]]:
-    """Bonds by ASE's own neighbour list."""
+    """Bonds by ASE's own neighbor list."""
     i, j = neighbor_list("ij", atoms, natural_cutoffs(atoms, mult=1.2))
     return [(int(a), int(b)) for a, b in zip(i, j, strict=True) if a < b]
 
@@ -40,7 +40,7 @@ def test_bonds_by_distances_alone_are_those_by_elements(name: str, unit: float) 
 
 
 def test_bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored() -> None:
-    """With the nearest neighbours as they are stored, 60 cells away, images of the whole cell took 24 GB."""
+    """With the nearest neighbors as they are stored, 60 cells away, images of the whole cell took 24 GB."""
     atoms = molecule("CH3CH2OH")
     every = np.arange(len(atoms))
     cell = np.array([[7.0, 0, 0], [1.0, 6.5, 0], [-0.8, 1.0, 7.5]])

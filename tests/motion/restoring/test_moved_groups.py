@@ -23,13 +23,13 @@ BOND, ANGLE = 0.02, 2.0
 
 
 def bond_table(atoms: Atoms) -> list[tuple[int, int]]:
-    """Bonds by ASE's own neighbour list."""
+    """Bonds by ASE's own neighbor list."""
     i, j = neighbor_list("ij", atoms, natural_cutoffs(atoms, mult=1.2))
     return [(int(a), int(b)) for a, b in zip(i, j, strict=True) if a < b]
 
 
 def torsions(atoms: Atoms) -> list[tuple[int, int, int, int]]:
-    """One torsion for each bond in no ring with neighbours on both sides, none of them straight."""
+    """One torsion for each bond in no ring with neighbors on both sides, none of them straight."""
     bonds = bond_table(atoms)
     near = {a: [y for b in bonds for y in b if a in b and y != a] for a in range(len(atoms))}
     found = []

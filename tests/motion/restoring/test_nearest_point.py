@@ -198,7 +198,7 @@ def test_long_chain_off_by_a_fifth() -> None:
     fulfilled(whole, Motion(whole, x).restore_positions(start))
 
 
-#: Bonds and next neighbours of a chain are held: it bends, and the surface of its rows with it.
+#: Bonds and next neighbors of a chain are held: it bends, and the surface of its rows with it.
 BRACED = np.array([[1.25 * k, 0.45 * (-1) ** k, 0.1 * np.sin(k)] for k in range(9)])
 BRACES = [(k, k + 1) for k in range(8)] + [(k, k + 2) for k in range(7)]
 

@@ -178,7 +178,7 @@ def test_places_of_a_molecule_that_is_stored_in_several_images(platform, tie):
     np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0, atol=1e-7)
 
 
-def in_frame_of_its_centre(ratio):
+def in_frame_of_its_center(ratio):
     """A chain without forces whose masses are 1 and `ratio` in turn; masses, positions, velocities on the rows."""
     rng = np.random.default_rng(0)
     n = 12
@@ -195,9 +195,9 @@ def in_frame_of_its_centre(ratio):
 @pytest.mark.parametrize("every", [1, 500], ids=["looked at each step", "looked at now and then"])
 @pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
 @pytest.mark.parametrize("ratio", [10.0, 1e6])
-def test_the_centre_of_mass_stays(scheme, every, ratio):
+def test_the_center_of_mass_stays(scheme, every, ratio):
     """What rounds positions, and velocities on their way, must not add up in the momenta."""
-    masses, x, v = in_frame_of_its_centre(ratio)
+    masses, x, v = in_frame_of_its_center(ratio)
     system = free(masses)
     part = hold(system, Distance([[k, k + 1] for k in range(len(masses) - 1)]), x)
     integrator = ProjectedIntegrator(0.01, scheme=scheme, parts=[part])
@@ -217,7 +217,7 @@ def test_the_centre_of_mass_stays(scheme, every, ratio):
 @pytest.mark.parametrize("every", [1, 50])
 def test_velocities_are_those_of_the_core(every):
     """To the last digits, also where somebody looks at each step; carried with x they have three digits less."""
-    masses, x, v = in_frame_of_its_centre(10.0)
+    masses, x, v = in_frame_of_its_center(10.0)
     rows = Distance([[k, k + 1] for k in range(len(masses) - 1)])
     system = free(masses)
     part = hold(system, rows, x)

@@ -85,7 +85,7 @@ CORE = {
     "bond": lambda: Distance([0, 3]),
     "angle": lambda: Angle([1, 2, 4]),
     "dihedral": lambda: Dihedral([0, 1, 2, 3]),
-    "centres": lambda: CenterDistance([0, 1], [3, 4, 5]),
+    "centers": lambda: CenterDistance([0, 1], [3, 4, 5]),
     "gyration": lambda: RadiusOfGyration([0, 1, 2, 3, 4], mass_weighted=False),
 }
 

@@ -11,7 +11,7 @@ import pytest
 from collective_cases import (
     angle,
     bond,
-    centres,
+    centers,
     dihedral,
     points,
     with_variable,
@@ -221,7 +221,7 @@ def test_plain_dihedrals_are_periodic(force, period):
         (points("distance(p1, p2)", (3, 9)), Distance),
         (points("angle(p1,p2,p3)", (3, 9, 12)), Angle),
         (points("dihedral(p1,p2,p3,p4)", (6, 8, 14, 16)), Dihedral),
-        (centres([0, 1, 2], [14, 15, 16]), CenterDistance),
+        (centers([0, 1, 2], [14, 15, 16]), CenterDistance),
         (with_variable("q", q=dihedral(4, 6, 8, 14)), Dihedral),
     ],
 )
@@ -248,7 +248,7 @@ def _two_terms():
         bond(4, 14, "r^2"),
         torsion("cos(theta)"),
         points("distance(p1,p2)-distance(p2,p3)", (3, 9, 12)),
-        centres([0, 1, 2], [14, 15], (1.0, 2.0, 1.0)),
+        centers([0, 1, 2], [14, 15], (1.0, 2.0, 1.0)),
         with_variable("sqrt(q)", q=bond(4, 14)),
         openmm.HarmonicBondForce(),
         _two_terms(),

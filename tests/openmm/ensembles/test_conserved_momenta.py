@@ -183,7 +183,7 @@ def test_a_motion_remover_takes_momentum_beside_particles_without_mass(make, tie
     del context
 
 
-def test_a_motion_remover_leaves_turns_about_the_centre_of_mass():
+def test_a_motion_remover_leaves_turns_about_the_center_of_mass():
     """A round trap elsewhere leaves one, about the line between both; a trap with an axis elsewhere none."""
     system, x = tied([20.0] * 4, CALM, PLACES)
     system.addForce(openmm.CMMotionRemover())

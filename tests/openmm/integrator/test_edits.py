@@ -10,7 +10,7 @@ import pytest
 from openmm import app
 from openmm_systems import potential_energy, started, state_of, water_box
 from tied_cluster import (
-    CENTRE,
+    CENTER,
     RADIUS,
     X,
     bond,
@@ -103,7 +103,7 @@ def test_a_state_of_other_forces_does_not_bring_them(make):
 
 def length_of(make, context):
     x = state_of(context)[0]
-    return np.linalg.norm(x[0] - CENTRE) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
+    return np.linalg.norm(x[0] - CENTER) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
 
 
 @pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
@@ -148,7 +148,7 @@ def _chain():
 
 
 @pytest.mark.parametrize("how", ["collective", "carried"])
-def test_the_minimiser_of_openmm_does_not_know_rows(how):
+def test_the_minimizer_of_openmm_does_not_know_rows(how):
     topology, chain, x = _chain()
     part = CollectiveRows(chain, [bond(0, 9)], positions=x) if how == "collective" else None
     part = part or hold(chain, [Distance([[0, 9]])], x)
@@ -158,7 +158,7 @@ def test_the_minimiser_of_openmm_does_not_know_rows(how):
     made.step(1)
     before = potential_energy(made.context)
     made.minimizeEnergy(maxIterations=200)
-    with pytest.raises(InputError, match=r"OpenMM.s minimiser is one: take integrator\.minimizeEnergy"):
+    with pytest.raises(InputError, match=r"OpenMM.s minimizer is one: take integrator\.minimizeEnergy"):
         made.step(1)
     made.context.setPositions(x)
     integrator.minimizeEnergy(maxIterations=200)
@@ -215,7 +215,7 @@ def _held(how):
     elif how == "collective":
         CollectiveRows(system, [bond()], positions=X)
     elif how == "compiled surface":
-        surface_parts(Sphere([0], CENTRE, RADIUS), system=system, compiled=True)
+        surface_parts(Sphere([0], CENTER, RADIUS), system=system, compiled=True)
     else:
         surface_parts(ExpressionSurface([0], f"x^2+y^2+z^2-{X[0] @ X[0]}"), system=system)
     return system

@@ -1,4 +1,4 @@
-"""Minimisation with constraints kept."""
+"""Minimization with constraints kept."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from kcons.openmm import ProjectedIntegrator
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 
 
-# -- minimisation -----------------------------------------------------------------------------------
+# -- minimization -----------------------------------------------------------------------------------
 
 
 @platforms
-def test_minimiser_of_openmm_keeps_the_constraints(platform):
+def test_minimizer_of_openmm_keeps_the_constraints(platform):
     system, _, _ = alanine()
     pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
     made = app.Simulation(
@@ -44,7 +44,7 @@ def test_minimiser_of_openmm_keeps_the_constraints(platform):
 
 
 @pytest.mark.parametrize("evaluates", [False, True])
-def test_minimiser_keeps_parts(evaluates):
+def test_minimizer_keeps_parts(evaluates):
     """The lowest energy on the constraints: forces along them vanish, and it lies above the free minimum."""
     system, x, v = loose_alanine()
     integrator = ProjectedIntegrator(1e-3, parts=[holding(evaluates=evaluates)], tolerance=1e-12)

@@ -67,7 +67,7 @@ def test_units_and_arguments():
         ProjectedIntegrator(0.001, parts=meeting)
 
 
-# -- barostats, thermostats, centre of mass ----------------------------------------------------------
+# -- barostats, thermostats, center of mass ----------------------------------------------------------
 
 
 @platforms
@@ -149,7 +149,7 @@ def test_a_barostat_that_scales_atoms_is_refused_beside_constraints():
     del context
 
 
-def test_centre_of_mass_motion():
+def test_center_of_mass_motion():
     system, x, v = alanine()
     without = copy.deepcopy(system)
     kinds = [type(f) for f in without.getForces()]

@@ -177,7 +177,7 @@ def test_change_of_the_box(kind):
     assert_same(context, fresh, 1e-7, 1e-4)  # SETTLE has lengths in single precision
 
 
-def test_barostat_and_centre_of_mass():
+def test_barostat_and_center_of_mass():
     system, x = water_box(64)
     system.addForce(openmm.MonteCarloBarostat(1.0, 300.0, 2))
     system.addForce(openmm.CMMotionRemover(1))

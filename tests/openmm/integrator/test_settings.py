@@ -12,7 +12,7 @@ import pytest
 from openmm import app, unit
 from openmm_systems import holding, loose_alanine, potential_energy, started, state_of
 from tied_cluster import (
-    CENTRE,
+    CENTER,
     EVERYTHING,
     KINDS,
     MASSES,
@@ -174,7 +174,7 @@ def test_targets_stay(make, way):
     give(made, other, way)
     other.run(1)
     x = state_of(other.context)[0]
-    length = np.linalg.norm(x[0] - CENTRE) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
+    length = np.linalg.norm(x[0] - CENTER) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
     assert abs(length - 0.22) < 1e-12
 
 

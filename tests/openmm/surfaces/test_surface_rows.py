@@ -230,7 +230,7 @@ def barostat(system):
     system.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
 
 
-def centre_remover(system):
+def center_remover(system):
     system.addForce(openmm.CMMotionRemover())
 
 
@@ -243,7 +243,7 @@ def massless(system):
     [
         (bonded, r"particle 0 is on a surface and in the System's constraint \(1, 0\)"),
         (barostat, "MonteCarloBarostat"),
-        (centre_remover, "CMMotionRemover"),
+        (center_remover, "CMMotionRemover"),
         (massless, "particle 0 has no mass"),
     ],
 )

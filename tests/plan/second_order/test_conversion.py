@@ -60,7 +60,7 @@ def test_flat_groups_become_linear_rows_of_full_rank(case: str) -> None:
 def test_planar_groups_held_by_bonds_and_angles_are_converted(
     x: Array, bonds: list, angles: list, expected: tuple[int, int], freedom: int
 ) -> None:
-    """Three angles around a planar centre sum to 360 degrees, and less as soon as it leaves the plane."""
+    """Three angles around a planar center sum to 360 degrees, and less as soon as it leaves the plane."""
     x = turned(x)
     held = converted([Distance(bonds), Angle(angles)], x)
     assert counts(held) == expected
@@ -107,7 +107,7 @@ LEFT_ALONE: dict[str, tuple[object, list[Constraint], int]] = {
         ],
         9,
     ),
-    "planar centre by bonds and an improper": (
+    "planar center by bonds and an improper": (
         FORMATE,
         [Distance([(0, 1), (0, 2), (0, 3)]), Dihedral([(1, 0, 2, 3)])],
         4,
@@ -352,13 +352,13 @@ def test_molecules_of_the_g2_set(what: str) -> None:
 
 
 def porphin_like():
-    """Four flat five-rings in a flat ring of bridges: all bonds, and all distances of second neighbours."""
+    """Four flat five-rings in a flat ring of bridges: all bonds, and all distances of second neighbors."""
     x, pairs = [], set()
     for k in range(4):
-        centre = 3.1 * np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2), 0])
+        center = 3.1 * np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2), 0])
         first = len(x)
         for t in np.pi + k * np.pi / 2 + 2 * np.pi * np.arange(5) / 5:
-            x.append(centre + 1.18 * np.array([np.cos(t), np.sin(t), 0]))
+            x.append(center + 1.18 * np.array([np.cos(t), np.sin(t), 0]))
         pairs |= {tuple(sorted((first + i, first + (i + 1) % 5))) for i in range(5)}
     for k in range(4):
         here, there = 5 * k + 4, 5 * ((k + 1) % 4) + 1

@@ -53,8 +53,8 @@ def test_out_of_plane_force_turns_the_ring_as_a_rigid_body() -> None:
     f[2] += 3.0
     a = motion.acceleration(x, np.zeros_like(x), f)
     m = masses[:, None]
-    centre = (m * x).sum(axis=0) / masses.sum()
-    d = x - centre
+    center = (m * x).sum(axis=0) / masses.sum()
+    d = x - center
     inertia = np.sum(
         masses[:, None, None]
         * (np.einsum("ij,ij->i", d, d)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]),

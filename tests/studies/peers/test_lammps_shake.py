@@ -64,6 +64,6 @@ def test_order_two(name):
 def test_refusals():
     chain, water = test_systems.build("chain", 6), test_systems.build("water", 8, forces="ase")
     need("lammps")
-    assert "centre" in METHODS["lammps-shake-1e-8"].refuses(chain)
+    assert "center" in METHODS["lammps-shake-1e-8"].refuses(chain)
     assert METHODS["lammps-rattle-1e-8"].refuses(water) is None
     assert "fixed" in METHODS["lammps-rattle-1e-8"].refuses(test_systems.build("slab"))

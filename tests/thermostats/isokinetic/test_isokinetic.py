@@ -224,9 +224,9 @@ def test_momenta_grow_with_the_potential(order):
 
     def momenta(state):
         boost = math.exp(-case.potential(state.positions) / twice)
-        centre = (m * state.positions).sum(axis=0) / m.sum()
+        center = (m * state.positions).sum(axis=0) / m.sum()
         total = (m * state.velocities).sum(axis=0)
-        turning = np.cross(state.positions - centre, m * state.velocities).sum(axis=0)
+        turning = np.cross(state.positions - center, m * state.velocities).sum(axis=0)
         return np.concatenate([total, turning]) * boost
 
     expected = momenta(start)

@@ -64,8 +64,8 @@ def test_rows_that_join_clusters_make_them_one():
     assert freedom([Distance([[0, 1], [2, 3], [1, 2]])]) == [3, 6, 3]
 
 
-def test_the_motion_about_the_centre_may_be_held_whole():
-    """Without a degree of freedom about it a cluster has the sphere of its centre only."""
+def test_the_motion_about_the_center_may_be_held_whole():
+    """Without a degree of freedom about it a cluster has the sphere of its center only."""
     assert freedom([LinearRelation(0, [1], [1.0], None)]) == [3, 3, 3, 3]
 
 

@@ -38,7 +38,7 @@ def lengths(stepper, held, state):
     """|y|^2 of each sphere."""
     layout = stepper.layout(held, state.positions)
     tables = layout.cluster, layout.spheres, layout.masses, layout.totals
-    middle = kernels.centres(state.velocities, *tables)
+    middle = kernels.centers(state.velocities, *tables)
     n = len(layout.freedom)
     has = kernels.products(state.velocities, state.velocities, middle, middle, n, *tables)
     w = state.thermostat[1 : 1 + n * stepper.auxiliary].reshape(n, -1)

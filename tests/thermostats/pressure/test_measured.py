@@ -59,7 +59,7 @@ def started(shape=TRIANGLE, n=12, **functions):
 
 @pytest.mark.parametrize("shape", [TRIANGLE, METHANE], ids=["triangle", "dependent rows"])
 def test_three_ways_to_one_pressure(shape):
-    """Of rigid molecules all agree at any instant: d/dt of sum m r.v about their centres is zero."""
+    """Of rigid molecules all agree at any instant: d/dt of sum m r.v about their centers is zero."""
     system, state = started(shape)
     state = run(system, state, 0.05, 5, stepper=Langevin(1.0, 1.0, seed=1))
     molecular, atomic, difference = (

@@ -21,7 +21,7 @@ def system_of(rows, x, cell=12.0, pbc=True):
     return CellSystem(Motion(held, x))
 
 
-def test_pieces_move_by_their_centres_and_keep_their_shape():
+def test_pieces_move_by_their_centers_and_keep_their_shape():
     """Wherever their atoms are stored."""
     system, x = gas(METHANE, 8)
     pieces = find_pieces(system, x, ALL)
@@ -32,12 +32,12 @@ def test_pieces_move_by_their_centres_and_keep_their_shape():
     y = x + pieces.moved(x, change, lattice)
     system.set_cell(lattice[0] @ (np.eye(3) + change), y)
     assert system.motion.constraint_set.value(y, 0.0) == pytest.approx(np.zeros(80), abs=1e-13)
-    # Differences of centres scale, up to cell vectors.
+    # Differences of centers scale, up to cell vectors.
     before, after = pieces.whole(x, lattice), pieces.whole(y, lattice_of(system))
-    d = pieces.centres(after) - pieces.centres(before) @ (np.eye(3) + change)
+    d = pieces.centers(after) - pieces.centers(before) @ (np.eye(3) + change)
     assert d == pytest.approx(np.zeros((8, 3)), abs=1e-13)
     m = system.masses.reshape(8, 5, 1)
-    assert pieces.centres(before) == pytest.approx((m * before.reshape(8, 5, 3)).sum(1) / m.sum(1), abs=1e-13)
+    assert pieces.centers(before) == pytest.approx((m * before.reshape(8, 5, 3)).sum(1) / m.sum(1), abs=1e-13)
     assert pieces.mass == pytest.approx(m.sum((1, 2)))
 
 

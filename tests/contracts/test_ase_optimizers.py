@@ -1,4 +1,4 @@
-"""Every optimiser of ASE with the constraint object: right, or a typed error."""
+"""Every optimizer of ASE with the constraint object: right, or a typed error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from kcons.ase import constrain
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError
 
-# -- optimisers -------------------------------------------------------------------------------------
+# -- optimizers -------------------------------------------------------------------------------------
 
 PLAIN = {
     "BFGS", "BFGSLineSearch", "FIRE", "FIRE2", "GPMin", "GoodOldQuasiNewton", "LBFGS", "LBFGSLineSearch", "MDMin",
@@ -40,12 +40,12 @@ OTHER = {"BasinHopping", "BFGSClimbFixInternals", "CellAwareBFGS", "oldBFGS"}
 OPTIMISERS = classes_in(ase.optimize, Dynamics)
 
 
-def test_no_optimiser_is_forgotten():
+def test_no_optimizer_is_forgotten():
     assert set(OPTIMISERS) == PLAIN | PRECONDITIONED | GRADIENTLESS | ABSTRACT | OTHER
 
 
 @pytest.mark.parametrize("name", sorted(PLAIN | PRECONDITIONED))
-def test_optimiser(name):
+def test_optimizer(name):
     atoms, held = ethanol()
     if name == "GPMin":  # slow
         atoms = molecule("H2O")
@@ -101,9 +101,9 @@ def test_cell_relaxation(cls):
     held = constrain(atoms, Distance([[0, 1], [4, 5]], [2.5, 2.5]), project=True)
     options = {"long_output": False} if cls is CellAwareBFGS else {}
     scale = {"exp_cell_factor": 1.0} if cls is CellAwareBFGS else {}
-    optimiser = cls(FrechetCellFilter(atoms, **scale), logfile=None, **options)
+    optimizer = cls(FrechetCellFilter(atoms, **scale), logfile=None, **options)
     run = {"fmax": 0.05, "smax": 0.001} if cls is CellAwareBFGS else {"fmax": 0.05}
-    assert optimiser.run(**run, steps=200)
+    assert optimizer.run(**run, steps=200)
     assert np.abs(atoms.get_forces()).max() <= 0.05
     assert np.abs(atoms.get_stress()).max() <= 0.003
     assert off(atoms, held) <= 1e-12
