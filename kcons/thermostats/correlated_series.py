@@ -208,7 +208,11 @@ def mean(values: ArrayLike) -> Estimate:
 
 
 def autocorrelation_time(values: ArrayLike) -> float:
-    """Statistical inefficiency of a series, in values: so many of them tell as much of the mean as an independent one.
+    """Statistical inefficiency 1 + 2 sum rho(k) of a series, in values: so many of them are one independent sample.
+
+    The sum goes on as long as sums of two neighboring correlations are positive and fall (Geyer's initial monotone
+    sequence, Stat. Sci. 7, 473 (1992)). It is for long runs, where it is known to a few percent. The error of a mean is
+    that of `mean`, which also knows of slow parts that noise hides.
 
     1 for a series that does not change, or whose values swing back.
 
@@ -218,8 +222,16 @@ def autocorrelation_time(values: ArrayLike) -> float:
         Fewer than 32 values; a NaN or infinity.
     """
     series = checked(numbers(values, "values"), "values")
-    error = spread(series).error
-    return max(1.0, error**2 * len(series) / float(series.var(ddof=1))) if error else 1.0
+    n = len(series)
+    off = series - series.mean()
+    power = np.fft.rfft(off, 2 * n)
+    covariance = np.fft.irfft(power * power.conj(), 2 * n)[:n]
+    if not covariance[0] > (_ROUNDING * float(np.abs(series).max())) ** 2 * n:
+        return 1.0
+    pairs = (covariance / covariance[0])[: n - n % 2].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(pairs <= 0)
+    falling = np.minimum.accumulate(pairs[: ends[0] if len(ends) else len(pairs)])
+    return max(1.0, float(2 * falling.sum() - 1))
 
 
 def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:

@@ -10,7 +10,7 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats import thermal_velocities
+from kcons.thermostats import autocorrelation_time, thermal_velocities
 from kcons.thermostats.pressure import Barostat, CellSystem
 
 Array = NDArray[np.float64]
@@ -69,9 +69,5 @@ def cells_of(system: CellSystem, state: State, barostat: Barostat, trials: int, 
 
 def p_value(values: Array, distribution: stats.rv_continuous) -> float:
     """Of a Kolmogorov-Smirnov test on every so many of correlated values."""
-    off = values - values.mean()
-    power = np.abs(np.fft.rfft(off, 2 * len(off))) ** 2
-    rho = np.fft.irfft(power)[: len(off)] / (off @ off)
-    end = int(np.argmax(rho < 0.0))  # up to where correlations cross zero
-    apart = int(np.ceil(2 * rho[:end].sum() - 1))
+    apart = int(np.ceil(autocorrelation_time(values)))
     return float(stats.kstest(values[::apart], distribution.cdf).pvalue)
