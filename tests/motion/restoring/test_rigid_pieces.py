@@ -11,7 +11,6 @@ def test_pieces_of_a_ring_with_tails() -> None:
     """0-1-2-3 is a ring, 3-4-5 a tail, 6-7 another molecule, 8 alone and not asked for."""
     bonds = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (3, 4), (4, 5), (6, 7)])
     pieces = MoleculeGraph(9, bonds, np.array([0, 6]))
-    assert {frozenset(b) for b in pieces.bridges()} == {frozenset(b) for b in [(3, 4), (4, 5), (6, 7)]}
     for j, k, beyond in [(3, 4, {4, 5}), (4, 3, {0, 1, 2, 3}), (4, 5, {5}), (5, 4, {0, 1, 2, 3, 4}), (7, 6, {6})]:
         found = pieces.beyond(j, k)
         assert found is not None and set(found.tolist()) == beyond
