@@ -44,8 +44,6 @@ from kcons.steppers import (
     BlanesMoan6a,
     Extrapolation,
     Geodesic,
-    ProjectedRungeKutta4,
-    ProjectedVerlet,
     Rattle,
     State,
     Suzuki4,
@@ -165,8 +163,6 @@ STEPPERS = [
     Suzuki4(),
     BlanesMoan6(),
     BlanesMoan6a(),
-    ProjectedVerlet(),
-    ProjectedRungeKutta4(project=True),
     Langevin(0.1, 0.5, 1),
     NoseHooverChain(0.1, 5.0),
     Isokinetic(),
@@ -206,7 +202,7 @@ def test_forces_cannot_move_the_atoms(stepper, chains: bool, far: bool) -> None:
         run(System(motion, careless), start, 0.001, 3, stepper=stepper)
 
 
-@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4(), Geodesic(3), ProjectedVerlet()], ids=repr)
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4(), Geodesic(3)], ids=repr)
 @pytest.mark.parametrize("which", [0, 1])
 def test_forces_cannot_change_velocities(stepper, which: int, motion: Motion) -> None:
     def force(x, v, t):
@@ -241,7 +237,7 @@ def test_a_potential_cannot_move_the_atoms(motion: Motion) -> None:
         System(motion, lambda x, t: PULL, potential=potential).total_energy(State(X, 0 * X))
 
 
-@pytest.mark.parametrize("stepper", [Rattle(), BlanesMoan6a(), ProjectedVerlet(), Langevin(0.1, 0.5, 1)], ids=repr)
+@pytest.mark.parametrize("stepper", [Rattle(), BlanesMoan6a(), Langevin(0.1, 0.5, 1)], ids=repr)
 @pytest.mark.parametrize("name", ["positions", "velocities", "forces", "thermostat"])
 def test_observers_cannot_change_states(name: str, stepper, motion: Motion) -> None:
     def tampering(state: State) -> None:
