@@ -490,10 +490,10 @@ def _engine(system: TestSystem) -> OpenMMEngine:
 
 def only_water(system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.callback_rows.hold import take_constraints
+    from kcons.openmm.callback_rows.hold import move_constraints
 
     engine = _engine(system)
-    return not engine.surfaces and not take_constraints(engine.copy())
+    return not engine.surfaces and not move_constraints(engine.copy())
 
 
 def _in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem, dt: float) -> Run:

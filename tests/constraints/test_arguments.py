@@ -26,11 +26,11 @@ from kcons.constraints import (
 )
 from kcons.constraints.arguments import (
     as_array,
+    as_float_array,
     check_call,
     check_pairs,
     finite_number,
     generator_of,
-    numbers,
     positive,
     read_only_view,
     seed_from,
@@ -86,7 +86,7 @@ def motion() -> Motion:
 def test_what_is_no_real_number_is_refused(kind: str) -> None:
     wrong = {"complex": "has complex", "masked": "is a masked", "masked rows": "is a masked"}.get(kind, "is no array")
     with pytest.raises(InputError, match=f"^places {wrong}") as caught:
-        numbers(spoilt(X)[kind], "places")
+        as_float_array(spoilt(X)[kind], "places")
     assert caught.value.item == "places"
     with pytest.raises(InputError):
         as_array(spoilt(X)[kind], (3, 3), "places")
@@ -102,7 +102,7 @@ def test_real_numbers_come_in_as_float64(values) -> None:
 
 
 def test_arrays_that_kernels_can_take_are_not_copied() -> None:
-    assert as_array(X, X.shape, "places") is X and numbers(X, "places") is X
+    assert as_array(X, X.shape, "places") is X and as_float_array(X, "places") is X
 
 
 def test_kernels_never_see_arrays_that_cannot_be_written_to() -> None:
