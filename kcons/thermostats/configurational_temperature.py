@@ -15,7 +15,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers, whole_number
+from kcons.constraints.arguments import as_float_array, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -59,7 +59,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
         Fewer than 10 independent samples; a mean curvature that is 0 within three standard errors, so that the ratio
         has no error: it is given as infinite.
     """
-    above, below = numbers(squares, "squares"), numbers(curvatures, "curvatures")
+    above, below = as_float_array(squares, "squares"), as_float_array(curvatures, "curvatures")
     if above.shape != below.shape:
         raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
     for series, name in ((above, "squares"), (below, "curvatures")):

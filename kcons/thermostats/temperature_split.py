@@ -39,7 +39,7 @@ from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.bodies import UNCHANGED, bodies, row_changes
 from kcons.thermostats.configurational_temperature import temperature
-from kcons.thermostats.correlated_series import FEWEST, Estimate
+from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate
 from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic.step import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -282,9 +282,9 @@ class TemperatureSplit:
         UserWarning
             Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
         """
-        if len(self._series) < FEWEST or self._clusters is None or self._rest is None:
+        if len(self._series) < MIN_SAMPLES or self._clusters is None or self._rest is None:
             raise InputError(
-                f"{len(self._series)} samples are too few for an error; add {FEWEST} or more", item="samples"
+                f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
             )
         names = [None, *self._groups]
         if group not in names:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import check_call, numbers
+from kcons.constraints.arguments import as_float_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 
@@ -101,7 +101,7 @@ class ForceGroups:
 
     def of(self, name: str, x: FloatArray, time: float) -> FloatArray:
         """Forces of one group."""
-        f = numbers(self.groups[name](x, time), f"forces of group {name!r}")
+        f = as_float_array(self.groups[name](x, time), f"forces of group {name!r}")
         self.evaluations[name] += 1
         return f
 
@@ -114,8 +114,8 @@ class Difference:
 
     def __call__(self, x: FloatArray, time: float) -> FloatArray:
         # A function may use its array again, also where both share it.
-        less = np.array(numbers(self.cheap(x, time), "cheap forces"))
-        whole = numbers(self.expensive(x, time), "expensive forces")
+        less = np.array(as_float_array(self.cheap(x, time), "cheap forces"))
+        whole = as_float_array(self.expensive(x, time), "expensive forces")
         if less.shape != whole.shape:
             raise InputError(
                 f"cheap forces have shape {less.shape}, expensive ones {whole.shape}: they are of different systems, "
