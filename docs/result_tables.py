@@ -35,6 +35,15 @@ def frame(rows: Iterable[Any], /, **columns: Callable[[Any], Any]) -> pd.DataFra
     return pd.DataFrame([{name.replace("_", " "): of(row) for name, of in columns.items()} for row in rows])
 
 
+def told_once(rows: Iterable[Mapping[str, Any]], key: str = "system") -> list[dict[str, Any]]:
+    """Rows whose `key` is blank where it is that of the row before."""
+    found, before = [], None
+    for row in rows:
+        found.append({**row, key: "" if row[key] == before else row[key]})
+        before = row[key]
+    return found
+
+
 def named(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [{"name": name, **row} for name, row in found.items()]
 
@@ -156,14 +165,14 @@ def error_budget(data: Data) -> Tables:
             tolerances.append({"system": scene["title"], "solver": solver, "is": shown})
     return {
         "steps": frame(
-            steps,
+            told_once(steps),
             system=lambda r: r["system"],
             method=lambda r: r["method"],
             units=lambda r: r["unit"],
             step_and_error=lambda r: r["is"],
         ),
         "tolerances": frame(
-            tolerances,
+            told_once(tolerances),
             system=lambda r: r["system"],
             solver=lambda r: r["solver"],
             tolerance_and_distance=lambda r: r["is"],
@@ -446,7 +455,7 @@ def openmm_compare(data: Data) -> Tables:
             rows.append({"system": part["scene"]["title"], **target})
     return {
         "targets": frame(
-            rows,
+            told_once(rows),
             system=lambda r: r["system"],
             error=lambda r: f"{r['target']:.0e} Å",
             OpenMM=lambda r: fixed(r["own"], 0),
@@ -505,7 +514,7 @@ def openmm_constraints(data: Data) -> Tables:
             moved_over_to_kcons=lambda r: f"{r['moved_s']:.3f} s",
         ),
         "steps": frame(
-            steps,
+            told_once(steps),
             system=lambda r: r["system"],
             integrator=lambda r: r["integrator"],
             ms_a_step=lambda r: fixed(r["ms"]),
@@ -561,7 +570,7 @@ def openmm_platforms(data: Data) -> Tables:
     rows = [{"system": m["title"], **row} for m in data["measurements"] for row in named(m["rows"])]
     return {
         "speed": frame(
-            rows,
+            told_once(rows),
             system=lambda r: r["system"],
             integrator=lambda r: r["name"],
             µs_a_step=lambda r: fixed(1000 * r["ms"], 0) if "ms" in r else "",
@@ -668,8 +677,11 @@ def thermostats(data: Data) -> Tables:
     runs = [part for part in data["parts"].values() if "temperature" in part and "thermal_energy" in part]
     return {
         "configurations": frame(
-            runs,
-            system=lambda r: r.get("fluid", "two atoms in a trap"),
+            told_once(
+                {"system": "two atoms in a trap", **run, **({"system": run["fluid"]} if "fluid" in run else {})}
+                for run in runs
+            ),
+            system=lambda r: r["system"],
             thermostat=lambda r: r["thermostat"] if r["thermostat"] == "Langevin" else f"2K = ({r['thermostat']}) kT",
             degrees_of_freedom=lambda r: r["g"],
             kT_found_over_kT_asked=lambda r: pm(r["temperature"], 4, 1 / r["thermal_energy"]),
