@@ -8,10 +8,11 @@ from operator import is_
 from weakref import ref
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import Rng, finite_number, positive, seed_from
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import (
     ConvergenceError,
     InputError,
@@ -20,10 +21,9 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
-from kcons.steppers import Rattle, State, Stepper, System
+from kcons.steppers import Rattle, ReversibilityCheck, State, Stepper, System
 from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
-from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
 POTENTIAL, ACCEPTED, ENERGY, IRREVERSIBLE, UNSOLVED, NOT_FINITE, CHANGE, SUM, SQUARES, LAST = range(10)
@@ -95,6 +95,53 @@ class Counts:
         change = float(held[CHANGE]) if held[LAST] else math.nan
         square = float(held[SQUARES]) / told if told else math.nan
         return cls(accepted, energy, irreversible, unsolved, not_finite, change, square)
+
+
+class ReversedSteps(ReversibilityCheck):
+    """A check of reversibility that costs projections and no force.
+
+    A step and the step back ask for forces at the same places. Those of the step are remembered for the way back; only
+    where the way back leads elsewhere are forces asked for again. So the whole map is checked, whatever it consists of,
+    and one step at a time, so that chaos does not hide what is wrong and a bad proposal ends early.
+    """
+
+    def __init__(self, system: System, stepper: Stepper, tolerance: float) -> None:
+        super().__init__(stepper, tolerance)
+        self.force_evaluations = stepper.force_evaluations
+        self.system = system
+        force = None if system.force is None else self._force
+        #: The same system, which remembers.
+        self.watched = System(system.motion, force, potential=system.potential, far=system.far)
+        self._known: list[tuple[FloatArray, FloatArray]] = []
+        self._near = 0.0
+        self._back = False
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`, and see that the step back ends at `state`; errors as of `ReversibilityCheck`."""
+        state = replace(state, origin=None)  # forces of the system are those of the watched one
+        self._known = [] if state.forces is None else [(state.positions, state.forces)]
+        self._back = False
+        after = self.stepper.step(self.watched, state, dt)
+        x = state.positions
+        self._near = self.tolerance * extent(x) + 8 * float(np.spacing(np.abs(x).max(initial=0.0)))
+        self._back = True
+        try:
+            self.take_back(self.watched, state, after, dt, lambda: [forces for _, forces in self._known])
+        finally:
+            self._back = False
+        return after
+
+    def _force(self, x: FloatArray, time: float) -> ArrayLike:
+        if self._back:
+            for place, forces in reversed(self._known):
+                if float(np.abs(x - place).max(initial=0.0)) <= self._near:
+                    return forces
+        force = self.system.force
+        assert force is not None
+        forces = self.system.accepted(force(x, time), 0, True)
+        if not self._back:
+            self._known.append((x.copy(), forces))
+        return forces
 
 
 class HamiltonianMonteCarlo(DropsSystemCaches):
@@ -282,7 +329,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         """
         steps = self._found(system, state)[1]
         for _ in range(count):
-            state = steps.step(self.stepper, state, dt)
+            state = steps.step(system, state, dt)
         return state
 
     # -- inner ----------------------------------------------------------------------------------
@@ -325,7 +372,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
             directions = np.zeros((0, 3))
             if self.conserve_momentum:
                 directions = open_directions(system.motion, state.positions, state.time)
-            known = self._known = system, ReversedSteps(system, self.tolerance), directions
+            known = self._known = system, ReversedSteps(system, self.stepper, self.tolerance), directions
         return known
 
 

@@ -11,7 +11,7 @@ from thermostat_systems import quartic, springs, system
 from kcons.errors import InputError, NonFiniteError
 from kcons.steppers import State, System
 from kcons.thermostats import ForceGroups
-from kcons.thermostats.multistep.grouped_forces import GroupedForces
+from kcons.thermostats.multistep.force_groups import GroupedForces
 
 X = np.random.default_rng(0).normal(size=(4, 3))
 NAMES = ("slow", "fast")

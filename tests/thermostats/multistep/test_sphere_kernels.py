@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from thermostat_systems import molecules
 
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.sphere_layout import SphereLayout
+from kcons.thermostats.multistep.spheres import SphereLayout
 
 KT, L = 0.5, 2
 

@@ -8,7 +8,7 @@ from thermostat_systems import METHANE, TEN, molecules, system
 
 from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearRelation, LinearVelocity, Plane, Sphere
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.thermostats.multistep.sphere_layout import SphereLayout, refuse_driven
+from kcons.thermostats.multistep.spheres import SphereLayout, refuse_driven
 
 X = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [3.0, 1.2, 0], [6.0, 0.5, 0.2]])
 MASSES = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
