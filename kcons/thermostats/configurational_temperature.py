@@ -20,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.thermostats.correlated_series import Estimate, checked, few, spread
-from kcons.thermostats.isokinetic.step import constrained_acceleration
+from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Standard errors by which the mean curvature must differ from 0 for a ratio to have an error.

@@ -48,11 +48,10 @@ _GENERATOR = _Generator()
 
 def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
     """This thread's generator of numbers that are a function of a key, the number of a step and its part."""
-    generator = _GENERATOR
-    generator.key[:] = key
-    generator.counter[2:] = number, part
-    generator.bits.state = generator.state
-    return generator.numbers
+    _GENERATOR.key[:] = key
+    _GENERATOR.counter[2:] = number, part
+    _GENERATOR.bits.state = _GENERATOR.state
+    return _GENERATOR.numbers
 
 
 class SeededBath(Interpreted):

@@ -41,7 +41,7 @@ from kcons.thermostats.bodies import UNCHANGED, bodies, row_changes
 from kcons.thermostats.configurational_temperature import temperature
 from kcons.thermostats.correlated_series import FEWEST, Estimate
 from kcons.thermostats.freedom import atom_numbers
-from kcons.thermostats.isokinetic.step import constrained_acceleration
+from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Typical move for a difference, as a share of the distance to the next atom.

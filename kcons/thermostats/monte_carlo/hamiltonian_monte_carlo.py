@@ -79,13 +79,7 @@ class Counts:
 
     @classmethod
     def of(cls, state: State) -> Counts:
-        """Those of a state; all 0 before the first proposal.
-
-        Raises
-        ------
-        InputError
-            The state carries variables of another thermostat.
-        """
+        """Those of a state; all 0 before the first proposal."""
         carried(state, SIZE, "HamiltonianMonteCarlo")
         held = np.zeros(SIZE) if state.thermostat is None else state.thermostat
         accepted, energy, irreversible, unsolved, not_finite = (
@@ -241,15 +235,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         return round(self.stepper.force_evaluations * sum(self.steps) / 2)
 
     def check(self, system: System) -> None:
-        """Raise where there is no such density.
-
-        Raises
-        ------
-        InputError
-            Forces without a potential.
-        UnsupportedError
-            Rows that move with time, or hold velocities; forces that depend on velocities; friction.
-        """
+        """Raise where there is no such density: for forces without a potential, rows that move or hold velocities."""
         refuse_dissipation(system, "energy to accept or reject by")
         if system.motion.plan.driven:
             raise UnsupportedError(
@@ -268,13 +254,10 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
 
         Raises
         ------
-        InputError
-            A time step that is not positive; the state carries variables of another thermostat; whatever is wrong with
-            the forces.
         NonFiniteError
             The energy of the state itself is not finite.
         InputError, UnsupportedError
-            As `check`.
+            As `check`; a negative time step; the state carries variables of another thermostat.
         """
         self.check(system)
         still = stays(state, dt)
@@ -300,10 +283,8 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         random = stream(self.seed, state.step + 1, PROPOSAL)
         count, threshold = int(random.integers(self.steps[0], self.steps[1] + 1)), math.log1p(-random.random())
         begin = replace(system.with_forces(state), velocities=self._refreshed(system, state, random))
-        length = count * dt
         end, reason, change, potential = self._judged(system, begin, dt, count, threshold, held[POTENTIAL])
-        held[CHANGE] = change
-        held[LAST] = reason
+        held[CHANGE], held[LAST] = change, reason
         held[reason] += 1
         if reason in (ACCEPTED, ENERGY):
             held[SQUARES] += change * change
@@ -312,21 +293,13 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
             end = replace(begin, velocities=-begin.velocities)
         else:
             held[POTENTIAL] = potential
-        time, left_over = state.later(length)
+        time, left_over = state.later(count * dt)
         number, origin = state.step + 1, (ref(system), end.positions, end.velocities, time)
         self._left = held, end.positions
         return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 
     def trajectory(self, system: System, state: State, dt: float, count: int) -> State:
-        """The end of so many steps from `state`, each of which was taken back.
-
-        Raises
-        ------
-        ReversibilityError
-            One of them could not be.
-        KconsError
-            As the stepper.
-        """
+        """The end of so many steps from `state`, each of which was taken back, or `ReversibilityError`."""
         steps = self._found(system, state)[1]
         for _ in range(count):
             state = steps.step(system, state, dt)
@@ -377,13 +350,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
 
 
 def energy_at(system: System, state: State) -> float:
-    """The potential energy; 0 without forces.
-
-    Raises
-    ------
-    InputError
-        It is not one real number.
-    """
+    """The potential energy, 0 without forces; `InputError` if it is not one real number."""
     if system.potential is None:
         return 0.0
     x = state.positions.view()
@@ -398,13 +365,7 @@ def energy_at(system: System, state: State) -> float:
 
 
 def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
-    """Fewest and most steps of a proposal.
-
-    Raises
-    ------
-    InputError
-        Not whole numbers from 1 on, or in the wrong order.
-    """
+    """Fewest and most steps of a proposal."""
     given = np.asarray(steps)
     both = np.broadcast_to(given, 2) if given.shape in ((), (2,)) else np.zeros(2)
     if given.dtype.kind not in "iu" or not 1 <= both[0] <= both[1]:
@@ -415,13 +376,7 @@ def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def kept_part(keep: float) -> float:
-    """`keep` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number in [0, 1).
-    """
+    """`keep`, in [0, 1), as a float."""
     part = finite_number(keep, "keep")
     if not 0 <= part < 1:
         raise InputError(f"keep is {keep!r}; give a number from 0 (new velocities) to less than 1", item="keep")

@@ -270,26 +270,6 @@ def test_conserved_energy_converges_with_the_order():
         assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
 
 
-def test_compression_rate_is_the_divergence_of_the_flow():
-    """Of two free atoms in a trap: div of (v, f/m - alpha v) over all coordinates is -(g - 1) alpha."""
-    x = np.array([[0.4, 0.2, -0.4], [-0.7, 0.3, 0.4]])
-    m = np.array([1.0, 2.0])[:, None]
-    held = system([], x, m[:, 0], quartic)
-    v = np.array([[0.3, -0.5, 0.2], [0.1, 0.2, -0.7]])
-    f = quartic(x)
-
-    def acceleration(v):
-        return f / m - (v * f).sum() / (m * v * v).sum() * v
-
-    h, trace = 1e-6, 0.0
-    for k in range(6):
-        e = h * np.eye(6)[k].reshape(2, 3)
-        trace += (acceleration(v + e) - acceleration(v - e)).ravel()[k] / (2 * h)
-    thermostat = Isokinetic()
-    assert thermostat.compression_rate(held, State(x, v)) == pytest.approx(trace, rel=1e-7)
-    assert thermostat.friction(held, State(x, v)) == pytest.approx((v * f).sum() / (m * v * v).sum(), rel=1e-14)
-
-
 def constancy(steps: int, every: int) -> float:
     rows, x, masses = water_and_more()
     held = system(rows, x, masses, lambda x, t: 3 * waves(x) - quartic(0.1 * x))

@@ -13,7 +13,7 @@ from kcons.motion import Motion
 from kcons.steppers import State, System
 from kcons.steppers.stages.compiled_operations import PYTHON
 from kcons.thermostats import Isokinetic
-from kcons.thermostats.isokinetic.step import IsokineticStep, programs
+from kcons.thermostats.isokinetic.isokinetic import IsokineticStep, programs
 
 ORDERS = pytest.mark.parametrize("order", [2, 4, 6])
 EVERY = pytest.mark.parametrize("name", ROWS)

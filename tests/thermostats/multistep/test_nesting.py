@@ -52,7 +52,11 @@ def test_every_group_kicks_and_every_drift_flies_for_the_whole_step(order, turns
     assert shares(done, push) == pytest.approx({"slow": 1, "medium": 1, "fast": 1}, rel=1e-14)
     assert shares(done, Fly)[""] == pytest.approx(1, rel=1e-14)
     assert shares(done, Exchange)[""] == pytest.approx(1, rel=1e-14)
-    assert Counter(o.group for o in done if isinstance(o, Evaluate)) == {"slow": 1, "medium": 4, "fast": 12 * (1 if order == 2 else 6)}
+    assert Counter(o.group for o in done if isinstance(o, Evaluate)) == {
+        "slow": 1,
+        "medium": 4,
+        "fast": 12 * (1 if order == 2 else 6),
+    }
     ends = [o.ends[-1] for o in done if isinstance(o, Fly)]
     assert ends[-1] == 1.0 and math.fsum(o.fraction for o in done if isinstance(o, Fly)) == pytest.approx(1)
 
