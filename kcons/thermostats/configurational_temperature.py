@@ -51,7 +51,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
     Raises
     ------
     InputError
-        Fewer than 32 samples, or not as many of one as of the other; a NaN or infinity; curvatures that are all 0.
+        Fewer than 32 samples; curvatures that are all 0.
 
     Warns
     -----
@@ -93,8 +93,6 @@ def configurational_sample(
     ------
     UnsupportedError
         Targets move, or forces depend on the velocities.
-    InputError
-        Fewer than one direction.
     """
     if system.motion.plan.driven or system.velocity_dependent:
         raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
