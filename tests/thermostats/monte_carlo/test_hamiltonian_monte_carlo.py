@@ -278,12 +278,6 @@ def test_a_potential_is_one_number(value):
     assert caught.value.item == "potential"
 
 
-def test_a_step_of_zero_stands_still():
-    held, state = started()
-    after = HamiltonianMonteCarlo(0.5, 3, 1).step(held, state, 0.0)
-    assert np.array_equal(after.positions, state.positions) and after.step == 1
-
-
 def test_it_says_what_it_is():
     assert HamiltonianMonteCarlo(0.5, 10, 7, stepper=BlanesMoan4()).force_evaluations == 60
     empty = Counts.of(State(np.zeros((1, 3)), np.zeros((1, 3))))

@@ -41,21 +41,6 @@ def test_a_difference_does_not_trust_an_array_that_is_used_again():
     np.testing.assert_array_equal(ForceGroups.difference(one, two).of("slow", X, 0.0), 2 * X)
 
 
-@pytest.mark.parametrize(
-    ("groups", "words"),
-    [
-        ({}, "no groups"),
-        ([springs], "no groups"),
-        ({"": springs}, "a group of forces is called ''"),
-        ({"slow": 3}, "group 'slow' is 3"),
-        ({"fast": springs, "slow": springs}, "'fast' and 'slow' overlap"),
-    ],
-)
-def test_groups_that_cannot_be(groups, words):
-    with pytest.raises(InputError, match=words):
-        ForceGroups(groups)
-
-
 def test_a_method_is_one_function_however_often_it_is_looked_up():
     class Field:
         def force(self, x, t):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from thermostat_systems import dumbbells, molecules, quartic, quartic_potential, springs, system, waves
 
-from kcons.constraints import Distance, Plane, Sphere
+from kcons.constraints import Sphere
 from kcons.errors import InputError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
@@ -168,12 +168,6 @@ def test_it_says_once_that_dynamics_are_lost(caplog):
     ]
 
 
-def test_spheres_of_radius_zero():
-    held, state = molecules("bent", 2)
-    with pytest.raises(InputError, match="have the radius 0"):
-        IsokineticSpheres(0.5, 1.0, 3, spheres="axes", auxiliary=0).step(held, state, 0.1)
-
-
 @pytest.mark.parametrize(
     ("atoms", "auxiliary", "other"),
     [
@@ -195,12 +189,3 @@ def test_as_many_variables_of_another_thermostat(atoms, auxiliary, other):
     assert state.thermostat.shape == (1 + atoms * auxiliary,)
     with pytest.raises(InputError, match="variables of another thermostat, not of IsokineticSpheres"):
         spheres.step(held, state, 0.01)
-
-
-def test_a_cluster_on_a_plane():
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 1.0]])
-    held = system([Plane([0], [0, 0, 1.0]), Distance([[0, 1]])], x, [1.0, 2.0, 3.0], quartic)
-    stepper = IsokineticSpheres(0.5, 1.0, 3)
-    end = run(held, held.initial_state(x), 0.05, 30, stepper=stepper)
-    assert np.abs(held.motion.constraint_set.value(end.positions)).max() <= 1e-14
-    assert stepper.layout(held, x).freedom.tolist() == [4, 3]
