@@ -78,10 +78,3 @@ def test_fixed_atoms_stay():
     assert (thermal_velocities(still, x, 1.0, 5) == 0).all()
     with pytest.raises(InputError, match="0 degrees of freedom are left"):
         thermal_velocities(still, x, 1.0, 5, kinetic_energy=1.0)
-
-
-def test_one_molecule_without_room_to_turn():
-    """Total momentum of a single atom is all it has."""
-    held = system([], [[0.0, 0, 0]], [1.0])
-    with pytest.raises(InputError, match="0 degrees of freedom are left"):
-        thermal_velocities(held, np.zeros((1, 3)), 1.0, 0, zero_momentum=True, kinetic_energy=1.0)
