@@ -64,15 +64,9 @@ class Estimate(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Of the mean of a series.
+    """Standard error of the mean of a series, and how many independent values would give the same.
 
-    Attributes
-    ----------
-    error : float
-        Standard error.
-    independent : float
-        As many independent values would give the same error. Where fewer than 10 blocks make up the spread, as of a
-        distribution with heavy tails, at most so many.
+    Where fewer than 10 blocks make up the spread, as of a distribution with heavy tails, at most so many.
     """
 
     error: float
@@ -80,18 +74,11 @@ class Spread(NamedTuple):
 
 
 class _Processes(NamedTuple):
-    """What is tried: p shapes with r ratios each, on k cosines.
+    """What is tried: p shapes with r ratios each, at level 1.
 
-    Attributes
-    ----------
-    axes : numpy.ndarray, shape (p, k, cosines)
-        Along which the cosines are independent.
-    weights : numpy.ndarray, shape (p, r, k)
-        1/S along the axes, at level 1.
-    own : numpy.ndarray, shape (p, r)
-        Variance of the mean or the slope, at level 1.
-    prior : numpy.ndarray, shape (p, r)
-        ln of how likely each is but for the level; -inf where a spectrum would be negative.
+    Axes, shape (p, k, cosines), along which the cosines are independent; weights 1/S along these, shape (p, r, k); the
+    variance of the mean or the slope, shape (p, r); ln of how likely each is but for the level, shape (p, r), -inf
+    where a spectrum would be negative.
     """
 
     axes: FloatArray
@@ -224,12 +211,7 @@ def autocorrelation_time(values: ArrayLike) -> float:
     sequence, Stat. Sci. 7, 473 (1992)). It is for long runs, where it is known to a few percent. The error of a mean is
     that of `mean`, which also knows of slow parts that noise hides.
 
-    1 for a series that does not change, or whose values swing back.
-
-    Raises
-    ------
-    InputError
-        Fewer than 32 values; a NaN or infinity.
+    1 for a series that does not change, or whose values swing back; 32 values or more are needed.
     """
     series = checked(as_float_array(values, "values"), "values")
     n = len(series)
@@ -253,11 +235,6 @@ def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:
         An observable along a run, after equilibration.
     evaluations : float
         Of the forces in question from one value to the next, for example from `ForceGroups.evaluations`.
-
-    Raises
-    ------
-    InputError
-        As for `autocorrelation_time`; evaluations not positive.
     """
     return positive(evaluations, "evaluations") * autocorrelation_time(values)
 
