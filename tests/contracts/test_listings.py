@@ -125,13 +125,6 @@ def test_what_is_reversible_is_the_same_backwards(stepper, system) -> None:
     np.testing.assert_allclose([f for _, f in mirrored], [f for _, f in timed], rtol=0, atol=1e-15)
 
 
-@STEPPERS
-def test_forces_are_evaluated_as_often_as_it_says(stepper) -> None:
-    evaluated = sum(operation.verb == "evaluate" for operation in stepper.operations())
-    there_and_back = 2 if isinstance(stepper, ReversibilityCheck) else 1
-    assert there_and_back * evaluated == stepper.force_evaluations
-
-
 @EVERY
 @STEPPERS
 def test_a_line_for_each_operation(stepper, system) -> None:

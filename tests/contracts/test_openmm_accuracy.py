@@ -17,7 +17,6 @@ from openmm_systems import (
     rows_of,
     started,
     state_of,
-    total_energy,
     water_box,
 )
 
@@ -226,25 +225,6 @@ def test_one_bond_as_the_core_stepper(scheme):
         assert np.abs(state_of(context)[0] - state.positions).max() <= limit
 
 
-def test_energy_is_kept():
-    """Fluctuations fall with the order; there is no drift."""
-    system, x, v = alanine()
-    spread = {}
-    for scheme in ("rattle", "suzuki4", "blanes-moan6"):
-        integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12)
-        context = started(system, integrator, x, v)
-        energies = []
-        for _ in range(100):
-            integrator.step(2)
-            energies.append(total_energy(context))
-        half = len(energies) // 2
-        spread[scheme] = np.std(energies)
-        # Below 1e-8 kJ/mol it is rounding.
-        assert abs(np.mean(energies[:half]) - np.mean(energies[half:])) <= max(spread[scheme], 1e-8)
-    assert spread["suzuki4"] < 0.05 * spread["rattle"]
-    assert spread["blanes-moan6"] < 0.01 * spread["suzuki4"]
-
-
 def test_one_force_evaluation_a_step():
     """Counted by a force that is a Python function."""
     calls = []
@@ -269,12 +249,12 @@ def test_one_force_evaluation_a_step():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
-def test_a_protein_as_verlet_integrator(tolerance):
+def test_a_protein_as_verlet_integrator():
     """Dihydrofolate reductase with 2523 bonds held, 50 steps: the same positions (nm) within the tolerance.
 
     The forces of the CPU platform are single precision, which a much finer tolerance would show.
     """
+    tolerance = 1e-8
     pdb = app.PDBFile(str(DATA / "5dfr_minimized.pdb"))
     system = app.ForceField("amber99sb.xml").createSystem(pdb.topology, constraints=app.AllBonds, rigidWater=False)
     dt = 1e-3

@@ -155,13 +155,6 @@ def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
     return told | {"independent": count / autocorrelation_time(found), "less": less, "p": right, "more": more}
 
 
-@pytest.mark.parametrize(
-    ("ensemble", "barostat"), [("Langevin", "flexible"), ("NoseHoover", "three axes"), ("Isokinetic", "membrane")]
-)
-def test_volumes_beside_barostats_of_shapes(ensemble, barostat):
-    judge_beside(ensemble, barostat, 8000 if barostat == "flexible" else 4000, 3)
-
-
 @pytest.fixture(scope="module")
 def measured():
     """Name -> what was found; written when all are done."""
