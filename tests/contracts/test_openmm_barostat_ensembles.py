@@ -177,7 +177,8 @@ def test_volumes_of_each_beside_each(ensemble, barostat, measured):
     measured[f"{barostat}, {ensemble}"] = found
 
 
-@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("joined", [pytest.param(False, marks=pytest.mark.validation), True])
 def test_carried_rows_within_and_across_molecules(joined):
     """Two molecules with a row between them are one, and N is less by one for each such pair."""
     system, x = gas()

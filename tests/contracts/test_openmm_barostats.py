@@ -63,7 +63,7 @@ def test_volumes_change_and_all_is_held(name, barostat, platform):
 
 
 @pytest.mark.parametrize("platform", [p for p in GPUS if "mixed" in p.id or "none" in p.id])
-@pytest.mark.parametrize("name", ["Langevin", "RattleIntegrator"])
+@pytest.mark.parametrize("name", ["Langevin", pytest.param("RattleIntegrator", marks=pytest.mark.validation)])
 def test_on_gpus(name, platform):
     system, x = pressed("isotropic")
     there = started(system, openmm.VerletIntegrator(1e-3), x, None, "CPU")

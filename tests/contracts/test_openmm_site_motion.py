@@ -267,31 +267,6 @@ def test_programs_that_openmm_runs_by_itself_are_refused():
         ours.attach(context)
 
 
-def test_after_a_failure_the_next_step_is_whole():
-    """A NaN in the middle of a step leaves nothing half done."""
-    system, x, v = prepared("tip4pew")
-    system = copy.deepcopy(system)
-    wall = openmm.CustomExternalForce("1e-12*sqrt(limit-z)")
-    wall.addGlobalParameter("limit", 100.0)
-    wall.addParticle(0)
-    system.addForce(wall)
-    integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x, v)
-    integrator.step(5)
-    integrator.check()
-    before = state_of(context)
-    context.setParameter("limit", -100.0)
-    with pytest.raises(Exception, match=r"NaN|not finite"):
-        integrator.step(3)
-        integrator.check()
-    context.setParameter("limit", 100.0)
-    np.testing.assert_array_equal(state_of(context), before)
-    integrator.step(5)
-    reference = started(system, other := ProjectedIntegrator(1e-3), x, v)
-    other.step(10)
-    np.testing.assert_allclose(state_of(context)[0], state_of(reference)[0], atol=1e-12)
-
-
 def test_temperature_of_a_simulation_does_not_count_sites():
     system, x, v = prepared("tip5p")
     integrator = RattleIntegrator(1e-3)

@@ -21,7 +21,8 @@ from kcons import Motion
 from kcons.errors import ConvergenceError
 
 
-@settings(max_examples=80)
+@pytest.mark.slow
+@settings(max_examples=60)
 @given(seed=st.integers(10_000, 2**32 - 1), periodic=st.sampled_from([True, True, False]))
 def test_molecules_that_nobody_has_seen(seed, periodic):
     """Without a cell as well: what is found in cells alone is due to the cells."""
