@@ -263,26 +263,26 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
     return found
 
 
-def seed_number(seed: Any) -> int:
-    """A seed as an int; `InputError` for no whole number from 0 to 2^64 - 1."""
-    return whole_number(seed, "seed", 0, 2**64 - 1)
+#: What random numbers are drawn from, as in NumPy: a seed, a generator, or the operating system for None.
+Rng: TypeAlias = int | np.random.Generator | None
 
 
-def seed_from(rng: Any, item: str = "rng") -> int:
-    """A seed: a whole number itself, or one drawn from a generator; from the operating system for None."""
-    if isinstance(rng, int | np.integer):
-        return seed_number(rng)
-    return int(generator_of(rng, item).integers(2**63))
+def seed_from(rng: Rng, bits: int = 64) -> int:
+    """A seed: a whole number of so many bits itself, or one drawn from a generator."""
+    if isinstance(rng, int | np.integer) and not 0 <= rng < 2**bits:
+        raise InputError(f"rng is {_value_text(rng)}; give a whole number from 0 to {2**bits - 1}", item="rng")
+    drawn = generator_of(rng)
+    return int(rng if isinstance(rng, int | np.integer) else drawn.integers(2 ** (bits - 1)))
 
 
-def generator_of(rng: Any, item: str = "rng") -> np.random.Generator:
-    """A generator itself, or one made from a seed; `InputError` for what is neither."""
+def generator_of(rng: Rng) -> np.random.Generator:
+    """A generator itself, or one made from a seed."""
     try:
         return np.random.default_rng(rng)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError):
         raise InputError(
-            f"{item} is {rng!r}; give a whole number from 0 on, a numpy.random.Generator, or None", item=item
-        ) from error
+            f"rng is {_value_text(rng)}; give a whole number from 0 on, a numpy.random.Generator, or None", item="rng"
+        ) from None
 
 
 # -- numbers with units -----------------------------------------------------------------------------

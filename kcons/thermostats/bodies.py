@@ -10,7 +10,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
-from kcons.constraints.vectors import extent
+from kcons.constraints.vectors import extent, row_norms
 from kcons.motion.motion import Motion
 
 #: How far each atom is moved to see whether a row changes elsewhere, relative to the size of the system.
@@ -69,7 +69,7 @@ def row_changes(
         x = positions + shake
         with np.errstate(all="ignore"):
             rows = held.jacobian(x, time)
-            lengths = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+            lengths = row_norms(rows)
             yield np.asarray(rows @ fields(x)) / np.where(lengths == 0, 1.0, lengths)[:, None]
 
 

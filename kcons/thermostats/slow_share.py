@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import generator_of, numbers, refuse_other
+from kcons.constraints.arguments import Rng, generator_of, numbers, refuse_other
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
@@ -21,7 +21,7 @@ REACH = 0.03
 
 
 def slow_share(
-    system: System, frames: ArrayLike, group: str = "slow", *, seed: int = 0, displacement: float | None = None
+    system: System, frames: ArrayLike, group: str = "slow", *, rng: Rng = 0, displacement: float | None = None
 ) -> float:
     """Share of the stiffness that one group of forces carries along the constraints, root mean square.
 
@@ -37,7 +37,7 @@ def slow_share(
         Configurations on the constraints: ten of a short run for large systems, more for small ones.
     group : str
         The slow forces.
-    seed : int
+    rng : int, numpy.random.Generator or None
         Of the random moves, one a frame, which costs two evaluations of every group.
     displacement : float, optional
         Typical move of an atom for differences of forces; 0.03 of the distance to the next atom by default, as in a
@@ -64,12 +64,12 @@ def slow_share(
     x = numbers(frames, "frames")
     if x.ndim != 3 or not len(x):
         raise InputError(f"frames have shape {x.shape}; give (n_frames, n_atoms, 3)", item="frames")
-    rng = generator_of(seed, "seed")
+    generator = generator_of(rng)
     slow, whole, flight = 0.0, 0.0, 0.0
     for number, frame in enumerate(x):
         here = configuration(system, frame)
         flight = flight or flight_of(system, here, displacement, REACH)
-        v = thermal_velocities(system, here, 1.0, rng)
+        v = thermal_velocities(system, here, 1.0, generator)
         changes = np.zeros((2, *here.shape))
         for way in (flight, -flight):
             there, _ = system.flown(here, v, way)

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, generator_of, positive, refuse_other, whole_number
+from kcons.constraints.arguments import Rng, as_array, generator_of, positive, refuse_other, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -186,7 +186,7 @@ class TemperatureSplit:
     ----------
     system : System
         Constraints, and forces of any provider; in any consistent units.
-    seed : int
+    rng : int, numpy.random.Generator or None
         Of the random moves.
     displacement : float, optional
         Typical move of an atom for a difference; a thousandth of the distance to the next atom by default. Forces in
@@ -213,7 +213,7 @@ class TemperatureSplit:
         self,
         system: System,
         *,
-        seed: int = 0,
+        rng: Rng = 0,
         displacement: float | None = None,
         directions: int = 1,
         groups: Mapping[str, ArrayLike] | None = None,
@@ -230,7 +230,7 @@ class TemperatureSplit:
         self._system, self._displacement = system, displacement
         self._directions = whole_number(directions, "directions")
         self._groups = {name: atom_numbers(atoms, system.n_atoms) for name, atoms in (groups or {}).items()}
-        self._rng = generator_of(seed, "seed")
+        self._rng = generator_of(rng)
         self._clusters: Clusters | None = None
         #: Clusters with motions besides shifts and turns; known after the first draw.
         self._rest: NDArray[np.bool_] | None = None

@@ -234,7 +234,7 @@ def test_velocity_dependent_forces_are_refused():
 
 def test_variables_of_another_thermostat_are_refused():
     held, x = dumbbells(2)
-    other = Langevin(0.5, 1.0, seed=1).step(held, State(x, thermal_velocities(held, x, 0.5, 1)), 0.01)
+    other = Langevin(0.5, 1.0, rng=1).step(held, State(x, thermal_velocities(held, x, 0.5, 1)), 0.01)
     with pytest.raises(InputError, match="variables of another thermostat, not of Isokinetic"):
         Isokinetic(0.5).step(held, other, 0.01)
     Isokinetic(0.5).step(held, replace(other, thermostat=None), 0.01)

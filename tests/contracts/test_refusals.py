@@ -204,7 +204,7 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("Baumgarte(-1.0)", InputError, "rate"),
     ("Langevin(-1.0, 1.0, 1)", InputError, "thermal_energy"),
     ("Langevin(1.0, -1.0, 1)", InputError, "friction"),
-    ("Langevin(1.0, 1.0, 1.5)", InputError, "seed"),
+    ("Langevin(1.0, 1.0, 1.5)", InputError, "rng"),
     ("Langevin(1.0, 1.0, 1, substeps=0)", InputError, "substeps"),
     ('LangevinRespa(1.0, 1.0, 1, steps={"fast": 0})', InputError, "steps"),
     ("LangevinRespa(1.0, 1.0, 1, order=3)", InputError, "order"),

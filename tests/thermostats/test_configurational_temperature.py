@@ -115,7 +115,7 @@ def trapped(thermostat, steps, dt=0.02):
 TRAPPED = {
     "g - 1": (Isokinetic(1.0), 1.0),
     "g": (Isokinetic(kinetic_energy=3.0), 1.2),
-    "Langevin": (Langevin(1.0, 0.5, seed=1), 1.0),
+    "Langevin": (Langevin(1.0, 0.5, rng=1), 1.0),
     "Nose-Hoover": (NoseHooverChain(1.0, 3.0), 1.0),
 }
 #: Steps with which the standard error is 0.04 or less.
@@ -151,7 +151,7 @@ def test_dumbbells_in_a_trap_by_the_general_estimator():
     for thermostat, expected in (
         (Isokinetic(0.5), 0.5),
         (Isokinetic(kinetic_energy=0.5 * 10 * 0.5), 0.5 * 10 / 9),
-        (Langevin(0.5, 0.5, seed=1), 0.5),
+        (Langevin(0.5, 0.5, rng=1), 0.5),
     ):
         state = run(held, State(x, thermal_velocities(held, x, 0.5, 1)), 0.02, 2000, stepper=thermostat)
         samples = []

@@ -133,9 +133,9 @@ def test_targets_that_move_are_refused_where_they_have_no_place():
             stepper.check(driven)
 
 
-NOISE = {"thermal_energy": 0.5, "friction": 1.0, "seed": 3}
+NOISE = {"thermal_energy": 0.5, "friction": 1.0, "rng": 3}
 CHAIN = {"thermal_energy": 0.5, "period": 1.0}
-SAMPLER = {"thermal_energy": 0.5, "steps": 3, "seed": 1}
+SAMPLER = {"thermal_energy": 0.5, "steps": 3, "rng": 1}
 
 
 @pytest.mark.parametrize(
@@ -148,9 +148,9 @@ SAMPLER = {"thermal_energy": 0.5, "steps": 3, "seed": 1}
         (Langevin, NOISE | {"friction": math.inf}, "friction is inf"),
         (Langevin, NOISE | {"substeps": 0}, "substeps is 0"),
         (Langevin, NOISE | {"substeps": 1.5}, "substeps is 1.5"),
-        (Langevin, NOISE | {"seed": -1}, "seed is -1"),
-        (Langevin, NOISE | {"seed": 2**64}, "from 0 to 18446744073709551615"),
-        (Langevin, NOISE | {"seed": 0.5}, "seed is 0.5"),
+        (Langevin, NOISE | {"rng": -1}, "rng is -1"),
+        (Langevin, NOISE | {"rng": 2**64}, "from 0 to 18446744073709551615"),
+        (Langevin, NOISE | {"rng": 0.5}, "rng is 0.5"),
         (LangevinRespa, NOISE | {"order": 3}, "order is 3; choose 2 or 4"),
         (LangevinRespa, NOISE | {"steps": {"slow": 1, "fast": 0}}, "takes 0 steps"),
         (IsokineticSpheres, NOISE | {"friction": 0.0}, "friction is 0.0; spheres need a bath"),
@@ -182,13 +182,13 @@ def test_bad_parameters(kind, given, words):
 @pytest.mark.parametrize(
     ("stepper", "words"),
     [
-        (LangevinRespa(0.5, 1.0, 3), "LangevinRespa(0.5, 1.0, seed=3)"),
+        (LangevinRespa(0.5, 1.0, 3), "LangevinRespa(0.5, 1.0, rng=3)"),
         (LangevinRespa(0.5, 1.0, 3, steps=TWO, slow_kicks="middle"), "slow_kicks='middle')"),
         (
             IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes", order=4),
-            "IsokineticSpheres(0.5, 1.0, seed=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1, order=4)",
+            "IsokineticSpheres(0.5, 1.0, rng=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1, order=4)",
         ),
-        (HamiltonianMonteCarlo(0.5, (2, 4), 7), "HamiltonianMonteCarlo(0.5, (2, 4), seed=7, stepper=Rattle())"),
+        (HamiltonianMonteCarlo(0.5, (2, 4), 7), "HamiltonianMonteCarlo(0.5, (2, 4), rng=7, stepper=Rattle())"),
         (Isokinetic(0.5, order=4, convention="notes"), "Isokinetic(0.5, order=4, convention='notes')"),
     ],
 )

@@ -85,7 +85,7 @@ def test_curvatures_of_a_fluid():
     chosen = fluid.dumbbells(8)
     forces, kt = chosen.forces, chosen.thermal_energy
     x = forces.metropolis(chosen.positions, kt, 500, 10, 1, chosen.shift, chosen.turn)[1]
-    split = TemperatureSplit(chosen.system(), seed=3)
+    split = TemperatureSplit(chosen.system(), rng=3)
     for _ in range(1000):
         split.add(x)
     forward, bend, torque, twist = forces.split_sample(x)
@@ -205,7 +205,7 @@ def test_against_metropolis(flexible):
     configurations, masses = sampled(KT, 200, np.random.default_rng(5), flexible=flexible)
     k = 3 * np.arange(COPIES)
     pairs = [np.c_[k, k + 1], np.c_[k, k + 2], *([] if flexible else [np.c_[k + 1, k + 2]])]
-    split = TemperatureSplit(system([Distance(np.concatenate(pairs))], configurations[0], masses, waves), seed=1)
+    split = TemperatureSplit(system([Distance(np.concatenate(pairs))], configurations[0], masses, waves), rng=1)
     for x in configurations:
         split.add(x)
     found = split.result()
@@ -243,7 +243,7 @@ def test_along_a_run():
     held, x = dumbbells(40)
     split = TemperatureSplit(held)
     state = held.initial_state(x, thermal_velocities(held, x, KT, 1))
-    stepper = Langevin(KT, 1.0, seed=2)
+    stepper = Langevin(KT, 1.0, rng=2)
     state = run(held, state, 0.1, 200, stepper=stepper)
     run(held, state, 0.1, 1500, stepper=stepper, observers=[lambda s: split.add(s.positions, s.forces)], every=10)
     found = split.result()
@@ -347,7 +347,7 @@ def test_bad_input():
         ({"displacement": 0.0}, "displacement"),
         ({"directions": 0}, "directions"),
         ({"directions": 1.5}, "directions"),
-        ({"seed": "x"}, "seed"),
+        ({"rng": "x"}, "rng"),
         ({"groups": [[0, 1]]}, "groups"),
         ({"groups": {"far": [99]}}, "atoms must be"),
     ):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers, positive
+from kcons.constraints.arguments import FloatArray, IntArray, Rng, generator_of, numbers, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
@@ -80,7 +80,7 @@ class Pulled:
 
 
 def pull_free_energy(
-    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, seed: int = 0
+    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, rng: Rng = 0
 ) -> Pulled:
     """Difference of free energy from the works of pulls.
 
@@ -94,7 +94,7 @@ def pull_free_energy(
         Work done on the system by pulls from end to start, each from equilibrium at the end.
     thermal_energy : float
         kT in the unit of the works.
-    seed : int
+    rng : int, numpy.random.Generator or None
         Of the bootstrap.
 
     Raises
@@ -111,8 +111,8 @@ def pull_free_energy(
         or gain work, as those of the wrong sign do.
     """
     kT = positive(thermal_energy, "thermal_energy")
-    ahead, rng = _works(forward, "forward", kT), generator_of(seed, "seed")
-    drawn = ahead[rng.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
+    ahead, generator = _works(forward, "forward", kT), generator_of(rng)
+    drawn = ahead[generator.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
     one = _one_way(ahead, drawn, kT)
     if backward is None:
         effective = one[-1]
@@ -125,7 +125,7 @@ def pull_free_energy(
             )
         return Pulled(*one, kT * float(ahead.mean()) - one[0].value)
     back = _works(backward, "backward", kT)
-    drawn_back = back[rng.integers(len(back), size=(_SAMPLES, len(back)))]
+    drawn_back = back[generator.integers(len(back), size=(_SAMPLES, len(back)))]
     difference, error = _bar(ahead, back)
     overlap = _overlap(ahead, back, difference)
     if overlap < _OVERLAP:
@@ -181,7 +181,7 @@ def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
 
 
 def work_profile(
-    works: ArrayLike, *, thermal_energy: float, log_weights: ArrayLike | None = None, seed: int = 0
+    works: ArrayLike, *, thermal_energy: float, log_weights: ArrayLike | None = None, rng: Rng = 0
 ) -> tuple[FloatArray, FloatArray]:
     """Free energy along the path of forward pulls, against its start, with bootstrapped errors.
 
@@ -194,7 +194,7 @@ def work_profile(
     thermal_energy : float
     log_weights : array_like, shape (n, m), optional
         ln Z^(-1/2) at each place: then F is -kT ln P of the coordinate. Without, it is that of the held system.
-    seed : int
+    rng : int, numpy.random.Generator or None
 
     Returns
     -------
@@ -211,8 +211,8 @@ def work_profile(
     def along(chosen: IntArray | slice) -> FloatArray:
         return np.asarray(logsumexp(weights[chosen, 0], axis=0) - logsumexp(weights[chosen] - reduced[chosen], axis=0))
 
-    rng, n = generator_of(seed, "seed"), len(reduced)
-    sampled = np.array([along(rng.integers(n, size=n)) for _ in range(_SAMPLES)])
+    generator, n = generator_of(rng), len(reduced)
+    sampled = np.array([along(generator.integers(n, size=n)) for _ in range(_SAMPLES)])
     return thermal_energy * along(slice(None)), thermal_energy * sampled.std(axis=0, ddof=1)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kcons.constraints.arguments import positive, seed_number, whole_number
+from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
@@ -337,7 +337,8 @@ class Windows:
         Sample each window twice, pulled there from below and from above: what the two differ by is hysteresis.
     approach : float or array_like, shape (d,)
         From how far away it is pulled, in angstrom and radian.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        A folder goes on with the same number only.
     executor : Executor, optional
         Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
         processes of this machine.
@@ -363,7 +364,7 @@ class Windows:
         *,
         both_sides: bool = True,
         approach: ArrayLike = 0.1,
-        seed: int = 1,
+        rng: Rng = 1,
         executor: Executor | None = None,
         workers: int | None = None,
         progress: Callable[[int, int, float], None] | None = None,
@@ -371,7 +372,7 @@ class Windows:
         self.sampler, self.executor, self.progress = sampler, executor, progress
         self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         self.settings = settings or Settings()
-        self.both_sides, self.seed = both_sides, seed_number(seed)
+        self.both_sides, self.seed = both_sides, seed_from(rng)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
         self._failed: dict[str, str] = {}

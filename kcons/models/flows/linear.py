@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import root
 from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints.arguments import FloatArray, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, Rng, generator_of, numbers, whole_number
 from kcons.errors import InputError
 from kcons.models.flows.flow import Flow
 
@@ -540,7 +540,7 @@ class Equilibrium(NamedTuple):
 
 
 def find_equilibria(
-    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, seed: int = 0, tolerance: float = 1e-10
+    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, rng: Rng = 0, tolerance: float = 1e-10
 ) -> list[Equilibrium]:
     """Search for equilibria within a box, by Powell's method from many starts.
 
@@ -555,7 +555,7 @@ def find_equilibria(
         Starts: the corners and the middle of the box, the rest spread at random.
     time : float
         V is taken at this time.
-    seed : int
+    rng : int, numpy.random.Generator or None
     tolerance : float
         |V| counts as zero below this part of its size in the box.
     """
@@ -565,7 +565,7 @@ def find_equilibria(
     low, width = edges[:, 0], edges[:, 1] - edges[:, 0]
     corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * n), axis=-1).reshape(-1, n) if n <= 6 else np.zeros((0, n))
     fixed = np.vstack([np.full((1, n), 0.5), corners])
-    spread = np.random.default_rng(seed).random((max(starts - len(fixed), 0), n))
+    spread = generator_of(rng).random((max(starts - len(fixed), 0), n))
     points = low + width * np.vstack([fixed, spread])[:starts]
     found: list[FloatArray] = []
     with np.errstate(all="ignore"):

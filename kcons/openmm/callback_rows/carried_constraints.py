@@ -249,8 +249,7 @@ class CarriedConstraints(Part):
         allowed = np.maximum(near * held.scale, found.allowed)
         reach = np.abs(x[held.touched]).max(initial=0.0)
         if self._slopes is None:
-            gradients = held.jacobian(x, time)
-            self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+            self._slopes = found.norms
         if self._engine.rounded(x):
             allowed += 2.0**-22 * reach * self._slopes
         miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)

@@ -10,7 +10,7 @@ from weakref import ref
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.arguments import finite_number, positive, seed_number
+from kcons.constraints.arguments import Rng, finite_number, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     ConvergenceError,
@@ -119,7 +119,8 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     steps : int or (int, int)
         Time steps of a proposal; with two numbers drawn between them, both included, which keeps trajectories from
         coming back to where they began.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`.
     stepper : Stepper, optional
         A reversible and symplectic one: `Rattle` by default, `Geodesic`, a `Composition`, `BlanesMoan4`, ...
     keep : float
@@ -134,7 +135,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     Raises
     ------
     InputError
-        Temperature not positive, fewer than one step, `keep` not in [0, 1), a seed that is none.
+        Temperature not positive, fewer than one step, `keep` not in [0, 1).
     UnsupportedError
         A stepper that is not reversible and symplectic, such as a thermostat.
 
@@ -156,7 +157,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         self,
         thermal_energy: float,
         steps: int | tuple[int, int],
-        seed: int,
+        rng: Rng,
         *,
         stepper: Stepper | None = None,
         keep: float = 0.0,
@@ -165,7 +166,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     ) -> None:
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
         self.steps = step_range(steps)
-        self.seed = seed_number(seed)
+        self.seed = seed_from(rng)
         self.keep = kept_part(keep)
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
@@ -181,7 +182,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     def __repr__(self) -> str:
         few, most = self.steps
         steps = few if few == most else self.steps
-        return f"HamiltonianMonteCarlo({self.thermal_energy!r}, {steps!r}, seed={self.seed}, stepper={self.stepper!r})"
+        return f"HamiltonianMonteCarlo({self.thermal_energy!r}, {steps!r}, rng={self.seed}, stepper={self.stepper!r})"
 
     @property
     def order(self) -> int:

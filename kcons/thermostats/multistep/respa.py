@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from kcons.constraints.arguments import Rng
 from kcons.constraints.target import FloatArray
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
@@ -31,7 +32,8 @@ class LangevinRespa(Langevin):
         k_B T in the units of energy in use.
     friction : float
         gamma, in inverse units of time; 0 for constant energy.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`.
     steps : mapping of str to int, optional
         Steps of each group of forces in one step, ``{"slow": 1, "medium": 4, "fast": 12}``; each divides the next. The
         System has the forces, as `ForceGroups`. Without it all forces are one group.
@@ -65,7 +67,7 @@ class LangevinRespa(Langevin):
         self,
         thermal_energy: float,
         friction: float,
-        seed: int,
+        rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
         order: int = 2,
@@ -73,7 +75,7 @@ class LangevinRespa(Langevin):
         conserve_momentum: bool = False,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
-        super().__init__(thermal_energy, friction, seed, substeps=substeps, conserve_momentum=conserve_momentum)
+        super().__init__(thermal_energy, friction, rng, substeps=substeps, conserve_momentum=conserve_momentum)
         self.nesting = Nesting(steps, order, self.substeps, slow_kicks)
         self.inner_order = order
         both = self.nesting.in_flights, self.nesting.on_circles
@@ -82,7 +84,7 @@ class LangevinRespa(Langevin):
 
     def __repr__(self) -> str:
         given = "".join(self.nesting.words)
-        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
+        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""

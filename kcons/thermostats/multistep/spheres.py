@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import Rng, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
@@ -49,7 +49,8 @@ class IsokineticSpheres(SeededBath):
         k_B T in the units of energy in use.
     friction : float
         gamma, in inverse units of time, above 0: the rate at which the bath forgets.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`.
     steps : mapping of str to int, optional
         As for `LangevinRespa`.
     spheres : {'split', 'axes', 'cluster', 'global'}
@@ -90,7 +91,7 @@ class IsokineticSpheres(SeededBath):
         self,
         thermal_energy: float,
         friction: float,
-        seed: int,
+        rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
         spheres: Spheres = "split",
@@ -99,7 +100,7 @@ class IsokineticSpheres(SeededBath):
         substeps: int = 3,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
-        super().__init__(thermal_energy, friction, seed, substeps)
+        super().__init__(thermal_energy, friction, rng, substeps)
         if not self.friction > 0:
             raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
         if spheres not in KINDS:
@@ -117,7 +118,7 @@ class IsokineticSpheres(SeededBath):
     def __repr__(self) -> str:
         steps, others = self.nesting.words
         given = f"{steps}, spheres={self.spheres!r}, auxiliary={self.auxiliary}{others}"
-        return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
+        return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
         return self.listed(system)[0]

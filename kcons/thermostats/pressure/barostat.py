@@ -21,7 +21,7 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import check_pairs, finite_number, positive, seed_number, whole_number
+from kcons.constraints.arguments import Rng, check_pairs, finite_number, positive, seed_from, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
@@ -216,8 +216,8 @@ class Barostat:
     kind : {'isotropic', 'semi-isotropic', 'anisotropic', 'flexible', 'lateral', 'normal'}
         How the cell changes: as a whole; x and y together and z for itself (slabs, membranes); x, y and z; all lengths
         and angles, for crystals; x and y only; z only, at constant area.
-    seed : int
-        The same as that of a thermostat does no harm.
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`; the same number as for the thermostat does no harm.
     tension : float
         Surface tension gamma, energy over area, of the face spanned by the first two cell vectors.
     molecules : array_like of int, shape (n, 2), optional
@@ -243,7 +243,7 @@ class Barostat:
         *,
         every: int = 100,
         kind: Kind = "isotropic",
-        seed: int = 0,
+        rng: Rng = 0,
         tension: float = 0.0,
         molecules: ArrayLike | None = None,
         held: Held = "refuse",
@@ -263,7 +263,7 @@ class Barostat:
             raise InputError(f"kind={kind!r} has no surface tension; use 'semi-isotropic' or 'lateral'", item="tension")
         if held not in ("refuse", "stay"):
             raise InputError(f"held is {held!r}; choose 'refuse' or 'stay'", item="held")
-        self.every, self.seed = whole_number(every, "every"), seed_number(seed)
+        self.every, self.seed = whole_number(every, "every"), seed_from(rng)
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")

@@ -187,16 +187,20 @@ MUTANTS = {
     ],
     "thermostats/correlated_series.py": [
         (
-            "        more = «np.expm1(log_r)→0.0 * log_r»",
+            "own = rule @ rule + «np.expm1(_LOG_R)→0.0 * _LOG_R» *",
             "test_correlated_series.py::test_errors_are_as_large_as_they_say[memory-3]",
         ),
         (
-            "«_ALIKE * →»float(blocks @ blocks)",
+            "<= «_SMOOTH * →»squares.sum()",
             "test_correlated_series.py::test_errors_are_as_large_as_they_say[smooth]",
         ),
         (
             "for turn in (0.0,« *_OSCILLATORS→»):",
             "test_correlated_series.py::test_errors_are_as_large_as_they_say[underdamped]",
+        ),
+        (
+            "max(«2 * len(values) // 3→len(values)», _FEWEST_COSINES)",
+            "test_correlated_series.py::test_errors_are_as_large_as_they_say[up-and-down]",
         ),
         ("if «carriers < FEW_INDEPENDENT→False» else", "test_correlated_series.py::test_heavy_tails_are_said"),
     ],

@@ -23,8 +23,8 @@ from kcons.thermostats.pressure import CellRescaling, CellSystem, MonteCarloBaro
         ({"every": 0}, "every"),
         ({"every": 2.5}, "every"),
         ({"every": None}, "every"),
-        ({"seed": -1}, "seed"),
-        ({"seed": None}, "seed"),
+        ({"rng": -1}, "rng"),
+        ({"rng": "x"}, "rng"),
         ({"kind": "cubic"}, "kind"),
         ({"kind": ["normal"]}, "kind"),
         ({"tension": np.nan}, "tension"),
@@ -59,7 +59,7 @@ def test_widths_go_to_an_acceptance_of_one_half_and_trials_are_counted():
 
 def test_a_trial_is_a_function_of_the_state_and_the_seed():
     system, x = gas(n=10)
-    barostat, other = MonteCarloBarostat(0.01, width=0.2), MonteCarloBarostat(0.01, width=0.2, seed=1)
+    barostat, other = MonteCarloBarostat(0.01, width=0.2), MonteCarloBarostat(0.01, width=0.2, rng=1)
     state = started(system, x, barostat)
     cell = system.cell
     once = barostat.move(system, state, 1.0, 1.0)
@@ -125,7 +125,7 @@ def test_angles_of_the_cell_and_atoms_held_in_space():
 
 def test_copies_know_no_pieces_of_systems():
     system, x = gas(n=4)
-    barostat = MonteCarloBarostat(0.01, every=3, seed=5, width=0.2)
+    barostat = MonteCarloBarostat(0.01, every=3, rng=5, width=0.2)
     state = started(system, x, barostat)
     after = barostat.move(system, state, 1.0, 1.0)
     for again in (pickle.loads(pickle.dumps(barostat)), copy.deepcopy(barostat), copy.copy(barostat)):

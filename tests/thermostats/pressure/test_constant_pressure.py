@@ -18,7 +18,7 @@ from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCar
 N, SIDE = 40, 12.0
 PRESSURE = (N + 1) / SIDE**3
 STEPPERS = {
-    "langevin": lambda: Langevin(1.0, 0.5, seed=2),
+    "langevin": lambda: Langevin(1.0, 0.5, rng=2),
     "nose-hoover": lambda: NoseHooverChain(1.0, period=3.0, momentum="free"),
     "isokinetic": lambda: Isokinetic(1.0, momentum="free"),
 }
@@ -64,7 +64,7 @@ def test_a_run_goes_on_bit_for_bit(name, barostat, tmp_path):
 
 def test_march_is_the_same_as_steps():
     system, state = begun()
-    stepper = ConstantPressure(Langevin(1.0, 0.5, seed=2), MonteCarloBarostat(PRESSURE, every=4, width=0.2))
+    stepper = ConstantPressure(Langevin(1.0, 0.5, rng=2), MonteCarloBarostat(PRESSURE, every=4, width=0.2))
     one = state = stepper.start(system, state)
     for _ in range(10):
         one = stepper.step(system, one, 0.05)
@@ -88,7 +88,7 @@ def test_listing():
     assert lines[0].startswith("a step of ConstantPressure(Langevin(")
     assert lines[-1].split()[0] == "press"
     assert "(anisotropic), every 25 steps" in lines[-1]
-    assert lines[1:-1] == Langevin(1.0, 0.5, seed=2).listing().splitlines()[1:]
+    assert lines[1:-1] == Langevin(1.0, 0.5, rng=2).listing().splitlines()[1:]
 
 
 def test_zero_and_negative_steps():
