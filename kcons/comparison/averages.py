@@ -20,7 +20,7 @@ from kcons.comparison.measure import COLUMNS, described, first_line, processor_c
 from kcons.comparison.methods import lines_on_arrays
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import Rng, positive, seed_from
 from kcons.errors import InputError, did_you_mean
 from kcons.steppers import BlanesMoan4, State, Stepper, System
 from kcons.thermostats import (
@@ -76,7 +76,7 @@ class Setting:
     thermal_energy, step, friction : float
     inner : float
         Longest step of the cheap forces.
-    seed : int
+    rng : int, numpy.random.Generator or None
     """
 
     thermal_energy: float
@@ -218,7 +218,7 @@ def compare_averages(
     steps: Sequence[float] | None = None,
     frictions: Sequence[float] | None = None,
     budget: float = 20.0,
-    seed: int = 1,
+    rng: Rng = 1,
     done: pd.DataFrame | None = None,
     keep: Callable[[pd.DataFrame], None] | None = None,
     watcher: Watcher | None = None,
@@ -240,7 +240,7 @@ def compare_averages(
         Internal units; 1 in 12.5 and 1 in 50 steps of the cheap forces by default.
     budget : float
         Seconds of processor time for each sampler over all its runs.
-    seed : int
+    rng : int, numpy.random.Generator or None
     done, keep, watcher
         As for `kcons.comparison.compare`.
 
@@ -261,7 +261,7 @@ def compare_averages(
         raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
     if not system.thermal_energy:
         raise InputError(f"{system.name} has no temperature: compare its trajectories instead", item="criterion")
-    chosen, watching = choose_samplers(methods, cheap is not None), watcher or Watcher()
+    chosen, watching, seed = choose_samplers(methods, cheap is not None), watcher or Watcher(), seed_from(rng)
     if cheap is not None:
         _same_atoms(system, cheap)
     unit, inner = system.units.time_unit, inner_step(system)
@@ -288,7 +288,7 @@ def compare_averages(
     }
 
     def runs(sampler: Sampler) -> list[dict[str, Any]]:
-        options: dict[str, Any] = {"cheap": cheap, "budget": budget / len(planned[sampler.name]), "seed": seed}
+        options: dict[str, Any] = {"cheap": cheap, "budget": budget / len(planned[sampler.name]), "rng": seed}
         found = []
         for step, rate in planned[sampler.name]:
             with watching.piece(f"{sampler.title}, {step / unit:.3g} {system.units.time}", 1):
@@ -324,7 +324,7 @@ def sample(
     cheap: TestSystem | None = None,
     length: float | None = None,
     budget: float | None = None,
-    seed: int = 1,
+    rng: Rng = 1,
     watcher: Watcher | None = None,
 ) -> dict[str, Any]:
     """The row of one sampler at one step.
@@ -340,7 +340,7 @@ def sample(
         Time to sample, besides a tenth of it that is left out at the start.
     budget : float, optional
         Instead: seconds of processor time.
-    seed : int
+    rng : int, numpy.random.Generator or None
     watcher : Watcher, optional
 
     Raises
@@ -364,7 +364,9 @@ def sample(
         "note": "",
         "rounds": 0,
     }
-    run = _Sampling(system, cheap, sampler, Setting(system.thermal_energy, step, friction, inner_step(system), seed))
+    run = _Sampling(
+        system, cheap, sampler, Setting(system.thermal_energy, step, friction, inner_step(system), seed_from(rng))
+    )
     begun, warm = run.clock(), True
     try:
         while True:
@@ -407,7 +409,7 @@ class _Sampling:
         self.every = 1 if flight else max(1, round(INTERVAL * setting.inner / self.step))
         # Looked at with forces of its own, which count for nobody.
         watched = System(system.motion, lambda x, t: system.potential.watched(x)[1])
-        self.split, self.energies = TemperatureSplit(watched, seed=setting.seed), list[float]()
+        self.split, self.energies = TemperatureSplit(watched, rng=setting.seed), list[float]()
         self.clock = processor_clock(system)
         self.steps, self.seconds, self.before = 0, 0.0, (0, 0)
 

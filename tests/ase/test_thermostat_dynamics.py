@@ -380,7 +380,7 @@ def test_noise_is_reproducible():
     moving = made("langevin", atoms, rng=runs[5][0])
     moving.run(10)
     assert np.array_equal(atoms.positions, f)
-    assert f"seed={runs[5][0]}" in moving.todict()["stepper"] and moving.todict()["md-type"] == "ConstrainedLangevin"
+    assert f"rng={runs[5][0]}" in moving.todict()["stepper"] and moving.todict()["md-type"] == "ConstrainedLangevin"
 
 
 # -- changes by others ------------------------------------------------------------------------------

@@ -100,7 +100,7 @@ def test_the_notes_convention_is_found_to_be_hot():
 
 def test_results_can_be_repeated():
     again = sample(chain(), SAMPLERS["langevin"], 5 * UNIT, 0.01 / UNIT, length=40_000 * UNIT)
-    other = sample(chain(), SAMPLERS["langevin"], 5 * UNIT, 0.01 / UNIT, length=40_000 * UNIT, seed=2)
+    other = sample(chain(), SAMPLERS["langevin"], 5 * UNIT, 0.01 / UNIT, length=40_000 * UNIT, rng=2)
     assert again["turn"] == one("langevin")["turn"] != other["turn"]
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from kcons import steppers
+from kcons.comparison.projected_equation import ProjectedEquation
 
 Array = np.ndarray
 EPS = float(np.finfo(float).eps)
@@ -403,7 +404,7 @@ def stepper_of(name: str) -> Any:
     if name.startswith("Geodesic"):
         return steppers.Geodesic(int(name[8:]), great_circles=False)
     if name == "ProjectedVerlet":
-        return steppers.ProjectedVerlet(project=True)
+        return ProjectedEquation(project=True)
     return getattr(steppers, name)()
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from reference import cases
 from reference.cases import Case, Snapshot
-from stepper_systems import EVERY
+from stepper_systems import SYMMETRIC
 
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
@@ -22,7 +22,7 @@ from kcons.motion import Motion
 from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, Rattle, State, Stepper, System, run
 
 EPS = float(np.finfo(float).eps)
-STEPPERS: list[Stepper] = EVERY
+STEPPERS: list[Stepper] = SYMMETRIC
 #: Run by every test run, where they do not take long; all steppers by the long one. The bound on round-off is that of
 #: steppers of order six in every run.
 USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "BlanesMoan4()"}

@@ -250,7 +250,7 @@ PROFILES = [
         (lambda kT=kT: pull_free_energy([1.0] * 5, thermal_energy=kT), "thermal_energy", "positive")
         for kT in (-1.0, "x", "1")
     ),
-    (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, seed="x"), "seed", "seed is 'x'"),
+    (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, rng="x"), "rng", "rng is 'x'"),
     (lambda: work_along([0.0, 1.0], [0.0, 1.0, 2.0]), "force", "do not go"),
     (lambda: work_along([0.0, 1.0], [0.0, np.nan]), "force", "finite"),
     (lambda: work_profile(np.zeros(5), thermal_energy=1.0), "works", "shape"),

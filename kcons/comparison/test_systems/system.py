@@ -11,6 +11,7 @@ from ase import Atoms, units
 
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, PotentialCalculator
+from kcons.constraints.arguments import Rng, generator_of
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -241,7 +242,7 @@ def thermal_velocities(
     motion: Motion,
     positions: FloatArray,
     temperature: float,
-    seed: int,
+    rng: Rng,
     *,
     at_rest: bool = True,
 ) -> FloatArray:
@@ -249,9 +250,9 @@ def thermal_velocities(
 
     Scaled so that the kinetic energy is exactly g k_B T/2.
     """
-    rng = np.random.default_rng(seed)
+    generator = generator_of(rng)
     masses = motion.masses[:, None]
-    v = rng.standard_normal(positions.shape) * np.sqrt(units.kB * temperature / masses)
+    v = generator.standard_normal(positions.shape) * np.sqrt(units.kB * temperature / masses)
     if at_rest:
         v -= np.sum(masses * v, axis=0) / masses.sum()
     v = motion.project_velocities(positions, v)

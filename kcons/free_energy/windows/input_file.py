@@ -170,7 +170,7 @@ class Workers:
 
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
-_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "seed": Single}
+_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "rng": Single}
 #: Tables of a file; [sampling] becomes `Settings`.
 _TABLES: dict[str, Any] = {
     "structure": Structure,
@@ -195,7 +195,7 @@ class InputFile:
     targets : ndarray, shape (n, d)
         In angstrom and radian.
     options : dict
-        Of `Windows`: both_sides, approach, seed.
+        Of `Windows`: both_sides, approach, rng.
     improve : dict or None
         Of `Windows.improve`.
     pulls : dict or None

@@ -10,7 +10,7 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints.arguments import positive, seed_number, whole_number
+from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -29,7 +29,7 @@ from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats import Counts, best_share
+from kcons.thermostats import Counts, best_acceptance
 from kcons.thermostats.freedom import drift_velocity
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     ACCEPTED,
@@ -122,8 +122,9 @@ class HamiltonianMonteCarlo:
         In K if a float.
     steps : int or (int, int)
         Time steps of a proposal; with two numbers drawn between them, both included.
-    seed : int
-        Random numbers are a function of it and of the number of the proposal.
+    rng : int, numpy.random.Generator or None
+        A seed, or what one is drawn from, which `seed` then tells: random numbers are a function of it and of the
+        number of the proposal.
     keep : float
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     conserve_momentum : bool
@@ -151,7 +152,7 @@ class HamiltonianMonteCarlo:
         simulation: app.Simulation | openmm.Context,
         temperature: unit.Quantity | float,
         steps: int | tuple[int, int],
-        seed: int,
+        rng: Rng,
         *,
         keep: float = 0.0,
         conserve_momentum: bool = False,
@@ -162,7 +163,7 @@ class HamiltonianMonteCarlo:
         self.context: openmm.Context = getattr(simulation, "context", simulation)
         self.setTemperature(temperature)
         self.steps = step_range(steps)
-        self.seed = seed_number(seed)
+        self.seed = seed_from(rng)
         self.keep = kept_part(keep)
         self.conserve_momentum = bool(conserve_momentum)
         self.tolerance = positive(tolerance, "tolerance")
@@ -269,7 +270,7 @@ class HamiltonianMonteCarlo:
         assert integrator.scheme is not None
         search = DualAveraging(
             integrator.getStepSize().value_in_unit(unit.picosecond),
-            best_share(integrator.scheme.order) if wanted is None else wanted,
+            best_acceptance(integrator.scheme.order) if wanted is None else wanted,
         )
         check_proposals(proposals)
         begun = integrator.getStepSize()

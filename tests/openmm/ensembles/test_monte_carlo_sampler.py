@@ -297,13 +297,13 @@ def test_bad_input_changes_nothing():
             with_others.addForce(force)
         context = context_of(with_others, integrator)
         context.setPositions(x)
-        return HamiltonianMonteCarlo(context, **{"temperature": 300.0, "steps": 3, "seed": 1} | options)
+        return HamiltonianMonteCarlo(context, **{"temperature": 300.0, "steps": 3, "rng": 1} | options)
 
     for options, words in (
         ({"temperature": 0.0}, "temperature is 0.0"),
         ({"steps": 0}, "steps is 0"),
         ({"keep": 1.0}, "keep is 1.0"),
-        ({"seed": -1}, "seed is -1"),
+        ({"rng": -1}, "rng is -1"),
         ({"tolerance": 0.0}, "tolerance is 0.0"),
     ):
         with pytest.raises(InputError, match=words):
