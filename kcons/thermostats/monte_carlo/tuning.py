@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, positive, whole_number
-from kcons.errors import ConvergenceError, InputError
+from kcons.constraints.arguments import Positive, checked, positive, share, whole_number
+from kcons.errors import ConvergenceError
 from kcons.steppers import State, System
 from kcons.thermostats.freedom import carried
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
@@ -22,6 +24,8 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
 #: Of dual averaging: how strongly proposals move the step, how many count as made already, how fast old ones are
 #: forgotten.
 PULL, BEFORE, FORGET = 0.2, 10, 0.75
+
+Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
 
 
 class DualAveraging:
@@ -40,9 +44,10 @@ class DualAveraging:
         `dt` is not positive, or `wanted` not between 0 and 1.
     """
 
-    def __init__(self, dt: float, wanted: float) -> None:
-        self.wanted = wanted_share(wanted)
-        self._center = self._log = math.log(positive(dt, "dt"))
+    @checked
+    def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
+        self.wanted = wanted
+        self._center = self._log = math.log(dt)
         self._sum = self._mean = 0.0
         self._told: list[float] = []
         self.made = 0
@@ -109,6 +114,7 @@ def best_acceptance(order: int) -> float:
     return order / (order + 1)
 
 
+@checked
 def tune(
     system: System,
     state: State,
@@ -116,7 +122,7 @@ def tune(
     sampler: HamiltonianMonteCarlo,
     *,
     wanted: float | None = None,
-    proposals: int = 80,
+    proposals: Proposals = 80,
 ) -> Tuned:
     """Find the time step for a share of accepted proposals, by proposals with steps that differ.
 
@@ -145,7 +151,6 @@ def tune(
         As `HamiltonianMonteCarlo.step`.
     """
     search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
-    check_proposals(proposals)
     sampler.check(system)
     for _ in range(proposals):
         before = sum_of(state)
@@ -168,22 +173,3 @@ def sum_of(state: State) -> float:
     """
     held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
     return 0.0 if held is None else float(held[SUM])
-
-
-def wanted_share(wanted: float) -> float:
-    """`wanted` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number between 0 and 1.
-    """
-    share = finite_number(wanted, "wanted")
-    if not 0 < share < 1:
-        raise InputError(f"wanted is {wanted!r}; give a share between 0 and 1", item="wanted")
-    return share
-
-
-def check_proposals(proposals: int) -> None:
-    """Raise `InputError` for fewer than 20."""
-    whole_number(proposals, "proposals", 20)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import checked, whole_number
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.splitting import SUZUKI_4
@@ -22,6 +22,7 @@ from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
 SlowKicks = Literal["ends", "middle"]
+InnerOrder = Literal[2, 4]
 
 
 @dataclass(frozen=True)
@@ -75,15 +76,7 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
 
 
 def inner_flight(order: int, substeps: int) -> tuple[float, ...]:
-    """What each drift of the innermost scheme is made of.
-
-    Raises
-    ------
-    InputError
-        An order that there is no scheme of.
-    """
-    if order not in (2, 4):
-        raise InputError(f"order is {order}; choose 2 or 4", item="order")
+    """What each drift of the innermost scheme is made of."""
     return (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
 
 
@@ -93,10 +86,8 @@ def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
     Raises
     ------
     InputError
-        An unknown place; steps of the next group that have no middle.
+        Steps of the next group that have no middle.
     """
-    if slow_kicks not in ("ends", "middle"):
-        raise InputError(f"slow_kicks is {slow_kicks!r}; choose 'ends' or 'middle'", item="slow_kicks")
     if slow_kicks == "ends":
         return False
     if len(levels) == 1:
@@ -184,8 +175,14 @@ class Nesting:
         As `levels_of`, `inner_flight` and `middle_of`.
     """
 
+    @checked
     def __init__(
-        self, steps: Mapping[str, int] | None, order: int, substeps: int, slow_kicks: SlowKicks, turns: bool = False
+        self,
+        steps: Mapping[str, int] | None,
+        order: InnerOrder,
+        substeps: int,
+        slow_kicks: SlowKicks,
+        turns: bool = False,
     ) -> None:
         levels = levels_of(steps)
         flight = inner_flight(order, substeps)

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraints.arguments import Rng, whole_number
+from kcons.constraints.arguments import FromZero, Positive, Rng, checked
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Operation, Project, Turn
@@ -28,8 +27,8 @@ from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
-from kcons.thermostats.multistep.sphere_layout import KINDS, SphereLayout, Spheres, refuse_driven
+from kcons.thermostats.multistep.nesting import InnerOrder, Nesting, SlowKicks
+from kcons.thermostats.multistep.sphere_layout import SphereLayout, Spheres, refuse_driven
 
 logger = logging.getLogger("kcons.thermostats")
 
@@ -87,26 +86,23 @@ class IsokineticSpheres(SeededBath):
     3579 (2013).
     """
 
+    @checked
     def __init__(
         self,
         thermal_energy: float,
-        friction: float,
+        friction: Positive,
         rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
         spheres: Spheres = "split",
-        auxiliary: int = 1,
-        order: int = 2,
+        auxiliary: FromZero = 1,
+        order: InnerOrder = 2,
         substeps: int = 3,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, rng, substeps)
-        if not self.friction > 0:
-            raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
-        if spheres not in KINDS:
-            raise InputError(f"spheres is {spheres!r}; choose one of {', '.join(KINDS)}", item="spheres")
         self.spheres: Spheres = spheres
-        self.auxiliary = whole_number(auxiliary, "auxiliary", 0)
+        self.auxiliary = auxiliary
         self.inner_order = order
         self.nesting = Nesting(steps, order, self.substeps, slow_kicks, turns=True)
         both = self.nesting.in_flights, self.nesting.on_circles

@@ -57,7 +57,7 @@ def test_bad_input():
     held, state = trimer(trap, trap_potential)
     sampler = HamiltonianMonteCarlo(KT, 2, 3)
     for options, words in (
-        ({"wanted": 0.0}, "wanted is 0.0; give a share between 0 and 1"),
+        ({"wanted": 0.0}, "wanted is 0.0; give a positive number"),
         ({"wanted": 1.0}, "wanted is 1.0"),
         ({"proposals": 10}, "proposals is 10"),
     ):
