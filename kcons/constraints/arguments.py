@@ -16,7 +16,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import UnionType
+from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
@@ -466,17 +466,7 @@ Rule: TypeAlias = Callable[[Any, str], Any]
 
 
 class Rules(NamedTuple):
-    """What an annotation says of an argument.
-
-    Attributes
-    ----------
-    kind : Kind
-        The units that Quantities may have; `NUMBER` if not said.
-    optional : bool
-        Whether None is a value, which no rule looks at.
-    rules : tuple of callable (value, item)
-        Each gives what is taken in place of the value.
-    """
+    """What an annotation says of an argument: its units, or `NUMBER`; whether None may pass, unseen; rules."""
 
     kind: Kind
     optional: bool
@@ -490,7 +480,7 @@ def rules_of(function: Callable[..., Any]) -> dict[str, Rules]:
     for name in inspect.signature(function).parameters:
         hint = hints.get(name)
         kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-        given = [kind for kind in kinds if kind is not type(None)]
+        given = [kind for kind in kinds if kind is not NoneType]
         told = next((kind.__metadata__ for kind in given if hasattr(kind, "__metadata__")), ())
         if len(given) == 1 and get_origin(given[0]) is Literal:
             told = (functools.partial(one_of, words=get_args(given[0])),)

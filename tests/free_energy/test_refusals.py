@@ -52,7 +52,7 @@ _SETTINGS = [
 ]
 SETTINGS = [
     *((partial(Settings, **{name: value}), name, f"{name} is") for name, value in _SETTINGS),
-    (lambda: Settings(thermostat="andersen"), "thermostat", "no thermostat 'andersen'"),
+    (lambda: Settings(thermostat="andersen"), "thermostat", "choose 'langevin', 'nose-hoover' or 'isokinetic'"),
     (lambda: Settings(production=300, every=10), "production", r"fewer than 32 samples; .* a smaller `every`"),
 ]
 
