@@ -21,7 +21,6 @@ try:
     from kcons.openmm.collective.coordinates import Row, forces_by_term
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
-    from kcons.openmm.ensembles.molecular_pressure import PressureReporter, molecular_pressure
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
     from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
@@ -50,7 +49,6 @@ __all__ = [
     "NoseHoover",
     "NoseHooverMiddle",
     "Precision",
-    "PressureReporter",
     "ProjectedIntegrator",
     "RattleIntegrator",
     "Row",
@@ -59,7 +57,6 @@ __all__ = [
     "forces_by_term",
     "hold",
     "masses_of",
-    "molecular_pressure",
     "move_constraints",
     "positions_of",
     "surface_parts",

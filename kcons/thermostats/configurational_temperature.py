@@ -20,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.thermostats.correlated_series import Estimate, checked, few, spread
-from kcons.thermostats.isokinetic.step import constrained_acceleration
+from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Standard errors by which the mean curvature must differ from 0 for a ratio to have an error.
@@ -51,7 +51,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
     Raises
     ------
     InputError
-        Fewer than 32 samples, or not as many of one as of the other; a NaN or infinity; curvatures that are all 0.
+        Fewer than 32 samples; curvatures that are all 0.
 
     Warns
     -----
@@ -93,8 +93,6 @@ def configurational_sample(
     ------
     UnsupportedError
         Targets move, or forces depend on the velocities.
-    InputError
-        Fewer than one direction.
     """
     if system.motion.plan.driven or system.velocity_dependent:
         raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")

@@ -44,21 +44,8 @@ ChainOrder = Literal[2, 4, 6]
 KT, LINKS, PARTS, SIZE = range(4)
 
 
-@checked
-def chain_fractions(chain_order: ChainOrder, repeats: Count) -> tuple[float, ...]:
-    """The fractions of its time in which a chain moves on.
-
-    Parameters
-    ----------
-    chain_order : {2, 4, 6}
-    repeats : int
-        How many times in succession, each over its part of the time.
-
-    Raises
-    ------
-    InputError
-        Another order; no repeat.
-    """
+def chain_fractions(chain_order: ChainOrder, repeats: int) -> tuple[float, ...]:
+    """The fractions of its time in which a chain moves on, `repeats` times in succession."""
     return tuple(share / repeats for share in FRACTIONS[chain_order]) * repeats
 
 
@@ -118,7 +105,7 @@ class NoseHooverChain(Interpreted):
         *,
         length: Count = 3,
         chain_order: ChainOrder = 4,
-        repeats: int = 1,
+        repeats: Count = 1,
         stepper: Splitting | None = None,
         momentum: Momentum = "auto",
     ) -> None:

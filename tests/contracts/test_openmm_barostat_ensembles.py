@@ -20,7 +20,7 @@ from scipy import stats
 
 from kcons.comparison import environment
 from kcons.constraints import Distance
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold, molecular_pressure
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold
 from kcons.steppers.files import text
 from kcons.thermostats import autocorrelation_time
 
@@ -107,12 +107,9 @@ PRESSURE = (N + 1) * KT / SIDE**3
 def test_volumes_of_a_rigid_ideal_gas(ensemble, barostat):
     system, x = gas()
     integrator = ProjectedIntegrator(0.002, ensemble=ENSEMBLES[ensemble]())
-    found, context = volumes(system, integrator, x, barostats(PRESSURE * BAR)[barostat])
+    found, _ = volumes(system, integrator, x, barostats(PRESSURE * BAR)[barostat])
     judge(found, N, PRESSURE)
     integrator.check()
-    # By differences, the pressure of an ideal gas is that of its points, at any instant.
-    volume = context.getState().getPeriodicBoxVolume()._value
-    assert molecular_pressure(context, 300) == pytest.approx(N * KT / volume * BAR, rel=1e-6)
 
 
 def test_virtual_sites_move_with_their_molecules():

@@ -4,7 +4,6 @@
 - `langevin_ensemble`: Langevin dynamics
 - `isokinetic_ensemble`: constant kinetic energy
 - `nose_hoover_ensemble`: Nosé-Hoover chains
-- `molecular_pressure`: the pressure of molecules as points
 - `respa_ensemble`: several time steps
 - `monte_carlo_sampler`: Monte Carlo without any error of the time step
 """

@@ -33,19 +33,9 @@ TWICE, INTEGRAL, SQUARE, COUNT, SIZE = range(5)
 
 @njit(cache=True, nogil=True)
 def weights_of(aligned, square, twice, t):  # type: ignore[no-untyped-def]
-    """What of the velocities becomes of the kick over a time t, which may be negative: u' = keep u + push F.
+    """Keep, push and log of the growth of the kick over a time t, which may be negative: u' = keep u + push F.
 
-    Parameters
-    ----------
-    aligned, square, twice : float
-        u.f, f.F and 2K.
-
-    Returns
-    -------
-    keep, push, log_growth : float
-        The last is how much u was scaled.
-    cancels : bool
-        Whether digits were lost, or c^2 is too large a number, so that u' must be found by `turned`.
+    Of u.f, f.F and 2K. Last, whether digits were lost, or c^2 is too large a number, so that `turned` must find u'.
     """
     a = aligned / twice
     c2 = square / twice if square > 0 else 0.0
@@ -71,12 +61,7 @@ def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t:
 
         u(t) = (q e^{-z} + e |u| [(1 + p) - (1 - p) e^{-2z}]/2)/g,    g = [(1 + p) + (1 - p) e^{-2z}]/2.
 
-    Parameters
-    ----------
-    u, pace, masses : ndarray, shape (n_atoms, 3)
-        Velocities, F and masses; masses are 0 for atoms that do not take part.
-    twice, t : float
-        As for `weights_of`.
+    Masses, shape (n_atoms, 3), are 0 for atoms that do not take part.
     """
     inside = np.where(masses > 0, pace, 0.0)
     largest = float(np.abs(inside).max())

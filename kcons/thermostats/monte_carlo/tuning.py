@@ -29,20 +29,7 @@ Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
 
 
 class DualAveraging:
-    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5).
-
-    Parameters
-    ----------
-    dt : float
-        To begin with.
-    wanted : float
-        Between 0 and 1.
-
-    Raises
-    ------
-    InputError
-        `dt` is not positive, or `wanted` not between 0 and 1.
-    """
+    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5)."""
 
     @checked
     def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
@@ -152,24 +139,14 @@ def tune(
     """
     search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
     sampler.check(system)
+    known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
+    held = np.zeros(SIZE) if known is None else known
     for _ in range(proposals):
-        before = sum_of(state)
+        before = held[SUM]
         state = sampler.step(system, state, search.dt)
-        search.learn(sum_of(state) - before)
+        held = np.asarray(state.thermostat)
+        search.learn(float(held[SUM] - before))
     search.refuse_failure(system.shown_time)
-    assert state.thermostat is not None
-    held = np.zeros(SIZE)
-    held[POTENTIAL] = state.thermostat[POTENTIAL]
+    potential, held = held[POTENTIAL], np.zeros(SIZE)
+    held[POTENTIAL] = potential
     return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
-
-
-def sum_of(state: State) -> float:
-    """Probabilities of acceptance of all proposals so far, added up.
-
-    Raises
-    ------
-    InputError
-        The state carries variables of another thermostat.
-    """
-    held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
-    return 0.0 if held is None else float(held[SUM])

@@ -143,14 +143,6 @@ def swaying(x, t, h):
     return -np.sin(2 * np.pi * x @ np.linalg.inv(h))
 
 
-def test_a_second_run_from_one_state_is_the_first_again():
-    system, state = begun(force=swaying, potential=lambda x, t, h: 0.0)
-    first, second = (run(system, state, 0.05, 9, stepper=made("langevin", 3)) for _ in range(2))
-    assert np.array_equal(first.positions, second.positions)
-    assert np.array_equal(first.barostat, second.barostat)
-    assert not np.array_equal(first.cell, SIDE * np.eye(3))
-
-
 @pytest.mark.parametrize("stepper", [*(make() for make in STEPPERS.values()), Rattle(), Suzuki4()], ids=repr)
 def test_other_steppers_go_on_in_the_cell_of_the_state(stepper):
     """Which they keep, wherever the System has been since."""
