@@ -32,7 +32,13 @@ def test_a_notebook_runs_and_a_cell_that_fails_is_told(notebooks, tmp_path):
     (page,) = (page for page in notebooks.pages() if page.stem == "check_trajectory")
     notebook = notebooks.notebook_of(page)
     notebook = notebooks.run(notebook, tmp_path)
-    said = [output.text for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs if "text" in output]
+    said = [
+        output.text
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
+        if "text" in output
+    ]
     assert any("kept to the precision of the file" in text for text in said)
     notebook.cells.append({"cell_type": "code", "source": "assert False", "metadata": {}, "outputs": []})
     from nbclient.exceptions import CellExecutionError
