@@ -26,7 +26,7 @@ def pages() -> list[Path]:
 
 
 def notebook_of(page: Path) -> Any:
-    """A page as a notebook without outputs; of links into the site their words stay, pictures are drawn by the cells."""
+    """A page as a notebook without outputs: links into the site lose their target, pictures are drawn by the cells."""
     text = LINK.sub(lambda match: "" if match[1] else match[2], page.read_text(encoding="utf-8"))
     notebook = jupytext.reads(text, fmt="md")
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
