@@ -144,7 +144,7 @@ MUTANTS = {
             "test_conserved_momenta.py::test_particles_without_mass_leave_turns_about_them",
         ),
         (
-            "«turns.keep_rows(motion, places)→pass»",
+            "«turns.keep_rows(motion, x[atoms], time)→pass»",
             "test_conserved_momenta.py::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
         ),
         (
