@@ -50,16 +50,8 @@ def row_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all rows by motions, relative to their gradients, here and at two places nearby, shape (n_rows, k).
 
-    At a single place they may cancel by symmetry. Fixed atoms stay. Not finite where a surface is not defined.
-
-    Parameters
-    ----------
-    motion : Motion
-    positions : ndarray, shape (n_atoms, 3)
-    fields : callable
-        Gets positions, gives the velocities of k motions as columns, shape (3 n_atoms, k).
-    size : float, optional
-        Of the system.
+    At a single place they may cancel by symmetry. Fixed atoms stay. Not finite where a surface is not defined. `fields`
+    gets positions and gives the velocities of k motions as columns, shape (3 n_atoms, k); `size` is that of the system.
     """
     held, rng = motion.constraint_set, np.random.default_rng(0)
     size = size or extent(positions) or 1.0

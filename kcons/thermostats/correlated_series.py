@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dct
 
-from kcons.constraints.arguments import numbers, positive
+from kcons.constraints.arguments import as_float_array, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Fewest values that `mean` takes an error from, and independent ones below which it is not to be relied on.
-FEWEST, FEW_INDEPENDENT = 32, 10
+MIN_SAMPLES, FEW_INDEPENDENT = 32, 10
 #: Cosines of a long series. Their number is halved while the faster ones have hardly anything of the spread and
 #: `_FEWEST_COSINES` remain: what matters is how the spectrum begins, not how smooth a series is from value to value.
 _COSINES, _FEWEST_COSINES, _SMOOTH = 64, 16, 0.8
@@ -64,15 +64,9 @@ class Estimate(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Of the mean of a series.
+    """Standard error of the mean of a series, and how many independent values would give the same.
 
-    Attributes
-    ----------
-    error : float
-        Standard error.
-    independent : float
-        As many independent values would give the same error. Where fewer than 10 blocks make up the spread, as of a
-        distribution with heavy tails, at most so many.
+    Where fewer than 10 blocks make up the spread, as of a distribution with heavy tails, at most so many.
     """
 
     error: float
@@ -80,18 +74,11 @@ class Spread(NamedTuple):
 
 
 class _Processes(NamedTuple):
-    """What is tried: p shapes with r ratios each, on k cosines.
+    """What is tried: p shapes with r ratios each, at level 1.
 
-    Attributes
-    ----------
-    axes : numpy.ndarray, shape (p, k, cosines)
-        Along which the cosines are independent.
-    weights : numpy.ndarray, shape (p, r, k)
-        1/S along the axes, at level 1.
-    own : numpy.ndarray, shape (p, r)
-        Variance of the mean or the slope, at level 1.
-    prior : numpy.ndarray, shape (p, r)
-        ln of how likely each is but for the level; -inf where a spectrum would be negative.
+    Axes, shape (p, k, cosines), along which the cosines are independent; weights 1/S along these, shape (p, r, k); the
+    variance of the mean or the slope, shape (p, r); ln of how likely each is but for the level, shape (p, r), -inf
+    where a spectrum would be negative.
     """
 
     axes: FloatArray
@@ -173,8 +160,8 @@ def spread(series: FloatArray) -> Spread:
 
 def checked(series: FloatArray, item: str) -> FloatArray:
     """The same series, if an error can be taken from it; `InputError` otherwise."""
-    if series.ndim != 1 or len(series) < FEWEST:
-        raise InputError(f"{series.shape} {item} are too few for an error; give {FEWEST} or more", item=item)
+    if series.ndim != 1 or len(series) < MIN_SAMPLES:
+        raise InputError(f"{series.shape} {item} are too few for an error; give {MIN_SAMPLES} or more", item=item)
     if not np.isfinite(series).all():
         bad = int(np.argmin(np.isfinite(series)))
         raise InputError(f"number {bad} of {item} is not finite; leave it out", item=item)
@@ -209,7 +196,7 @@ def mean(values: ArrayLike) -> Estimate:
     UserWarning
         Fewer than 10 independent values.
     """
-    series = checked(numbers(values, "values"), "values")
+    series = checked(as_float_array(values, "values"), "values")
     found = spread(series)
     doubt = few(len(series), found.independent)
     if doubt:
@@ -224,14 +211,9 @@ def autocorrelation_time(values: ArrayLike) -> float:
     sequence, Stat. Sci. 7, 473 (1992)). It is for long runs, where it is known to a few percent. The error of a mean is
     that of `mean`, which also knows of slow parts that noise hides.
 
-    1 for a series that does not change, or whose values swing back.
-
-    Raises
-    ------
-    InputError
-        Fewer than 32 values; a NaN or infinity.
+    1 for a series that does not change, or whose values swing back; 32 values or more are needed.
     """
-    series = checked(numbers(values, "values"), "values")
+    series = checked(as_float_array(values, "values"), "values")
     n = len(series)
     off = series - series.mean()
     power = np.fft.rfft(off, 2 * n)
@@ -253,11 +235,6 @@ def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:
         An observable along a run, after equilibration.
     evaluations : float
         Of the forces in question from one value to the next, for example from `ForceGroups.evaluations`.
-
-    Raises
-    ------
-    InputError
-        As for `autocorrelation_time`; evaluations not positive.
     """
     return positive(evaluations, "evaluations") * autocorrelation_time(values)
 

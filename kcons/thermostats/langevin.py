@@ -48,11 +48,10 @@ _GENERATOR = _Generator()
 
 def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
     """This thread's generator of numbers that are a function of a key, the number of a step and its part."""
-    generator = _GENERATOR
-    generator.key[:] = key
-    generator.counter[2:] = number, part
-    generator.bits.state = generator.state
-    return generator.numbers
+    _GENERATOR.key[:] = key
+    _GENERATOR.counter[2:] = number, part
+    _GENERATOR.bits.state = _GENERATOR.state
+    return _GENERATOR.numbers
 
 
 class SeededBath(Interpreted):
@@ -71,6 +70,9 @@ class SeededBath(Interpreted):
     """
 
     exchanged: tuple[int, float] | None = None
+    #: The operations of a step, and as the interpreter goes through them; of one whose flights are great circles.
+    _in_flights: tuple[tuple[Operation, ...], Program]
+    _great_circles: tuple[tuple[Operation, ...], Program]
 
     order = 2
     reversible = False
@@ -88,6 +90,13 @@ class SeededBath(Interpreted):
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
         refuse_dissipation(system, "place in this scheme; use friction")
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self.listed(system)[0]
+
+    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
+        """The operations, and as the interpreter goes through them."""
+        return self._in_flights if system is None or system.great_circles is None else self._great_circles
 
     def depends_on(self, system: System, state: State) -> Any:
         return self.thermal_energy, self.friction, self.seed
@@ -159,13 +168,6 @@ class Langevin(SeededBath):
 
     def __repr__(self) -> str:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}, substeps={self.substeps})"
-
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self.listed(system)[0]
-
-    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
-        """The operations, and as the interpreter goes through them."""
-        return self._in_flights if system is None or system.great_circles is None else self._great_circles
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)

@@ -44,19 +44,7 @@ KT, LINKS, PARTS, SIZE = range(4)
 
 
 def chain_fractions(chain_order: int, repeats: int) -> tuple[float, ...]:
-    """The fractions of its time in which a chain moves on.
-
-    Parameters
-    ----------
-    chain_order : {2, 4, 6}
-    repeats : int
-        How many times in succession, each over its part of the time.
-
-    Raises
-    ------
-    InputError
-        Another order; no repeat.
-    """
+    """The fractions of its time in which a chain moves on, `repeats` times in succession."""
     if chain_order not in FRACTIONS:
         raise InputError(f"chain_order is {chain_order!r}; give 2, 4 or 6", item="chain_order")
     count = whole_number(repeats, "repeats")

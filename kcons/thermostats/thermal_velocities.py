@@ -47,7 +47,7 @@ def thermal_velocities(
     Raises
     ------
     InputError
-        Energies that are not positive; nothing can move.
+        Nothing can move.
     UnsupportedError
         `zero_momentum` with rows that hold atoms in space in every direction.
     """

@@ -38,22 +38,6 @@ def test_estimates():
     assert abs(found.off(0.7)) <= 3.5 and found.error == pytest.approx(0.5 / 100, rel=0.4)
 
 
-@pytest.mark.parametrize("values", [np.zeros(31), np.zeros((40, 2)), []])
-def test_too_few_values(values):
-    with pytest.raises(InputError, match="too few for an error"):
-        mean(values)
-
-
-def test_samples_that_do_not_go_together():
-    with pytest.raises(InputError, match="do not go together"):
-        configurational_temperature(np.ones(100), np.ones(99))
-
-
-def test_forces_that_are_the_same_everywhere_tell_no_temperature():
-    with pytest.raises(InputError, match="do not change with the positions"):
-        configurational_temperature(np.ones(100), np.zeros(100))
-
-
 def test_on_a_sphere():
     """U = m g z: |grad U|^2/m = m g^2 (1 - z^2/R^2), and the laplacian is -2 g z/R^2."""
     radius, m, g = 1.3, 2.0, 0.7

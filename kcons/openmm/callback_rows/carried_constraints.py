@@ -230,7 +230,7 @@ class CarriedConstraints(Part):
             if touched & {i, j}:
                 raise UnsupportedError(
                     f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
-                    "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+                    "kcons hold it too: hold(system, ...) moves such constraints, or add move_constraints(system)"
                 )
 
     def attach(self, program: Program, context: openmm.Context) -> None:

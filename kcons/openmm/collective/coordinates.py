@@ -185,7 +185,7 @@ def _variables(force: openmm.CustomCVForce) -> list[openmm.Force]:
     return [force.getCollectiveVariable(k) for k in range(force.getNumCollectiveVariables())]
 
 
-def each_term(force: openmm.Force) -> list[openmm.Force]:
+def forces_by_term(force: openmm.Force) -> list[openmm.Force]:
     """One Force for each variable of a CustomCVForce, or for each term of a Force made of terms.
 
     So a CustomBondForce with three bonds becomes three rows.

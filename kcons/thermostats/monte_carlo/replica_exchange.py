@@ -44,8 +44,7 @@ def exchange(
     Raises
     ------
     InputError
-        Fewer than two states, not as many temperatures; temperatures that are not positive; a state without a potential
-        energy; states of Systems of other masses or constraints.
+        A state without a potential energy; states of Systems of other masses or constraints.
     """
     if not all(isinstance(given, Sequence | np.ndarray) for given in (states, thermal_energies)):
         raise InputError("give a sequence of states, and of as many temperatures", item="states")

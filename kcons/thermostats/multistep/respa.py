@@ -12,8 +12,7 @@ from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate
 from kcons.steppers.program import Row
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
-from kcons.thermostats.multistep.force_groups import group_names
-from kcons.thermostats.multistep.grouped_forces import GroupedForces
+from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
 from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
 
 
@@ -80,7 +79,7 @@ class LangevinRespa(Langevin):
         self.inner_order = order
         both = self.nesting.in_flights, self.nesting.on_circles
         self._in_flights, self._great_circles = (listed_and_made(each, self.nesting.names) for each in both)
-        self.force_evaluations = sum(self.nesting.evaluations.values())
+        self.force_evaluations = self.nesting.evaluations
 
     def __repr__(self) -> str:
         given = "".join(self.nesting.words)

@@ -63,25 +63,17 @@ MODES = 11
 
 
 class Strains:
-    """One of the kinds in which a cell changes.
+    """One of the kinds in which a cell changes, by k generators.
 
     Attributes
     ----------
-    kind : str
-    generators : ndarray, shape (k, 3, 3)
-    diagonals : ndarray, shape (k, 3)
-        Of the generators.
+    generators, diagonals : ndarray, shape (k, 3, 3) and (k, 3)
     traces, sizes : ndarray, shape (k,)
-        Their traces, and sums of squares of their entries.
+        Of the generators, and sums of squares of their entries.
     axes : ndarray of bool, shape (3,)
         Those along which lengths change.
     most : ndarray, shape (k,)
         Largest |e_k| of a trial.
-
-    Raises
-    ------
-    InputError
-        An unknown kind.
     """
 
     def __init__(self, kind: Kind) -> None:
@@ -133,8 +125,6 @@ def _exponential(a: FloatArray) -> FloatArray:
 #: Probability of acceptance that widths are adapted to, and how fast that fades: the mean change of ln(width) in trial
 #: n is n^-FADING.
 WANTED, FADING = 0.5, 0.6
-
-
 #: Standard deviations of the noise of a trial that fit into the largest change of a length, beside its mean of one.
 _WITHIN = 2.0
 
@@ -156,14 +146,7 @@ class Press(Operation):
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where the system is before or after a trial.
-
-    Attributes
-    ----------
-    cell, positions, energy
-    forces, stress : ndarray or None
-        Where the barostat asks for them.
-    """
+    """Where the system is before or after a trial, with forces and stress where the barostat asks for them."""
 
     cell: FloatArray
     positions: FloatArray
@@ -283,13 +266,7 @@ class Barostat:
         return Press(self.every, f"{self.what} ({self.strains.kind})")
 
     def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
-        """What moves as one.
-
-        Raises
-        ------
-        UnsupportedError, InputError
-            As `find_pieces`.
-        """
+        """What moves as one; errors as of `find_pieces`."""
         known = self._pieces.get(system)
         if known is None:
             require_periodic(system, self.strains.axes, self.strains.kind)
@@ -305,13 +282,7 @@ class Barostat:
         return float(zlib.crc32(f"{type(self).__name__} {self.strains.kind}".encode()))
 
     def variables_of(self, state: State) -> FloatArray | None:
-        """Those that a state carries; None where no barostat has begun.
-
-        Raises
-        ------
-        InputError
-            They are those of a barostat of another class or kind.
-        """
+        """Those that a state carries, None where no barostat has begun; `InputError` for those of another one."""
         known = state.barostat
         if known is None or len(known) <= WORK:
             return None
@@ -331,13 +302,7 @@ class Barostat:
         return variables
 
     def acceptance(self, state: State) -> FloatArray:
-        """Mean probability of acceptance of each mode so far; NaN before the first trial.
-
-        Raises
-        ------
-        InputError
-            As `variables_of`.
-        """
+        """Mean probability of acceptance of each mode so far; NaN before the first trial."""
         known = self.variables_of(state)
         if known is None:
             return np.full(len(self.strains), np.nan)
@@ -379,7 +344,8 @@ class Barostat:
             positions, remainder = _added(state.positions, d, state.remainder)
             check_finite(positions, "position", state.step)
             try:
-                self._enter(system, before.cell @ matrix, positions)
+                self._check_width(system, before.cell @ matrix)
+                system.set_cell(before.cell @ matrix, positions)
                 there = replace(state, positions=positions, forces=None, barostat=None)
                 after = self._place(system, system.cell, positions, there)
                 log = self._log_chance(pieces, before, after, trial, thermal_energy)
@@ -398,10 +364,6 @@ class Barostat:
         variables[WORK] += after.energy - before.energy
         moved = replace(state, positions=positions, remainder=remainder, barostat=variables)
         return replace(moved, forces=after.forces, origin=(ref(system), positions, state.velocities, state.time))
-
-    def _enter(self, system: CellSystem, cell: FloatArray, positions: FloatArray) -> None:
-        self._check_width(system, cell)
-        system.set_cell(cell, positions)
 
     def _check_width(self, system: CellSystem, cell: FloatArray) -> None:
         if self.cutoff is not None:
@@ -585,13 +547,7 @@ def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:
 
 
 def require_barostat(given: object) -> Barostat:
-    """What is given, if it is a barostat.
-
-    Raises
-    ------
-    InputError
-        It is not.
-    """
+    """What is given, if it is a barostat; `InputError` otherwise."""
     if isinstance(given, Barostat):
         return given
     raise InputError(f"barostat is {given!r}; give MonteCarloBarostat(pressure) or CellRescaling(...)", item="barostat")

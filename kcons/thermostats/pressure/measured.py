@@ -48,12 +48,7 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
 
 
 def refuse_virial(virial: Virial, thermal_energy: float | None) -> None:
-    """Refuse a virial that is unknown, and kT for the momenta of atoms.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise `InputError` for a virial that is unknown, and for kT with the momenta of atoms."""
     if virial not in get_args(Virial):
         raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
     if virial == "atomic" and thermal_energy is not None:
@@ -95,7 +90,7 @@ def instantaneous_pressure(
     Raises
     ------
     InputError
-        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume; pieces of another system.
+        `thermal_energy` with 'atomic'; a cell without a volume; pieces of another system.
     UnsupportedError
         There is no stress, or a piece is held in space.
     NonFiniteError
@@ -173,11 +168,6 @@ class PressureObserver:
     ----------
     values : list of ndarray, shape (3, 3)
     volumes : list of float
-
-    Raises
-    ------
-    InputError
-        An unknown virial; `thermal_energy` with 'atomic'.
     """
 
     def __init__(

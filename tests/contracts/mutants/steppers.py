@@ -99,10 +99,10 @@ MUTANTS = {
             "test_hamiltonian_monte_carlo.py::test_atoms_at_rest_stay_and_planes_keep_their_momentum",
         ),
     ],
-    "thermostats/monte_carlo/reversed_steps.py": [
+    "steppers/reversibility_check.py": [
         (
             "if not residual <«= self.tolerance→ 1e300»:",
-            "test_reversed_steps.py::test_what_cannot_be_taken_back_is_seen",
+            "test_hamiltonian_monte_carlo.py::test_what_cannot_be_taken_back_is_seen",
         ),
     ],
     "thermostats/monte_carlo/replica_exchange.py": [

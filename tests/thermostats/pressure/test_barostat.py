@@ -17,32 +17,6 @@ from kcons.motion import Motion
 from kcons.thermostats.pressure import CellRescaling, CellSystem, MonteCarloBarostat
 
 
-@pytest.mark.parametrize(
-    ("settings", "match"),
-    [
-        ({"every": 0}, "every"),
-        ({"every": 2.5}, "every"),
-        ({"every": None}, "every"),
-        ({"rng": -1}, "rng"),
-        ({"rng": "x"}, "rng"),
-        ({"kind": "cubic"}, "kind"),
-        ({"kind": ["normal"]}, "kind"),
-        ({"tension": np.nan}, "tension"),
-        ({"tension": 1.0}, "no surface tension"),
-        ({"cutoff": np.inf}, "cutoff"),
-        ({"cutoff": -3.0}, "cutoff"),
-        ({"molecules": [[0, 1], [2]]}, "bonds"),
-        ({"held": "maybe"}, "held"),
-        ({"width": 0.0}, "width"),
-        ({"pressure": [1.0, 1.0, 2.0], "kind": "anisotropic"}, "no distribution belongs to it"),
-        ({"pressure": np.ones(1)}, "give one number"),
-    ],
-)
-def test_bad_settings(settings, match):
-    with pytest.raises(InputError, match=match):
-        MonteCarloBarostat(**{"pressure": 1.0, **settings})
-
-
 def test_widths_go_to_an_acceptance_of_one_half_and_trials_are_counted():
     system, x = gas(n=100)
     barostat = MonteCarloBarostat(101 / 12**3, width=1e-4, kind="semi-isotropic")

@@ -147,18 +147,6 @@ def test_the_mean_stress_along_each_axis_is_the_pressure(kind):
     assert np.ptp(stress) > 1e-3 or kind == "isotropic"
 
 
-def test_bonds_make_pieces():
-    system, state = started()
-    one = find_pieces(system, state.positions, np.ones(3, bool), [[0, 3]])
-    found = instantaneous_pressure(system, state, pieces=one, thermal_energy=1.0)
-    # One piece less, and the first spring within it.
-    d = state.positions[3] - state.positions[0]
-    d -= SIDE * np.round(d / SIDE)
-    rest = instantaneous_pressure(system, state, thermal_energy=1.0)
-    assert np.trace(found) == pytest.approx(np.trace(rest), abs=1.0)
-    assert np.trace(found) != pytest.approx(np.trace(rest), rel=1e-6)
-
-
 def test_what_is_refused():
     system, state = started()
     for wrong, match in ((3, "pieces is 3"), (started(n=3)[0], "pieces is <")):
