@@ -6,8 +6,9 @@ velocities, independently of it.
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -240,6 +241,48 @@ def groups_in(integrator: openmm.Integrator) -> set[int]:
     """The force groups that act on what an integrator moves."""
     groups = integrator.getIntegrationForceGroups()
     return {group for group in range(32) if groups >> group & 1}
+
+
+def forces_alone(
+    system: openmm.System,
+    rows: Sequence[Sequence[openmm.Force]],
+    box: Sequence | None = None,
+    parameters: Mapping[str, float] | None = None,
+) -> openmm.Context:
+    """A Context of copies of some Forces alone, each row of them in the group of its number, in double precision.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Of its particles.
+    rows : sequence of sequences of Force
+    box : sequence of three vectors, optional
+        In place of the System's default.
+    parameters : mapping of str to float, optional
+        Those of a Context.
+
+    Raises
+    ------
+    UnsupportedError
+        A PythonForce whose function cannot be copied.
+    """
+    alone = openmm.System()
+    for k in range(system.getNumParticles()):
+        alone.addParticle(system.getParticleMass(k))
+    alone.setDefaultPeriodicBoxVectors(*(system.getDefaultPeriodicBoxVectors() if box is None else box))
+    for group, forces in enumerate(rows):
+        for force in forces:
+            try:
+                taken = copy.deepcopy(force)
+            except openmm.OpenMMException as error:
+                raise UnsupportedError(f"{force.getName()}: {error} Define the function in a module") from error
+            taken.setForceGroup(group)
+            alone.addForce(taken)
+    context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    for name in context.getParameters():
+        if parameters is not None:
+            context.setParameter(name, parameters[name])
+    return context
 
 
 def forces_of(system: openmm.System) -> Iterable[openmm.Force]:

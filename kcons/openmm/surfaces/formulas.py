@@ -22,8 +22,9 @@ from kcons.errors import InputError, KconsError
 from kcons.openmm.collective.coordinates import free_groups
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import SURFACE_NAME
+from kcons.openmm.integrator.system_checks import SURFACE_NAME, forces_alone
 from kcons.openmm.quantities import number
+from kcons.openmm.states import forces_at
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 
 #: Newton steps at most. The loop ends after steps of less than this (nm): the number of right digits doubles.
@@ -123,19 +124,12 @@ class ExpressionSurface:
             system = openmm.System()
             for _ in self.atoms:
                 system.addParticle(1.0)
-            for group, force in enumerate(self.forces(np.arange(len(self.atoms)))):
-                force.setForceGroup(group)
-                system.addForce(force)
             try:
-                platform = openmm.Platform.getPlatformByName("Reference")
-                self._context = openmm.Context(system, openmm.VerletIntegrator(0.001), platform)
+                self._context = forces_alone(system, [[force] for force in self.forces(np.arange(len(self.atoms)))])
             except openmm.OpenMMException as error:
                 raise InputError(f"OpenMM cannot read {self.expression!r}: {error}", item="expression") from None
         self._context.setPositions(np.ascontiguousarray(r))
-        f1, f2 = (
-            np.array(self._context.getState(forces=True, groups={group}).getForces(asNumpy=True)._value)
-            for group in (0, 1)
-        )
+        f1, f2 = (forces_at(self._context, {group}) for group in (0, 1))
         with np.errstate(all="ignore"):
             return np.einsum("ij,ij->i", f1, f2) / np.einsum("ij,ij->i", f1, f1), -f1
 

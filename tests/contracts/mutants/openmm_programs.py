@@ -81,6 +81,10 @@ MUTANTS = {
         ("if «found != self.settings[_SUM_OF_VECTORS]→False»:", "test_settings.py::test_targets_stay"),
     ],
     "openmm/integrator/system_checks.py": [
+        (
+            "«context.setParameter(name, parameters[name])→pass»",
+            "test_conserved_momenta.py::test_forces_are_looked_at_with_the_parameters_of_the_context",
+        ),
         ("if force.getFrequency() > «→100»0]", "test_system_checks.py::test_two_barostats_are_refused"),
         (
             "apex = i« if of[j] == of[k] else j if of[j] == sides[j][k] else k→»",
@@ -134,10 +138,6 @@ MUTANTS = {
         (
             "if «not removed→True»:  # what a remover takes",
             "test_conserved_momenta.py::test_a_motion_remover_takes_momentum_beside_particles_without_mass",
-        ),
-        (
-            "«context.setParameter(name, given.getParameter(name))→pass»",
-            "test_conserved_momenta.py::test_forces_are_looked_at_with_the_parameters_of_the_context",
         ),
         (
             "«turns.keep(turns.fields(x[fixed]))→pass»",
