@@ -171,7 +171,7 @@ MUTANTS = {
     "openmm/ensembles/langevin_ensemble.py": [
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "test_langevin_ensemble.py"),
     ],
-    "openmm/surfaces/surface_steps.py": [
+    "openmm/surfaces/surface_integrator.py": [
         ('"0.5«+0.5*behind→»"', "test_surface_steps.py"),
         (
             '"«select(failed, 0.5*behind, 0.5)→0.5»"',
@@ -202,7 +202,7 @@ MUTANTS = {
             "test_row_program.py::test_many_steps_look_less_often",
         ),
     ],
-    "openmm/surfaces/closed_forms.py": [
+    "openmm/surfaces/landings.py": [
         (
             "super()«._declare_solution(p)→»",
             "test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",

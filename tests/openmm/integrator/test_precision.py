@@ -37,7 +37,7 @@ from kcons.openmm import (
     surface_parts,
 )
 from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.surfaces.formulas import ImplicitRows
+from kcons.openmm.surfaces.landings import ImplicitRows
 
 less_than_double = pytest.mark.parametrize("platform", [p for p in on_gpus("single") if "double" not in str(p.id)])
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])

@@ -29,7 +29,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.landings import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 
 # -- what is refused --------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from surface_cases import (
 
 from kcons.constraints import Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm.integrator.schemes import SCHEMES
-from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.landings import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
 
 
