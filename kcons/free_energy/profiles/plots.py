@@ -60,13 +60,7 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
 
 
 def plot_surface(surface: Surface, *, coordinates: tuple[str, str] = ("x", "y"), energy: str = "energy") -> Figure:
-    """Contours of a free energy in two coordinates, with the windows and the minima.
-
-    Raises
-    ------
-    InputError
-        The surface does not have two coordinates.
-    """
+    """Contours of a free energy in two coordinates, with the windows and the minima."""
     if len(surface.low) != 2:
         raise InputError(f"contours need a surface in 2 coordinates, not {len(surface.low)}", item="surface")
     figure, (axes,) = _axes(1, (6.4, 5.2))

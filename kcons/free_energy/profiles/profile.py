@@ -226,11 +226,6 @@ class Profile:
         below : float, optional
             Only places count where the free energy is this much above its lowest value or less: rates and populations
             do not depend on the others.
-
-        Raises
-        ------
-        InputError
-            `between` is not in the range of the windows; `below` is not positive, or given beside `between`.
         """
         known = self._known
         grid = np.linspace(known.x[0], known.end, _POINTS)
