@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +13,7 @@ from kcons.constraints.vectors import extent
 from kcons.errors import OverdeterminedError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Ensemble, Integrator
 from kcons.openmm.integrator.system_checks import (
+    forces_alone,
     forces_of,
     groups_in,
     groups_of,
@@ -191,15 +191,7 @@ def _totals(
     given: openmm.Context, force: openmm.Force, x: FloatArray, fixed: list[int], turns: RigidMotions
 ) -> FloatArray:
     """Sum of one force over the particles, at a few places and as shares of its size; `turns` sees them, too."""
-    system, alone = given.getSystem(), openmm.System()
-    for k in range(system.getNumParticles()):
-        alone.addParticle(1.0 if system.isVirtualSite(k) else system.getParticleMass(k))
-    alone.setDefaultPeriodicBoxVectors(*box_of(given))
-    alone.addForce(copy.deepcopy(force))
-    clock = openmm.VerletIntegrator(1e-3)
-    context = openmm.Context(alone, clock, openmm.Platform.getPlatformByName("Reference"))
-    for name in context.getParameters():
-        context.setParameter(name, given.getParameter(name))
+    context = forces_alone(given.getSystem(), [[force]], box_of(given), given.getParameters())
     rng = np.random.default_rng(0)
     size = extent(x) or 1.0
     found: list[FloatArray] = []
