@@ -310,8 +310,8 @@ class ConstraintSet:
                 rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
                 speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
         allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * joined(reach))
-        found = (joined(rates), joined(speeds)) if v is not None else (None, None)
-        return Residuals(joined(sigma), allowed, *found, joined(norms), joined(sizes))
+        found = [None if v is None else joined(parts) for parts in (rates, speeds)]
+        return Residuals(joined(sigma), allowed, found[0], found[1], joined(norms), joined(sizes))
 
     # -- pieces ---------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import OverdeterminedError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Ensemble, Integrator
 from kcons.openmm.integrator.system_checks import (
     forces_alone,
@@ -65,13 +65,6 @@ class CountsMomenta(Ensemble):
 
     momentum: Momentum
     temperature: float | None
-
-    @staticmethod
-    def checked(momentum: Momentum) -> Momentum:
-        """Raise `InputError` for a word that is none of `Momentum`."""
-        if momentum not in ("auto", "conserved", "free"):
-            raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
-        return momentum
 
     def masses(self, integrator: Integrator) -> FloatArray:
         """Masses of the particles that it acts on; 0 for others."""
