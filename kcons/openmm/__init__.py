@@ -20,10 +20,9 @@ try:
     from kcons.openmm.collective.collective_rows import CollectiveRows
     from kcons.openmm.collective.coordinates import Row, forces_by_term
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-    from kcons.openmm.ensembles.langevin_ensemble import Langevin
+    from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-    from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
     from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
