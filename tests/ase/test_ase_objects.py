@@ -184,7 +184,7 @@ def test_what_no_object_of_ase_holds_is_named():
     constrain(atoms, [FixedAtoms([0]), Sphere([1], [0.0, 0.0, 0.0])])
     with pytest.raises(UnsupportedError, match=r"no object of ASE holds <Sphere\(1\)>"):
         to_ase_constraints(atoms)
-    with pytest.raises(InputError, match="missing must be"):
+    with pytest.raises(InputError, match="missing is"):
         to_ase_constraints(atoms, missing="ignore")
     assert plain_kinds(atoms, missing="leave out") == ["Hookean", "FixAtoms"]
     two_planes = molecule("CH3CH2OH")

@@ -477,7 +477,7 @@ BAD = [
     ("two steps", {"bath": "hot"}, "bath is 'hot'"),
     ("two steps", {"slow": 3}, "slow is 3; give an ASE calculator"),
     ("two steps", {"auxiliary": 2}, "auxiliary is no option with bath='langevin'"),
-    ("spheres", {"friction": 0.0}, "spheres need a bath"),
+    ("spheres", {"friction": 0.0}, "friction is 0.0; give a positive number"),
     ("spheres", {"spheres": "axes", "auxiliary": 0}, "radius 0"),
     ("spheres", {"conserve_momentum": True}, "conserve_momentum is no option with bath='spheres'"),
 ]
