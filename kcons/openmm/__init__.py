@@ -31,7 +31,7 @@ try:
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.formulas import ExpressionSurface
+    from kcons.openmm.surfaces.landings import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
@@ -62,6 +63,7 @@ class Freedom:
     turns: bool = False
 
 
+@checked
 def freedom(
     system: System, state: State, forces: FloatArray, atoms: ArrayLike | None = None, momentum: Momentum = "auto"
 ) -> Freedom:
@@ -90,8 +92,6 @@ def freedom(
     OverdeterminedError
         No degree of freedom is left.
     """
-    if momentum not in ("auto", "conserved", "free"):
-        raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
     chosen, count = _counted(system, state, atoms)
     directions = np.zeros((0, 3))
     turns = False

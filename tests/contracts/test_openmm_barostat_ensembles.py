@@ -152,13 +152,6 @@ def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
     return told | {"independent": count / autocorrelation_time(found), "less": less, "p": right, "more": more}
 
 
-@pytest.mark.parametrize(
-    ("ensemble", "barostat"), [("Langevin", "flexible"), ("NoseHoover", "three axes"), ("Isokinetic", "membrane")]
-)
-def test_volumes_beside_barostats_of_shapes(ensemble, barostat):
-    judge_beside(ensemble, barostat, 8000 if barostat == "flexible" else 4000, 3)
-
-
 @pytest.fixture(scope="module")
 def measured():
     """Name -> what was found; written when all are done."""
@@ -181,7 +174,8 @@ def test_volumes_of_each_beside_each(ensemble, barostat, measured):
     measured[f"{barostat}, {ensemble}"] = found
 
 
-@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("joined", [pytest.param(False, marks=pytest.mark.validation), True])
 def test_carried_rows_within_and_across_molecules(joined):
     """Two molecules with a row between them are one, and N is less by one for each such pair."""
     system, x = gas()

@@ -52,7 +52,7 @@ _SETTINGS = [
 ]
 SETTINGS = [
     *((partial(Settings, **{name: value}), name, f"{name} is") for name, value in _SETTINGS),
-    (lambda: Settings(thermostat="andersen"), "thermostat", "no thermostat 'andersen'"),
+    (lambda: Settings(thermostat="andersen"), "thermostat", "choose 'langevin', 'nose-hoover' or 'isokinetic'"),
     (lambda: Settings(production=300, every=10), "production", r"fewer than 32 samples; .* a smaller `every`"),
 ]
 
@@ -210,7 +210,7 @@ PROFILES = [
     (lambda: integrate(N3, [0.0, np.nan, 2.0], [1.0] * 3), "f", "window 1 is not finite"),
     (lambda: integrate(N3, N3[:2], [1.0] * 3), "f", r"shape \(3,\)"),
     (lambda: integrate(N3, N3, [1.0, 1.0, -1.0]), "e", "window 2 is negative"),
-    (lambda: integrate(N3, N3, [1.0] * 3, method="simpson"), "method", "unknown method"),
+    (lambda: integrate(N3, N3, [1.0] * 3, method="simpson"), "method", "choose 'gp' or 'spline'"),
     (lambda: integrate(N3, N3, [1.0] * 3, zero=3.0), "zero", "beyond the windows"),
     (lambda: integrate(N3, N3, [1.0] * 3, at=[-1.0]), "at", "beyond the windows"),
     (lambda: integrate(N3, N3, [1.0] * 3, period=-1.0), "period", "positive"),

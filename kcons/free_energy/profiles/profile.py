@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from kcons.constraints.arguments import FloatArray, as_float_array, positive, whole_number
+from kcons.constraints.arguments import FloatArray, as_float_array, checked, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
@@ -257,6 +257,7 @@ class Profile:
         return chosen
 
 
+@checked
 def integrate(
     x: ArrayLike,
     f: ArrayLike,
@@ -300,8 +301,6 @@ def integrate(
     UserWarning
         The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
     """
-    if method not in ("gp", "spline"):
-        raise InputError(f"unknown method {method!r}; give 'gp' or 'spline'", item="method")
     known = _windows(x, f, e, period)
     points = np.linspace(known.x[0], known.end, _POINTS) if at is None else _places(at, known, "at")
     closure = None

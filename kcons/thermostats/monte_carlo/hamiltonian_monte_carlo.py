@@ -10,7 +10,7 @@ from weakref import ref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import Rng, finite_number, positive, seed_from
+from kcons.constraints.arguments import Positive, Rng, Share, checked, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import (
@@ -194,21 +194,20 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     reversible = False
     symplectic = False
 
+    @checked
     def __init__(
         self,
-        thermal_energy: float,
+        thermal_energy: Positive,
         steps: int | tuple[int, int],
         rng: Rng,
         *,
         stepper: Stepper | None = None,
-        keep: float = 0.0,
+        keep: Share = 0.0,
         conserve_momentum: bool = False,
-        tolerance: float = 1e-9,
+        tolerance: Positive = 1e-9,
     ) -> None:
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        self.steps = step_range(steps)
-        self.seed = seed_from(rng)
-        self.keep = kept_part(keep)
+        self.thermal_energy, self.keep, self.tolerance = thermal_energy, keep, tolerance
+        self.steps, self.seed = step_range(steps), seed_from(rng)
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
         if not (getattr(self.stepper, "reversible", False) and getattr(self.stepper, "symplectic", False)):
@@ -217,7 +216,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
                 "Rattle, Geodesic, a Composition or a RungeKuttaNystrom stepper"
             )
         self.conserve_momentum = bool(conserve_momentum)
-        self.tolerance = positive(tolerance, "tolerance")
         self._known: tuple[System, ReversedSteps, FloatArray] | None = None
 
     def __repr__(self) -> str:
@@ -373,11 +371,3 @@ def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
             f"steps is {steps!r}; give a whole number, 1 or more, or the fewest and the most", item="steps"
         )
     return int(both[0]), int(both[1])
-
-
-def kept_part(keep: float) -> float:
-    """`keep`, in [0, 1), as a float."""
-    part = finite_number(keep, "keep")
-    if not 0 <= part < 1:
-        raise InputError(f"keep is {keep!r}; give a number from 0 (new velocities) to less than 1", item="keep")
-    return part

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, positive, whole_number
-from kcons.errors import ConvergenceError, InputError
+from kcons.constraints.arguments import Positive, checked, positive, share, whole_number
+from kcons.errors import ConvergenceError
 from kcons.steppers import State, System
 from kcons.thermostats.freedom import carried
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
@@ -23,15 +25,16 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
 #: forgotten.
 PULL, BEFORE, FORGET = 0.2, 10, 0.75
 
+Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
+
 
 class DualAveraging:
     """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5)."""
 
-    def __init__(self, dt: float, wanted: float) -> None:
-        self.wanted = finite_number(wanted, "wanted")
-        if not 0 < self.wanted < 1:
-            raise InputError(f"wanted is {wanted!r}; give a share between 0 and 1", item="wanted")
-        self._center = self._log = math.log(positive(dt, "dt"))
+    @checked
+    def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
+        self.wanted = wanted
+        self._center = self._log = math.log(dt)
         self._sum = self._mean = 0.0
         self._told: list[float] = []
         self.made = 0
@@ -98,6 +101,7 @@ def best_acceptance(order: int) -> float:
     return order / (order + 1)
 
 
+@checked
 def tune(
     system: System,
     state: State,
@@ -105,7 +109,7 @@ def tune(
     sampler: HamiltonianMonteCarlo,
     *,
     wanted: float | None = None,
-    proposals: int = 80,
+    proposals: Proposals = 80,
 ) -> Tuned:
     """Find the time step for a share of accepted proposals, by proposals with steps that differ.
 
@@ -134,7 +138,6 @@ def tune(
         As `HamiltonianMonteCarlo.step`.
     """
     search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
-    check_proposals(proposals)
     sampler.check(system)
     known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
     held = np.zeros(SIZE) if known is None else known
@@ -147,8 +150,3 @@ def tune(
     potential, held = held[POTENTIAL], np.zeros(SIZE)
     held[POTENTIAL] = potential
     return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
-
-
-def check_proposals(proposals: int) -> None:
-    """Raise `InputError` for fewer than 20."""
-    whole_number(proposals, "proposals", 20)

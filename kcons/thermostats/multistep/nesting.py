@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import checked, whole_number
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.splitting import SUZUKI_4
@@ -21,6 +21,7 @@ from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
 SlowKicks = Literal["ends", "middle"]
+InnerOrder = Literal[2, 4]
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,6 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
 
 def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
     """Whether the slowest group kicks in the middle of the step; `InputError` where that has none."""
-    if slow_kicks not in ("ends", "middle"):
-        raise InputError(f"slow_kicks is {slow_kicks!r}; choose 'ends' or 'middle'", item="slow_kicks")
     if slow_kicks == "ends":
         return False
     if len(levels) == 1:
@@ -148,12 +147,16 @@ class Nesting:
         Steps, and what else is not as by default, as arguments.
     """
 
+    @checked
     def __init__(
-        self, steps: Mapping[str, int] | None, order: int, substeps: int, slow_kicks: SlowKicks, turns: bool = False
+        self,
+        steps: Mapping[str, int] | None,
+        order: InnerOrder,
+        substeps: int,
+        slow_kicks: SlowKicks,
+        turns: bool = False,
     ) -> None:
         levels = levels_of(steps)
-        if order not in (2, 4):
-            raise InputError(f"order is {order}; choose 2 or 4", item="order")
         flight = (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
         self.names = tuple(level.group for level in levels)
         self.middle = middle_of(levels, slow_kicks)

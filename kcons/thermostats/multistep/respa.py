@@ -13,7 +13,7 @@ from kcons.steppers.operations import Evaluate
 from kcons.steppers.program import Row
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
-from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
+from kcons.thermostats.multistep.nesting import InnerOrder, Nesting, SlowKicks
 
 
 class LangevinRespa(Langevin):
@@ -69,7 +69,7 @@ class LangevinRespa(Langevin):
         rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
-        order: int = 2,
+        order: InnerOrder = 2,
         substeps: int = 3,
         conserve_momentum: bool = False,
         slow_kicks: SlowKicks = "ends",
