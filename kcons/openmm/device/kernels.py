@@ -7,9 +7,8 @@ work-item has a cluster of atoms that rows join, or a single atom; a work-group 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -174,7 +173,9 @@ def _of_rows(arrays: Sequence[Array]) -> list[Array]:
     return [array for array in arrays if array.name.startswith("rows_")]
 
 
-def standard_arrays(parameters: Sequence[float] = (0.0,), memory: Sequence[float] = (0.0,), seed: int = 0) -> list[Array]:
+def standard_arrays(
+    parameters: Sequence[float] = (0.0,), memory: Sequence[float] = (0.0,), seed: int = 0
+) -> list[Array]:
     """Arrays of every program: settings, what belongs to the state, failures, sums, what is read at the end."""
     return [
         Array("parameters", "mixed", np.array([*parameters, 0.0])),
