@@ -10,6 +10,7 @@ collective variables, surfaces and the constraint objects of kcons.
 - `collective`: collective variables
 - `callback_rows`: constraint objects of kcons
 - `surfaces`: particles on surfaces
+- `device`: steps as kernels of a plugin
 """
 
 from kcons.errors import with_extra
@@ -19,6 +20,7 @@ try:
     from kcons.openmm.callback_rows.hold import hold, take_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
     from kcons.openmm.collective.coordinates import Row, each_term
+    from kcons.openmm.device.device_integrator import DeviceIntegrator
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
     from kcons.openmm.ensembles.molecular_pressure import PressureReporter, molecular_pressure
@@ -42,6 +44,7 @@ __all__ = [
     "SCHEMES",
     "CarriedConstraints",
     "CollectiveRows",
+    "DeviceIntegrator",
     "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",

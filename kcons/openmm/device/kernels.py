@@ -7,18 +7,20 @@ work-item has a cluster of atoms that rows join, or a single atom; a work-group 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.errors import UnsupportedError
 
 #: Platforms whose kernels are plain C++.
 PLAIN = ("Reference", "CPU")
 #: Work-groups of a kernel at most; each leaves its share of a sum in a place of its own.
 MOST_GROUPS = 256
+_NONE = np.zeros(0, dtype=np.int64)
 #: Sums over all particles: two times three that are used in turn, and that of the kinetic energy which is told.
 _SUMS = 7
 
@@ -90,6 +92,10 @@ _COMMON = """
 #else
 #define CLAIM(place, value) atomicCAS(place, 0, value)
 #endif
+#define GET_U(a, p) {for (int c_ = 0; c_ < 3; c_++) d[3*(a)+c_] = kept[3*(p)+c_];}
+#define PUT_U(a, p) {for (int c_ = 0; c_ < 3; c_++) kept[3*(p)+c_] = d[3*(a)+c_];}
+#define RESTS(p) ((p) < 0 ? -1-(p) : (p))
+#define TINY ((mixed) 1e-37f)
 /* The first failure is kept; kernels that are launched later do nothing. */
 #define FAIL(row, residual) \\
   {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; failure_residual[0] = residual;}}
@@ -115,10 +121,10 @@ DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
 
 _PLAIN = """
 #include <math.h>
-#include <algorithm>
 #define PLAIN
 #define USE_DOUBLE_PRECISION
-using std::max; using std::min;
+template <class T> static inline T max(T a, T b) {return a > b ? a : b;}
+template <class T> static inline T min(T a, T b) {return a < b ? a : b;}
 typedef double real, mixed;
 typedef long mm_long;
 typedef unsigned long mm_ulong;
@@ -149,32 +155,57 @@ static inline real4 make_real4(double x, double y, double z, double w) {return r
 #define PUT_D(a, p) GET_3(delta, p, d, a)
 """
 
-_NUMBERS = ("dt", "time", "tolerance")
 _BOX = ("box0", "box1", "box2")
+#: What kernels are given besides arrays of their own, in the order in which the plugin gives it.
+_GIVEN = ["int padded", "int step", "int launch", "mixed dt", "mixed time", "mixed tolerance"]
+_GIVEN += [f"mixed4 {name}" for name in _BOX]
+_GIVEN += ["GLOBAL real4* RESTRICT posq", "GLOBAL real4* RESTRICT correction", "GLOBAL mixed4* RESTRICT velm"]
+_GIVEN += ["GLOBAL mixed4* RESTRICT delta", "GLOBAL const int* RESTRICT order"]
+#: Arrays that functions of rows have, too.
+_PASSED = ("parameters", "failure", "failure_residual")
 
 
-def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_group: int = 64) -> str:
+def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_group: int = 64, slots: int = 1) -> str:
     """What comes before the source of rows: types and names of the platform, `ROWS`, `FAIL`, random numbers."""
-    passed = [*(a for a in arrays if a.name in ("parameters", "failure", "failure_residual")), *_of_rows(arrays)]
-    names = ["step", "launch", "tolerance", *_BOX, *(a.name for a in passed)]
+    plain = platform in PLAIN
+    passed = [array for array in arrays if array.name in _PASSED or array.name.startswith("rows_")]
     typed = ["int step", "int launch", "mixed tolerance", *(f"mixed4 {name}" for name in _BOX)]
-    typed += [f"GLOBAL {a.kind}* RESTRICT {a.name}" for a in passed]
-    if scratch:
-        names.append("scratch")
-        typed.append("LOCAL_ARG mixed* scratch")
-    start = _PLAIN if platform in PLAIN else f"#define WG {work_group}\n"
-    return (
-        f"{start}#define MOST_GROUPS {MOST_GROUPS}\n#define ROWS {', '.join(typed)},\n"
-        f"#define ROWS_PASS {', '.join(names)},\n{_COMMON}"
-    )
-
-
-def _of_rows(arrays: Sequence[Array]) -> list[Array]:
-    return [array for array in arrays if array.name.startswith("rows_")]
+    typed += [f"GLOBAL {a.kind}* {a.name}" for a in passed] + ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
+    names = ["step", "launch", "tolerance", *_BOX, *(a.name for a in passed)] + ["scratch"] * (scratch > 0)
+    forces = [f"force{k}" for k in range(slots)]
+    if plain:
+        given = "void** pointers, const double* reals, const int* integers, int GROUP_ID, int NUM_GROUPS"
+        own = [("mixed", name) for name in ("positions", "velocities", "delta", "inverse_masses", *forces)]
+        own += [(array.kind, array.name) for array in arrays]
+        lines = [
+            f"{kind.replace('mixed', 'double')}* {name} = ({kind}*) pointers[{k}];"
+            for k, (kind, name) in enumerate(own)
+        ]
+        lines += [f"double {name} = reals[{k}];" for k, name in enumerate(("dt", "time", "tolerance"))]
+        lines += [f"int {name} = integers[{k}];" for k, name in enumerate(("step", "launch"))]
+        lines += [
+            f"real4 {b} = {{reals[{k}], reals[{k + 1}], reals[{k + 2}], 0}};"
+            for k, b in zip((3, 6, 9), _BOX, strict=True)
+        ]
+        unpack = " ".join(lines)
+    else:
+        own_arrays = [f"GLOBAL {array.kind}* RESTRICT {array.name}" for array in arrays]
+        given = ", ".join([*_GIVEN, *(f"GLOBAL const mm_long* RESTRICT {name}" for name in forces), *own_arrays])
+        unpack = ""
+    words = {
+        "MOST_GROUPS": str(MOST_GROUPS),
+        "ARGUMENTS": given,
+        "UNPACK": unpack,
+        "SCRATCH": f" LOCAL mixed scratch[{scratch}];" if scratch else "",
+        "ROWS": f"{', '.join(typed)},",
+        "ROWS_PASS": f"{', '.join(names)},",
+    }
+    start = _PLAIN if plain else f"#define WG {work_group}\n"
+    return start + "".join(f"#define {word} {text}\n" for word, text in words.items()) + _COMMON
 
 
 def standard_arrays(
-    parameters: Sequence[float] = (0.0,), memory: Sequence[float] = (0.0,), seed: int = 0
+    parameters: Sequence[float] = (), memory: Sequence[float] = (), seed: int = 0, particles: int = 1
 ) -> list[Array]:
     """Arrays of every program: settings, what belongs to the state, failures, sums, what is read at the end."""
     return [
@@ -185,5 +216,493 @@ def standard_arrays(
         Array("failure", "int", np.zeros(3, dtype=np.int64)),
         Array("failure_residual", "mixed", np.zeros(1)),
         Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
-        Array("looked", "mixed", np.zeros(3)),
+        Array("kept", "mixed", np.zeros(3 * particles)),
+        Array("looked", "mixed", np.zeros(6)),
     ]
+
+
+# -- operations ---------------------------------------------------------------------------------------
+
+
+class Op(NamedTuple):
+    """An operation as plain data.
+
+    Attributes
+    ----------
+    verb : str
+        As `kcons.steppers.operations` has them; 'note' is for the kinetic energy that a State tells.
+    share : float
+        The fraction of the step that it is over.
+    group : str
+        Whose forces.
+    flights : tuple of float
+        Of a drift the RATTLE drifts, of a chain the parts that it consists of, as fractions of the step.
+    ends : tuple of float
+        At which fractions of the step they end; of others, when they are.
+    begun : int
+        0 in the step that is being made, -1 in the one before.
+    use : int
+        Number of its noise within the step.
+    """
+
+    verb: str
+    share: float = 0.0
+    group: str = ""
+    flights: tuple[float, ...] = ()
+    ends: tuple[float, ...] = ()
+    begun: int = 0
+    use: int = 0
+
+
+#: What kernels can do.
+VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note")
+
+
+def divided(operations: Sequence[Op], noisy: bool) -> tuple[list[Op], list[Op], list[Op]]:
+    """Head, middle and tail of a step: up to its last evaluation of forces, joined with the next step, and its end."""
+    uses = iter(range(len(operations)))
+    ops = [op._replace(use=next(uses)) if op.verb == "exchange" else op for op in operations]
+    last = max((k for k, op in enumerate(ops) if op.verb == "evaluate"), default=-1) + 1
+    if not last:
+        raise UnsupportedError("a step on the device evaluates forces at its end; the leapfrog does not")
+    head, tail = ops[:last], [op._replace(begun=-1) for op in ops[last:]]
+    noted = [Op("note"), *tail] if noisy else tail
+    return joined(head), joined([*tail, *head]), joined(noted)
+
+
+def joined(operations: Sequence[Op]) -> list[Op]:
+    """The same with fewer operations, where nobody sees what is between them."""
+    done: list[Op] = []
+    for k, op in enumerate(operations):
+        after = next((later.verb for later in operations[k + 1 :] if later.verb != "kick"), "")
+        if op.verb == "project" and after == "fly":
+            continue  # the drift absorbs what v has across the rows
+        if op.verb == "project" and done and done[-1].verb == "turn":
+            continue  # turned velocities are tangent
+        if done and done[-1][0:3:2] == op[0:3:2] and op.verb in ("kick", "turn"):
+            done[-1] = done[-1]._replace(share=done[-1].share + op.share)
+        elif done and done[-1].verb == op.verb == "chain":
+            done[-1] = done[-1]._replace(flights=(*done[-1].flights, *op.flights))
+        else:
+            done.append(op)
+    return done
+
+
+# -- kernels ------------------------------------------------------------------------------------------
+
+_REDUCE = """ shared[LOCAL_ID] = acc0; shared[LOCAL_ID+WG] = acc1; shared[LOCAL_ID+2*WG] = acc2;
+ shared[LOCAL_ID+3*WG] = acc3;
+ SYNC_THREADS;
+ for (int span = WG/2; span > 0; span /= 2) {
+  if (LOCAL_ID < span) for (int k = 0; k < 4*WG; k += WG) shared[LOCAL_ID+k] += shared[LOCAL_ID+k+span];
+  SYNC_THREADS;
+ }
+"""
+_TAKE_SUMS = (
+    """ mixed sum0, sum1, sum2;
+ {mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;
+ for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {
+  acc0 += partial[k+BANK*MOST_GROUPS]; acc1 += partial[k+(BANK+1)*MOST_GROUPS]; acc2 += partial[k+(BANK+2)*MOST_GROUPS];
+ }
+"""
+    + _REDUCE
+    + """ sum0 = shared[0]; sum1 = shared[WG]; sum2 = shared[2*WG];
+ SYNC_THREADS;}
+"""
+)
+#: The closed form of `kcons.thermostats.isokinetic.kick`, everything divided by exp(z).
+_CLOSED_FORM = """ mixed z = max((mixed) sqrt(QQ/TWICE), TINY), decay = exp(-z);
+ mixed aim = WQ/sqrt(max((mixed) (WW*QQ), TINY));
+ aim = min(max(aim, (mixed) -1), (mixed) 1);
+ mixed sinhc = -expm1(-2*z)/(2*z), root = -expm1(-z)/z, scale = max((mixed) (aim*z*sinhc+(1+decay*decay)/2), TINY);
+ mixed keep = sqrt(TWICE/WW)*decay/scale, push = (aim*z*root*root/2+sinhc)/scale;
+"""
+#: Half a push of all links, the first of which then scales velocities, and half a push; see `kcons.openmm.NoseHoover`.
+_CHAIN = """ if (LOCAL_ID == 0) {
+  mixed link[LINKS], factor = 1, place = memory_before[M_chain_place], inertia = P_kT/(P_frequency*P_frequency);
+  const mixed parts[PARTS] = {SHARES};
+  for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
+  for (int part = 0; part < PARTS; part++) {
+   mixed h = parts[part]*dt;
+   for (int turn = 0; turn < 2*LINKS; turn++) {
+    int k = turn < LINKS ? LINKS-1-turn : turn-LINKS;
+    if (turn == LINKS) {
+     factor *= exp(-h*link[0]); place += h*P_momenta*link[0];
+     for (int j = 1; j < LINKS; j++) place += h*link[j];
+    }
+    mixed damp = k+1 < LINKS ? exp(-h*link[k+1]/4) : (mixed) 1, push;
+    if (k == 0) push = (sum0*factor*factor-P_momenta*P_kT)/(P_momenta*inertia);
+    else push = ((k == 1 ? P_momenta : (mixed) 1)*inertia*link[k-1]*link[k-1]-P_kT)/inertia;
+    link[k] = (link[k]*damp+h*push/2)*damp;
+   }
+  }
+  if (GROUP_ID == 0) {
+   for (int k = 0; k < LINKS; k++) memory[M_link1+k] = link[k];
+   memory[M_chain_place] = place;
+  }
+  shared[0] = factor;
+ }
+ SYNC_THREADS;
+ mixed factor = shared[0];
+ SYNC_THREADS;
+"""
+#: What the last call did: whether velocities are finite, the kinetic energy that is told, a failure.
+_LOOK = (
+    """ mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;
+ if (GROUP_ID != 0) return;
+ for (int p = LOCAL_ID; p < PARTICLES; p += LOCAL_SIZE) {
+  mixed v[3], w[1];
+  GET_V(0, p)
+  acc0 += v[0]*v[0]+v[1]*v[1]+v[2]*v[2];
+ }
+ for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
+"""
+    + _REDUCE
+    + """ if (LOCAL_ID == 0) {
+  looked[0] = shared[0]; looked[1] = shared[WG]; looked[5] = failure_residual[0];
+  for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
+ }
+"""
+)
+
+
+class Action(NamedTuple):
+    """What the plugin does: launch a kernel, let a solver of OpenMM act on positions or velocities, evaluate forces."""
+
+    verb: int
+    kernel: str = ""
+    groups: int = -1
+    slot: int = 0
+
+
+LAUNCH, POSITIONS, VELOCITIES, EVALUATE = range(4)
+
+
+class _Place(NamedTuple):
+    """Where the clusters of a shape are: among the items of a kernel or its groups, in `atoms` and in `work`."""
+
+    shape: Shape
+    begin: int
+    atoms: int
+    work: int
+
+
+class Kernels:
+    """The kernels of a step.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        All atoms, each in one cluster.
+    groups : mapping of str to int
+        Bit masks of the groups of forces, by the name that operations have.
+    own : bool
+        Whether kernels hold the rows themselves; else OpenMM's solvers do.
+    tidy : bool
+        Whether noise is made tangent, so that multipliers are those of forces.
+    fixed : ndarray of int
+        Particles with a mass that rest.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        groups: Mapping[str, int],
+        own: bool,
+        *,
+        tidy: bool = False,
+        fixed: IntArray = _NONE,
+    ) -> None:
+        self.groups, self.own, self.tidy, self.resting = dict(groups), own, tidy, len(fixed) > 0
+        self.places: list[_Place] = []
+        self.order: list[IntArray] = []
+        counts, at, work = {True: 0, False: 0}, 0, 0
+        for shape in shapes:
+            clusters = len(shape.atoms)
+            self.places.append(_Place(shape, counts[shape.together], at, work))
+            atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()
+            self.order.append(np.where(np.isin(atoms, fixed), -1 - atoms, atoms))
+            counts[shape.together] += clusters
+            at += shape.atoms.size
+            work += 10 * shape.atoms.size * shape.together
+        self.items, self.crowds, self.work = counts[False], counts[True], work
+        self.particles = at
+        self.source: list[str] = []
+        self._reset()
+        self._bank = 0
+
+    def _reset(self) -> None:
+        self._code = ["" for _ in self.places]
+        self._before, self._moves, self._sums, self._noted, self._used = "", False, False, False, False
+
+    def _add(self, code: str, rows: str | None = None) -> None:
+        """Code for each cluster; another where rows are held in it."""
+        self._used = self._used or any(code if rows is None or not place.shape.name else rows for place in self.places)
+        for k, place in enumerate(self.places):
+            self._code[k] += code if rows is None or not place.shape.name else rows
+
+    def write(self, name: str, operations: Sequence[Op]) -> list[Action]:
+        """Kernels for some operations; returns what is to be done with them."""
+        self._name, self._actions = name, list[Action]()
+        for op in operations:
+            if op.verb not in VERBS:
+                raise UnsupportedError(f"a step on the device has no operation {op.verb!r}")
+            getattr(self, f"_{op.verb}")(op)
+        self._close()
+        return self._actions
+
+    # -- one operation each --
+
+    def _kick(self, op: Op) -> None:
+        self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
+
+    def _fly(self, op: Op) -> None:
+        for length, end in zip(op.flights, op.ends, strict=True):
+            h = _of_dt(length)
+            free = f" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
+            start = f" {{ROOM mixed h = {h};\n"
+            aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
+            moved = (
+                " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]/h;}\n }\n"
+            )
+            if self.own:
+                solve = (
+                    f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {_time(op, end)}, x, d, w);\n if (failure[0] == 0)\n"
+                )
+                self._add(free, start + aim + solve + moved)
+            else:
+                self._add(f"{start}{aim} EACH PUT_D(a, AT)\n }}\n")
+                self._close(Action(POSITIONS))
+                self._add(f"{start} EACH GET_D(a, AT)\n{moved}")
+            self._moves = True
+
+    def _project(self, op: Op) -> None:
+        if self.own:
+            self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")
+        else:
+            self._close(Action(VELOCITIES))
+
+    def _exchange(self, op: Op) -> None:
+        noise = (
+            f" {{mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);\n"
+            f" EACH if (w[a] != 0) {{\n  mixed g[4], s = size*sqrt(w[a]);\n"
+            f"  gaussians(g, ORDER(AT), step+({op.begun}), {op.use}, seed[0]);\n"
+            "  for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+s*g[c];\n }}\n"
+        )
+        self._add(noise)
+        if self.tidy:
+            self._add("", " SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, v, w);\n")
+
+    def _turn(self, op: Op) -> None:
+        push = f"{_of_dt(op.share)}*{self._force(op)}*w[a]"
+        sums = (
+            " EACH {if (w[a] != 0) for (int c = 0; c < 3; c++) {mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a];"
+            " acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;}\n PUT_U(a, AT)}\n }\n"
+        )
+        if self.own:
+            start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {push};\n"
+            self._add(start + sums, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{sums}")
+        else:  # OpenMM's solver takes velocities only
+            self._add(f" EACH {{mixed* d = v; PUT_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] += {push};}}\n")
+            self._close(Action(VELOCITIES))
+            split = "{mixed s = d[3*a+c]; d[3*a+c] = v[3*a+c]-s; v[3*a+c] = s;}"
+            self._add(f" {{ROOM EACH {{GET_U(a, AT) for (int c = 0; c < 3; c++) {split}}}\n{sums}")
+        self._gather()
+        named = _CLOSED_FORM.replace("WQ", "sum0").replace("QQ", "sum1").replace("WW", "sum2")
+        self._before += named.replace("TWICE", "P_two_k") + (
+            " if (GLOBAL_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}\n"
+        )
+        self._add(
+            " {ROOM EACH {GET_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n"
+        )
+
+    def _chain(self, op: Op) -> None:
+        self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc0 += v[3*a+c]*v[3*a+c]/w[a];\n")
+        self._before += (
+            " if (GLOBAL_ID == 0) for (int k = 0; k <= LINKS; k++) memory_before[M_link1+k] = memory[M_link1+k];\n"
+        )
+        self._gather()
+        shares = ", ".join(f"(mixed) {share!r}" for share in op.flights)
+        self._before += _CHAIN.replace("SHARES", shares).replace("PARTS", str(len(op.flights)))
+        self._add(" EACH for (int c = 0; c < 3; c++) v[3*a+c] *= factor;\n")
+
+    def _evaluate(self, op: Op) -> None:
+        self._close(Action(EVALUATE, "", self.groups[op.group], list(self.groups).index(op.group)))
+
+    def _note(self, op: Op) -> None:
+        self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
+        self._noted = True
+
+    def _force(self, op: Op) -> str:
+        return f"FORCE(force{list(self.groups).index(op.group)}, AT, c)"
+
+    def _gather(self) -> None:
+        """What follows needs the sums that each cluster has added to."""
+        self._sums, bank = True, self._bank
+        self._close()
+        self._before = _TAKE_SUMS.replace("BANK", str(bank))
+
+    # -- text --
+
+    def _close(self, action: Action | None = None) -> None:
+        """A kernel of what was written since the last; `action` comes after it."""
+        if self._used or self._before:
+            name = f"{self._name}{sum(a.verb == LAUNCH for a in self._actions)}"
+            self._actions.append(Action(LAUNCH, name))
+            ends = ""
+            if self._sums or self._noted:
+                kept = [(self._bank + k, f"shared[{k}*WG]") for k in range(3) if self._sums]
+                kept += [(6, "shared[3*WG]")] * self._noted
+                stores = " ".join(f"partial[GROUP_ID+{place}*MOST_GROUPS] = {value};" for place, value in kept)
+                ends = f"{_REDUCE} if (LOCAL_ID == 0) {{{stores}}}\n"
+                self._bank = 3 - self._bank if self._sums else self._bank
+            accumulators = " mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;\n" if ends else ""
+            self.source.append(self._header(name) + self._before + accumulators + self._clusters() + ends + "}\n")
+        if action is not None:
+            self._actions.append(action)
+        self._reset()
+
+    def _header(self, name: str) -> str:
+        return (
+            f"KERNEL void {name}(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];SCRATCH\n"
+            " if (failure[0] != 0 && failure[0] != launch+1) return;\n"
+        )
+
+    def _clusters(self) -> str:
+        """Loops over the clusters that a group has and those that an item has."""
+        crowds = [(place, code) for place, code in zip(self.places, self._code, strict=True) if place.shape.together]
+        items = [(place, code) for place, code in zip(self.places, self._code, strict=True) if not place.shape.together]
+        text = ""
+        for loop, kinds in (
+            (f" for (int item = GROUP_ID; item < {self.crowds}; item += NUM_GROUPS) {{\n", crowds),
+            (f" for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE) {{\n", items),
+        ):
+            if any(code for _, code in kinds):
+                text += loop + "".join(self._cluster(place, code) for place, code in kinds if code) + " }\n"
+        return text
+
+    def _cluster(self, place: _Place, code: str) -> str:
+        shape = place.shape
+        clusters, n = shape.atoms.shape
+        cluster = f"item-{place.begin}"
+        if shape.together:
+            room = f" GLOBAL mixed *x = work+{place.work}+({cluster})*{10 * n}, "
+            room += f"*v = x+{3 * n}, *d = v+{3 * n}, *w = d+{3 * n};\n"
+            words = {"EACH": f"for (int a = LOCAL_ID; a < {n}; a += LOCAL_SIZE)", "ROOM": "", "SYNC": "SYNC_THREADS;"}
+            atom = f"atoms[{place.atoms}+({cluster})*{n}+a]"
+            words["AT"] = f"RESTS({atom})" if self.resting else atom
+            load = " SYNC_THREADS;\n"
+        else:
+            room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n"
+            words = {"EACH": f"for (int a = 0; a < {n}; a++)", "ROOM": f"mixed d[{3 * n}];", "SYNC": "", "AT": "at[a]"}
+            atom = f"atoms[{place.atoms}+a*{clusters}+{cluster}]"
+            load = f" EACH at[a] = {f'RESTS({atom})' if self.resting else atom};\n"
+        load += " EACH {GET_V(a, AT) GET_X(a, AT)" + f" if ({atom} < 0) w[a] = 0;" * self.resting + "}\n"
+        store = f" EACH if (w[a] != 0) {{PUT_V(a, AT) {'PUT_X(a, AT)' * self._moves}}}\n"
+        text = load + code + store
+        words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}"}
+        for word, meaning in words.items():
+            text = text.replace(word, meaning)
+        return f" if (item >= {place.begin} && item < {place.begin + clusters}) {{\n{room}{text} }}\n"
+
+
+class Plan(NamedTuple):
+    """What the plugin needs for a Context.
+
+    Attributes
+    ----------
+    source : str
+    arrays : list of Array
+    parts : tuple of three lists of Action
+        Head, middle and tail of a step.
+    order : ndarray of int
+        Of atoms in the array `atoms`; -1-k for those that rest.
+    items, work_group, slots : int
+        Work-items that there is work for, their number in a group, and how many groups of forces are kept.
+    """
+
+    source: str
+    arrays: list[Array]
+    parts: tuple[list[Action], list[Action], list[Action]]
+    order: IntArray
+    items: int
+    work_group: int
+    slots: int
+
+
+class Rows(NamedTuple):
+    """Rows that kernels hold, see `kcons.openmm.device.rows`."""
+
+    shapes: Sequence[Shape] = ()
+    arrays: Sequence[Array] = ()
+    source: str = ""
+    scratch: int = 0
+    work_group: int = 64
+    fixed: IntArray = _NONE
+
+
+def plan(
+    operations: Sequence[Op],
+    platform: str,
+    particles: int,
+    groups: Mapping[str, int],
+    rows: Rows | None,
+    *,
+    parameters: Mapping[str, float],
+    memory: Mapping[str, float],
+    seed: int = 0,
+    noisy: bool = False,
+    tidy: bool = False,
+) -> Plan:
+    """Everything that the plugin needs.
+
+    Parameters
+    ----------
+    operations : sequence of Op
+        Of a step.
+    platform : str
+        Its name.
+    particles : int
+        How many the System has.
+    groups : mapping of str to int
+        Bit masks of the groups of forces, by the name that operations have.
+    rows : Rows or None
+        None where constraints stay with OpenMM.
+    parameters : mapping of str to float
+        Settings, which kernels know as P_name.
+    memory : mapping of str to float
+        What belongs to a state besides x and v, M_name: the place in the array.
+    seed : int
+    noisy : bool
+        Whether the kinetic energy that is told is that before the end of a step.
+    tidy : bool
+        See `Kernels`.
+    """
+    held = Rows() if rows is None else rows
+    loose = np.setdiff1d(np.arange(particles), np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
+    shapes = [*held.shapes, *([Shape("", loose[:, None])] if len(loose) else [])]
+    kernels = Kernels(shapes, groups, rows is not None, tidy=tidy, fixed=held.fixed)
+    parts = divided(operations, noisy)
+    actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
+    order = np.concatenate(kernels.order)
+    arrays = standard_arrays([*parameters.values()], [*memory.values()], seed, particles)
+    arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
+    work_group = 1 if platform in PLAIN else held.work_group
+    names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
+    names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
+    names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(particles)}
+    look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
+    source = preamble(platform, arrays, held.scratch, held.work_group, len(groups))
+    source += "".join(f"#define {name} {text}\n" for name, text in names.items())
+    source += "".join([held.source, *kernels.source, look])
+    items = kernels.items + kernels.crowds * work_group
+    return Plan(source, arrays, actions, order, items, work_group, len(groups))  # type: ignore[arg-type]
+
+
+def _of_dt(share: float) -> str:
+    return f"((mixed) {share!r}*dt)"
+
+
+def _time(op: Op, end: float) -> str:
+    """The time at a fraction of the step, of which the kernel knows when it began."""
+    return f"time+{_of_dt(end + op.begun)}"
