@@ -8,15 +8,18 @@ import logging
 import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import openmm
 
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, KconsError, UnsupportedError
+from kcons.errors import KconsError, UnsupportedError
 from kcons.openmm.device import build
-from kcons.openmm.device.kernels import PLAIN, VERBS, Op, Plan, Rows, plan
+from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, plan
+from kcons.openmm.device.rows import molecules_of, rows_of
+from kcons.openmm.device.rows import refusal as rows_refusal
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
@@ -26,6 +29,7 @@ from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
+from kcons.openmm.states import box_of, positions_of
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
@@ -35,7 +39,7 @@ logger = logging.getLogger("kcons.openmm")
 #: Ensembles whose operations kernels have.
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa)
 _EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
-_DOUBLES = ctypes.POINTER(ctypes.c_double)
+_DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
 #: What a solve that failed leaves of a call.
 _FAILED = 1
 
@@ -54,8 +58,8 @@ class _Given(ctypes.Structure):
 
 
 _PLANNER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
-#: Integrators by the number in their description, for parts, which no text describes.
-_ALIVE: weakref.WeakValueDictionary[int, DeviceIntegrator] = weakref.WeakValueDictionary()
+#: Integrators by the key in their description, for parts, which no text describes.
+_ALIVE: weakref.WeakValueDictionary[str, DeviceIntegrator] = weakref.WeakValueDictionary()
 
 
 # -- what becomes of operations ---------------------------------------------------------------------
@@ -69,8 +73,10 @@ def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
         return f"{type(ensemble).__name__} has no kernels"
     if getattr(ensemble, "atoms", None) is not None:
         return "a thermostat on some of the particles has no kernels"
-    if parts:
-        return "parts are held by the CustomIntegrator only"
+    if parts and isinstance(ensemble, LangevinRespa):
+        return f"{type(ensemble).__name__} holds no parts"
+    if why := rows_refusal(parts):
+        return why
     for operation in ensemble.operations(scheme):
         if operation.verb not in VERBS or (isinstance(operation, Fly) and operation.exact):
             return f"the operation {operation.verb!r} has no kernel"
@@ -130,7 +136,9 @@ class DeviceProgram(Program):
 
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
-        return {"memory": self.integrator.read("memory")}
+        memory = {"memory": self.integrator.read("memory")}  # which makes the kernels if there are none yet
+        saved = [array.name for array in self.integrator.rows.arrays if array.saved]
+        return memory | {name: self.integrator.read(name) for name in saved}
 
     def recall(self, values: Mapping[str, Any]) -> None:
         """Write what `remembered` gave back into the Context."""
@@ -166,7 +174,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
         self.this = made.this  # the proxy of this class owns what XmlSerializer has made
         openmm.Integrator.setStepSize(self, dt)
-        _ALIVE[id(self)] = self
+        self._key = uuid4().hex
+        _ALIVE[self._key] = self
 
     def describe(self) -> bool:
         """Tell the plugin what a step is; returns whether it knew another one."""
@@ -178,7 +187,8 @@ class DeviceIntegrator(ProjectedIntegrator):
                 "memory": program.kept,
                 "seed": self._seed,
                 "noisy": self.ensemble.noisy,
-                "integrator": id(self) if self.parts else 0,
+                "integrator": self._key,
+                "parts": bool(self.parts),
             }
         )
         if description == self._described:
@@ -228,7 +238,10 @@ class DeviceIntegrator(ProjectedIntegrator):
         context = guard.context
         first = context.getStepCount()
         try:
-            openmm.Integrator.step(self, steps)
+            for done in range(0, steps, self.rows.block):
+                block = min(steps - done, self.rows.block)
+                self._renew(context, block)
+                openmm.Integrator.step(self, block)
         except openmm.OpenMMException as error:
             told = self._look()
             guard.put_back()
@@ -240,18 +253,17 @@ class DeviceIntegrator(ProjectedIntegrator):
         if ends:
             guard.look()
 
+    def _renew(self, context: openmm.Context, steps: int) -> None:
+        """Targets and cells of the steps that follow."""
+        positions = positions_of(context) if self.rows.looks else None
+        cell = np.array(box_of(context)) if self.rows.looks else None
+        for name, values in self.rows.renew(context.getTime()._value, self._dt, steps, positions, cell).items():
+            self.write(name, values)
+
     def _unsolved(self, told: Sequence[float], good: int) -> KconsError:
-        step, row, residual = int(told[2]), int(told[3]), told[4]
-        if self.rows is not None:
-            return self.rows.failure(row, residual, step)
-        return ConvergenceError(
-            f"row {row} could not be solved at step {step}, residual {residual:.3g}: take a smaller time step. The "
-            f"Context is back at step {good}, the last that was checked",
-            residual=residual,
-            tolerance=self.getConstraintTolerance(),
-            row=row,
-            step=step,
-        )
+        error: KconsError = self.rows.failure(int(told[3]), told[4], int(told[2]))
+        error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
+        return error
 
     def _look(self) -> list[float]:
         told = (ctypes.c_double * 5)()
@@ -325,11 +337,27 @@ def _planner(made: int, given: Any) -> int:
 def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     library = build.library()
     masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
-    rows = None if given.constraints else Rows()
+    n, described = given.constraints, json.loads(given.description)
+    pairs = np.array(given.pairs[: 2 * n], dtype=np.int64).reshape(n, 2)
+    lengths = np.array(given.lengths[:n], dtype=np.float64)
+    integrator = _ALIVE.get(described["integrator"])
+    if described["parts"] and integrator is None:
+        raise UnsupportedError("no text has the parts of an integrator: read it by from_xml(xml, parts=...)")
+    parts = () if integrator is None else integrator.parts
     if not given.positions:
+        for atoms in molecules_of(pairs, parts):
+            members = np.ascontiguousarray(atoms, dtype=np.int32)
+            library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
         return
+    rows: Any = NoRows()
+    if n or parts:
+        positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
+        box = np.array(given.box[:9]).reshape(3, 3)
+        rows = rows_of(masses, (pairs, lengths), parts, positions, box if box.any() else None, given.time)
+    if integrator is not None:
+        integrator.rows = rows
     platform = given.platform.decode()
-    done = _plan_of(json.loads(given.description), platform, masses, given.groups, rows)
+    done = _plan_of(described, platform, masses, given.groups, rows)
     compiled = build.kernels_library(done.source) if platform in PLAIN else ""
     library.kcons_plan_source(
         made, done.source.encode(), str(compiled).encode(), done.items, done.work_group, done.slots
@@ -345,10 +373,10 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
                 made, number, action.verb, action.kernel.encode(), ctypes.c_int32(action.groups), action.slot
             )
     order = np.ascontiguousarray(done.order, dtype=np.int32)
-    library.kcons_plan_order(made, order.ctypes.data_as(ctypes.POINTER(ctypes.c_int)), order.size)
+    library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
 
 
-def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, rows: Rows | None) -> Plan:
+def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, rows: Any) -> Plan:
     operations = [
         Op(*(tuple(value) if isinstance(value, list) else value for value in op)) for op in described["operations"]
     ]
@@ -364,7 +392,7 @@ def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, gr
         memory=dict.fromkeys(described["memory"], 0.0),
         seed=seed,
         noisy=described["noisy"],
-        tidy=bool(described["integrator"]),
+        tidy=described["parts"],
     )
 
 

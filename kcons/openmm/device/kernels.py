@@ -8,7 +8,7 @@ work-item has a cluster of atoms that rows join, or a single atom; a work-group 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -94,6 +94,9 @@ _COMMON = """
 #endif
 #define GET_U(a, p) {for (int c_ = 0; c_ < 3; c_++) d[3*(a)+c_] = kept[3*(p)+c_];}
 #define PUT_U(a, p) {for (int c_ = 0; c_ < 3; c_++) kept[3*(p)+c_] = d[3*(a)+c_];}
+#define AWAY(a, p, sign) {mixed i_ = cells[3*(p)], j_ = cells[3*(p)+1], k_ = cells[3*(p)+2]; \\
+  x[3*(a)] = x[3*(a)] sign (i_*box0.x+j_*box1.x+k_*box2.x); \\
+  x[3*(a)+1] = x[3*(a)+1] sign (j_*box1.y+k_*box2.y); x[3*(a)+2] = x[3*(a)+2] sign k_*box2.z;}
 #define RESTS(p) ((p) < 0 ? -1-(p) : (p))
 #define TINY ((mixed) 1e-37f)
 /* The first failure is kept; kernels that are launched later do nothing. */
@@ -402,6 +405,8 @@ class Kernels:
         Whether noise is made tangent, so that multipliers are those of forces.
     fixed : ndarray of int
         Particles with a mass that rest.
+    placed : ndarray of int
+        Particles whose rows have a place in space: what cells OpenMM has moved them by is taken back for them.
     """
 
     def __init__(
@@ -412,8 +417,10 @@ class Kernels:
         *,
         tidy: bool = False,
         fixed: IntArray = _NONE,
+        placed: IntArray = _NONE,
     ) -> None:
         self.groups, self.own, self.tidy, self.resting = dict(groups), own, tidy, len(fixed) > 0
+        self.placed = placed
         self.places: list[_Place] = []
         self.order: list[IntArray] = []
         counts, at, work = {True: 0, False: 0}, 0, 0
@@ -597,8 +604,13 @@ class Kernels:
             words = {"EACH": f"for (int a = 0; a < {n}; a++)", "ROOM": f"mixed d[{3 * n}];", "SYNC": "", "AT": "at[a]"}
             atom = f"atoms[{place.atoms}+a*{clusters}+{cluster}]"
             load = f" EACH at[a] = {f'RESTS({atom})' if self.resting else atom};\n"
-        load += " EACH {GET_V(a, AT) GET_X(a, AT)" + f" if ({atom} < 0) w[a] = 0;" * self.resting + "}\n"
-        store = f" EACH if (w[a] != 0) {{PUT_V(a, AT) {'PUT_X(a, AT)' * self._moves}}}\n"
+        away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
+        load += (
+            f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')}"
+            + f" if ({atom} < 0) w[a] = 0;" * self.resting
+            + "}\n"
+        )
+        store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
         text = load + code + store
         words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}"}
         for word, meaning in words.items():
@@ -630,15 +642,21 @@ class Plan(NamedTuple):
     slots: int
 
 
-class Rows(NamedTuple):
-    """Rows that kernels hold, see `kcons.openmm.device.rows`."""
+class NoRows:
+    """What kernels hold where nothing is held, and what they need to know of rows; see `kcons.openmm.device.rows`."""
 
+    block = 10**9
+    looks = False
     shapes: Sequence[Shape] = ()
     arrays: Sequence[Array] = ()
-    source: str = ""
-    scratch: int = 0
-    work_group: int = 64
-    fixed: IntArray = _NONE
+    source = ""
+    scratch = 0
+    work_group = 64
+    fixed = placed = _NONE
+
+    def renew(self, *state: Any) -> dict[str, FloatArray]:
+        """Nothing changes with time."""
+        return {}
 
 
 def plan(
@@ -646,7 +664,7 @@ def plan(
     platform: str,
     particles: int,
     groups: Mapping[str, int],
-    rows: Rows | None,
+    rows: Any,
     *,
     parameters: Mapping[str, float],
     memory: Mapping[str, float],
@@ -666,7 +684,7 @@ def plan(
         How many the System has.
     groups : mapping of str to int
         Bit masks of the groups of forces, by the name that operations have.
-    rows : Rows or None
+    rows : DeviceRows, NoRows or None
         None where constraints stay with OpenMM.
     parameters : mapping of str to float
         Settings, which kernels know as P_name.
@@ -678,15 +696,16 @@ def plan(
     tidy : bool
         See `Kernels`.
     """
-    held = Rows() if rows is None else rows
+    held = NoRows() if rows is None else rows
     loose = np.setdiff1d(np.arange(particles), np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
     shapes = [*held.shapes, *([Shape("", loose[:, None])] if len(loose) else [])]
-    kernels = Kernels(shapes, groups, rows is not None, tidy=tidy, fixed=held.fixed)
+    kernels = Kernels(shapes, groups, rows is not None, tidy=tidy, fixed=held.fixed, placed=held.placed)
     parts = divided(operations, noisy)
     actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
     order = np.concatenate(kernels.order)
     arrays = standard_arrays([*parameters.values()], [*memory.values()], seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
+    arrays += [Array("cells", "int", np.zeros(3 * particles))] * (len(held.placed) > 0)
     work_group = 1 if platform in PLAIN else held.work_group
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}

@@ -31,6 +31,7 @@ public:
     void execute(ContextImpl& c, ProgramIntegrator& integrator, int steps) override {
         ContextSelector selector(cc);
         cc.getIntegrationUtilities().setNextStepSize(integrator.getStepSize());
+        if (!valid && arrays.count("cells")) follow();   // who sets positions begins to count cells anew
         StepKernel::execute(c, integrator, steps);
     }
     void lookBack() override { ContextSelector selector(cc); StepKernel::lookBack(); }
@@ -82,6 +83,13 @@ private:
         for (int k = 0; k < cc.getNumAtoms(); k++) place[index[k]] = k;
         for (size_t k = 0; k < now.size(); k++) now[k] = plan.order[k] < 0 ? -1-place[-1-plan.order[k]] : place[plan.order[k]];
         arrays.at("atoms").upload(now);
+        if (arrays.count("cells") == 0) return;
+        vector<int> cells;
+        for (int k = 0; k < cc.getNumAtoms(); k++) {
+            mm_int4 by = cc.getPosCellOffsets()[k];
+            cells.insert(cells.end(), {by.x, by.y, by.z});
+        }
+        arrays.at("cells").upload(cells);
     }
     ComputeContext& cc;
     ComputeProgram program;
