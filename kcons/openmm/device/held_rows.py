@@ -54,6 +54,8 @@ def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
     for part in parts:
         if isinstance(part, Constraint):
             found.append(part)
+        elif hasattr(part, "given"):  # all of an integrator, as it has them
+            found += part.given
         elif isinstance(part, CarriedConstraints):
             found += part.motion.sources[0].constraints
         else:

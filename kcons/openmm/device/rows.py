@@ -19,8 +19,6 @@ from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedEr
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.carried_constraints import with_massless_atoms
 from kcons.openmm.device.held_rows import IN_CELLS, STORED, HeldRows, Pattern, constraints_of
-from kcons.openmm.device.held_rows import molecules_of as molecules_of
-from kcons.openmm.device.held_rows import refusal as refusal
 from kcons.openmm.device.kernels import Array, Shape
 from kcons.openmm.device.large_clusters import LargeClusters, group_size
 from kcons.openmm.device.small_clusters import ItemWriter, Record
