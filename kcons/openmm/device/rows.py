@@ -94,8 +94,7 @@ class DeviceRows:
         tables = [np.zeros(1)]
         for number, pattern in enumerate(small):
             record = self._record(pattern, sum(table.size for table in tables))
-            timed = [function.second is not None for function in held.functions]
-            texts.append(ItemWriter(f"s{number}", pattern, record, sum(map(len, order)), timed).text())
+            texts.append(ItemWriter(f"s{number}", pattern, record, sum(map(len, order)), held).text())
             tables.append(record.table.ravel())
             order.append(pattern.clusters.ravel())
             self.shapes.append(Shape(f"s{number}", pattern.atoms, False, pattern.rank))
