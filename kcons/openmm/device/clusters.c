@@ -16,25 +16,33 @@
 #define PLACE(p) (3*rows_slot[2*(p)])
 
 // Values and gradients at x + d (moved) or at x, of rows first to last; those of velocities `half_way` before `time`.
+// Shortest images are found at x, and kept.
 DEVICE void rows_evaluate(ROWS int first, int last, mixed time, mixed half_way, int moved, GLOBAL const mixed* x, GLOBAL const mixed* d, GLOBAL mixed* result) {
     for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
-        int begin = ROW(k, 1), end = ROW(k+1, 1), how = ROW(k, 3), rolls = ROW(k, 6) & 1, size = 3*(end-begin);
-        GLOBAL mixed* r = rows_place+6*begin;
-        mixed px = 0, py = 0, pz = 0, share = moved ? (rolls ? (mixed) 0.5 : (mixed) 1) : (mixed) 0;
+        int begin = ROW(k, 1), end = ROW(k+1, 1), how = ROW(k, 3), rolls = ROW(k, 6) & 1, size = 3*(end-begin), s = PLACE(begin);
+        GLOBAL mixed *r = rows_place+9*begin, *base = r+2*size;
+        mixed share = rolls ? (mixed) 0.5 : (mixed) 1;
         for (int p = begin; p < end; p++) {
-            int a = PLACE(p), b = PLACE(how == 2 && p > begin ? p-1 : begin), at = 3*(p-begin);
-            mixed ux = x[a], uy = x[a+1], uz = x[a+2], sx = d[a], sy = d[a+1], sz = d[a+2];
-            if (rolls) {r[size+at] = moved ? sx : 0; r[size+at+1] = moved ? sy : 0; r[size+at+2] = moved ? sz : 0;}
-            if (how) {ux -= x[b]; uy -= x[b+1]; uz -= x[b+2]; sx -= d[b]; sy -= d[b+1]; sz -= d[b+2];}
-            if (how == 2) {ROWS_NEAR(ux, uy, uz)}
+            int a = PLACE(p), at = 3*(p-begin);
+            mixed ux = x[a], uy = x[a+1], uz = x[a+2];
+            if (how == 2 && moved) {ux = base[at]; uy = base[at+1]; uz = base[at+2];}
+            else if (how == 2) {
+                int b = PLACE(p > begin ? p-1 : p);
+                ux -= x[b]; uy -= x[b+1]; uz -= x[b+2];
+                ROWS_NEAR(ux, uy, uz)
+                if (p > begin) {ux += base[at-3]; uy += base[at-2]; uz += base[at-1];}
+                base[at] = ux; base[at+1] = uy; base[at+2] = uz;
+            }
+            else if (how) {ux -= x[s]; uy -= x[s+1]; uz -= x[s+2];}
             if (how == 3) {
-                GLOBAL const mixed* n = rows_cells+ROWS_FIRST_CELL+ROW(k, 8)+3*(p-begin);
+                GLOBAL const mixed* n = rows_cells+ROWS_FIRST_CELL+ROW(k, 8)+at;
                 ux += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; uy += n[1]*box1.y+n[2]*box2.y; uz += n[2]*box2.z;
             }
-            if (share == 0) {sx = 0; sy = 0; sz = 0;}
-            if (how != 2) {px = 0; py = 0; pz = 0;}
-            px += ux+share*sx; py += uy+share*sy; pz += uz+share*sz;
-            r[at] = px; r[at+1] = py; r[at+2] = pz;
+            if (rolls) for (int c = 0; c < 3; c++) r[size+at+c] = moved ? d[a+c] : (mixed) 0;
+            if (moved) {
+                ux += share*(how ? d[a]-d[s] : d[a]); uy += share*(how ? d[a+1]-d[s+1] : d[a+1]); uz += share*(how ? d[a+2]-d[s+2] : d[a+2]);
+            }
+            r[at] = ux; r[at+1] = uy; r[at+2] = uz;
         }
         rows_function(ROW(k, 0), r, rows_parameter+ROW(k, 2), rolls ? time-half_way : time, result+3*begin+k);
     }
@@ -102,42 +110,51 @@ DEVICE void rows_push(ROWS int cluster, GLOBAL const mixed* there, GLOBAL mixed*
     }
 }
 
-DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const mixed* x, GLOBAL mixed* d, GLOBAL const mixed* w) {
+// How far rows are off at x + d; returns a row that is off more than it may be by its number + 1, 0 if there is none, and
+// the negative where a row is not finite.
+DEVICE int rows_measure(ROWS int cluster, mixed h, mixed time, GLOBAL const mixed* x, GLOBAL const mixed* d) {
     int first = rows_cluster[3*cluster], last = rows_cluster[3*cluster+3];
+    if (LOCAL_ID == 0) {scratch[0] = 0; scratch[1] = 0;}
+    rows_evaluate(ROWS_PASS first, last, time, h/2, 1, x, d, rows_now);
+    SYNC_THREADS;
+    for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
+        int begin = ROW(k, 1), rolls = ROW(k, 6) & 1;
+        mixed wanted = rows_number[3*k], period = rows_number[3*k+2], along = 0, reach = 0;
+        if (ROW(k, 7) >= 0) wanted = rows_moving(rows_knots, ROW(k, 7), rolls ? time-h/2 : time, 0);
+        mixed off = rows_now[3*begin+k]-(rolls ? h*wanted : wanted);
+        if (period > 0) off -= period*rint(off/period);
+        rows_off[k] = off;
+        for (int q = 3*begin+k+1; q < 3*ROW(k+1, 1)+k+1; q++) along += rows_now[q]*rows_there[q];
+#ifdef SINGLE
+        if (!ROW(k, 3)) for (int p = begin; p < ROW(k+1, 1); p++) for (int c = 0; c < 3; c++) reach += fabs(rows_there[3*p+k+1+c]*x[PLACE(p)+c]);
+#endif
+        mixed allowed = tolerance*rows_number[3*k+1]*(rolls ? (mixed) 0.0625 : (mixed) 1)+(mixed) 5e-7*reach;
+        if (!(fabs(off) <= allowed && along > 0)) scratch[0] = k+1;
+        if (!(fabs(off) < ROWS_FAR)) scratch[1] = k+1;
+    }
+    SYNC_THREADS;
+    int missed = (int) scratch[0], lost = (int) scratch[1];
+    SYNC_THREADS;
+    return lost ? -lost : missed;
+}
+
+DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const mixed* x, GLOBAL mixed* d, GLOBAL const mixed* w) {
+    int first = rows_cluster[3*cluster], last = rows_cluster[3*cluster+3], turn = 0;
     rows_evaluate(ROWS_PASS first, last, time-h, 0, 0, x, d, rows_there);
     for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) rows_sum[k] = 0;
-    for (int turn = 0;; turn++) {
-        SYNC_THREADS;
-        if (LOCAL_ID == 0) {scratch[0] = 0; scratch[1] = 0;}
-        SYNC_THREADS;
-        rows_evaluate(ROWS_PASS first, last, time, h/2, 1, x, d, rows_now);
-        for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
-            int begin = ROW(k, 1), rolls = ROW(k, 6) & 1;
-            mixed wanted = rows_number[3*k], period = rows_number[3*k+2], along = 0, reach = 0;
-            if (ROW(k, 7) >= 0) wanted = rows_moving(rows_knots, ROW(k, 7), rolls ? time-h/2 : time, 0);
-            if (rolls) wanted *= h;
-            mixed off = rows_now[3*begin+k]-wanted;
-            if (period > 0) off -= period*rint(off/period);
-            rows_off[k] = off;
-            for (int q = 3*begin+k+1; q < 3*ROW(k+1, 1)+k+1; q++) along += rows_now[q]*rows_there[q];
-#ifdef SINGLE
-            if (!ROW(k, 3)) for (int p = begin; p < ROW(k+1, 1); p++) for (int c = 0; c < 3; c++) reach += fabs(rows_there[3*p+k+1+c]*x[PLACE(p)+c]);
-#endif
-            mixed allowed = tolerance*rows_number[3*k+1]*(rolls ? (mixed) 0.0625 : (mixed) 1)+(mixed) 5e-7*reach;
-            if (!(fabs(off) <= allowed && along > 0)) scratch[0] = k+1;
-            if (!(fabs(off) < ROWS_FAR)) scratch[1] = k+1;
-        }
-        SYNC_THREADS;
-        int missed = (int) scratch[0], lost = (int) scratch[1];
-        if (!missed) break;
-        if (turn == ROWS_TURNS || lost) {
-            int k = (lost ? lost : missed)-1;
-            if (LOCAL_ID == 0) FAIL(ROWS_FIRST_LARGE+k, rows_off[k]);
-            break;
-        }
+    SYNC_THREADS;
+    int missed = rows_measure(ROWS_PASS cluster, h, time, x, d);
+    while (missed > 0 && turn < ROWS_TURNS) {
         rows_solve(ROWS_PASS cluster, turn%ROWS_CHORD == 0, rows_now, rows_there, w);
         rows_push(ROWS_PASS cluster, rows_there, d, w);
         for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) rows_sum[k] += rows_answer[k];
+        SYNC_THREADS;
+        missed = rows_measure(ROWS_PASS cluster, h, time, x, d);
+        turn++;
+    }
+    if (missed && LOCAL_ID == 0) {
+        int k = (missed > 0 ? missed : -missed)-1;
+        FAIL(ROWS_FIRST_LARGE+k, rows_off[k])
     }
     for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_sum[k]/h;
     SYNC_THREADS;
@@ -153,7 +170,7 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
             mixed off = 0;
             if (ROW(k, 7) >= 0) off = -rate*rows_moving(rows_knots, ROW(k, 7), time, rolls ? 0 : 1);
             else if (rolls) off = -rate*rows_number[3*k];
-            if (rate != 0) off += rate*rows_drift(ROW(k, 0), rows_place+6*begin, rows_parameter+ROW(k, 2), time);
+            if (rate != 0) off += rate*rows_drift(ROW(k, 0), rows_place+9*begin, rows_parameter+ROW(k, 2), time);
             for (int p = begin; p < ROW(k+1, 1); p++) {
                 int g = 3*p+k+1, a = PLACE(p);
                 off += rows_there[g]*v[a]+rows_there[g+1]*v[a+1]+rows_there[g+2]*v[a+2];

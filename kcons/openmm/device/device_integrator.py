@@ -17,18 +17,21 @@ from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError, UnsupportedError
 from kcons.openmm.device import build
+from kcons.openmm.device.held_rows import molecules_of
+from kcons.openmm.device.held_rows import refusal as rows_refusal
+from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, plan
-from kcons.openmm.device.rows import molecules_of, rows_of
-from kcons.openmm.device.rows import refusal as rows_refusal
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
-from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
+from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
+from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.states import box_of, positions_of
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
@@ -177,6 +180,17 @@ class DeviceIntegrator(ProjectedIntegrator):
         self._key = uuid4().hex
         _ALIVE[self._key] = self
 
+    def _held(self, parts: Any) -> tuple[Part, ...]:
+        return as_parts(parts)
+
+    def _write(self, program: Program) -> Step:
+        """A step without parts: kernels hold their rows."""
+        step = Step(program, self.scheme, (), self._ensemble)
+        write_step(step, self._own_step)
+        for part in self.parts:
+            part.program = self.program
+        return step
+
     def describe(self) -> bool:
         """Tell the plugin what a step is; returns whether it knew another one."""
         program = self.program
@@ -280,6 +294,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         program = self.program
         if name == "motion":
             return self._look()[0]
+        if name == "failed":  # a call that fails raises
+            return 0.0
         if name in program.kept and self.bound:
             return float(self.read("memory")[program.kept.index(name)])
         if name in program.settings:
@@ -343,17 +359,19 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     integrator = _ALIVE.get(described["integrator"])
     if described["parts"] and integrator is None:
         raise UnsupportedError("no text has the parts of an integrator: read it by from_xml(xml, parts=...)")
-    parts = () if integrator is None else integrator.parts
+    part = integrator.parts[0] if integrator is not None and integrator.parts else None
+    assert part is None or isinstance(part, KernelRows)
     if not given.positions:
-        for atoms in molecules_of(pairs, parts):
+        for atoms in molecules_of(pairs, () if part is None else part.given):
             members = np.ascontiguousarray(atoms, dtype=np.int32)
             library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
         return
     rows: Any = NoRows()
-    if n or parts:
+    if n or part is not None:
         positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
         box = np.array(given.box[:9]).reshape(3, 3)
-        rows = rows_of(masses, (pairs, lengths), parts, positions, box if box.any() else None, given.time)
+        made_of = masses, (pairs, lengths), positions, box if box.any() else None, given.time
+        rows = KernelRows(()).rows_at(*made_of) if part is None else part.rows_at(*made_of)
     if integrator is not None:
         integrator.rows = rows
     platform = given.platform.decode()

@@ -54,6 +54,8 @@ def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
     for part in parts:
         if isinstance(part, Constraint):
             found.append(part)
+        elif hasattr(part, "given"):  # all of an integrator, as it has them
+            found += part.given
         elif isinstance(part, CarriedConstraints):
             found += part.motion.sources[0].constraints
         else:
@@ -85,6 +87,7 @@ class Function(NamedTuple):
     known: tuple[float, ...]
     second: Callable[..., Any] | None
     parameters: int
+    is_distance: bool = False
 
     def text(self, name: str, space: str = "") -> str:
         """Its C function; with the time in it, also ``NAME_rate``."""
@@ -125,7 +128,7 @@ def function_of(item: Constraint) -> Function:
     if item.alike and not known:
         known = tuple(item.parameters()[0, : item.alike].tolist())
     size = len(item.names) if isinstance(item, Formula) else 0
-    found = Function(getattr(item.row, "py_func", item.row), item.width, known, second, size)
+    found = Function(getattr(item.row, "py_func", item.row), item.width, known, second, size, item.holds_length)
     found.text("looked_at")
     return found
 
@@ -208,8 +211,10 @@ class HeldRows:
             self.parameters += list(item.parameters().reshape(item.n_rows, -1))
             atoms += list(item.atoms)
             number = -1 if item.fixes_atoms else known.setdefault(function_of(item), len(known))
-            how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if held.lattice is None else NEAREST)
-            if item.relative and item.whole is not None:
+            # OpenMM keeps molecules in one piece: its own constraints know no images.
+            open_ = held.lattice is None or start + item.n_rows <= summed_from
+            how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if open_ else NEAREST)
+            if item.relative and item.whole is not None and not open_:
                 how[item.whole] = IN_CELLS
             moves, period = isinstance(item.target, MovingTarget), item.period or 0.0
             if moves:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ class _Engine:
 
     def follow_cell(self, state: openmm.State) -> None:
         cell = cell_of(state.getPeriodicBoxVectors())
-        if not np.array_equal(cell, self.cell):
+        if self.cell is None or not np.array_equal(cell, self.cell):
             self.motion.set_cell(cell)
             self.cell = cell
 
@@ -50,8 +50,8 @@ class KernelRows(CarriedConstraints):
     Parameters
     ----------
     parts : sequence of Constraint or CarriedConstraints
-        What ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; numbers of nm, ps, dalton, radian. Targets
-        left at None are taken from the positions at the first step.
+        What ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; numbers of nm, ps, dalton, radian.
+        Targets left at None are taken from the positions at the first step.
 
     Notes
     -----
@@ -109,13 +109,19 @@ class KernelRows(CarriedConstraints):
         if system.usesPeriodicBoundaryConditions():
             cell = cell_of(context.getState().getPeriodicBoxVectors())
         masses = masses_of(system)
-        touched = np.unique(np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in self.given)]))
-        refuse_virtual_sites(system, touched, masses)
+        refuse_virtual_sites(system, self.atoms, masses)
         time = float(context.getTime()._value)
         return self.rows_at(masses, (pairs, lengths), positions_of(context), cell, time)
 
     @property
-    def _engine(self) -> Any:
+    def atoms(self) -> IntArray:
+        """Particles that a row of the parts touches, and of the System's constraints once they are known."""
+        if self._bound is not None:
+            return self._bound[1].atoms
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in self.given)]))
+
+    @property
+    def _engine(self) -> Any:  # type: ignore[override]
         if self._bound is None:
             raise InputError(
                 "these rows are known at the first step of a Context; call integrator.attach(context) after its "
@@ -183,9 +189,9 @@ class KernelRows(CarriedConstraints):
         return f"<KernelRows: {sum(item.n_rows for item in self.given)} rows and the constraints of the System>"
 
 
-def as_parts(parts: Any, everything: bool) -> tuple[Part, ...]:
-    """What an integrator on the device holds: one part of all, or none."""
-    given = tuple(parts) if isinstance(parts, Sequence) else (parts,)
-    if len(given) == 1 and isinstance(given[0], KernelRows):
+def as_parts(parts: Any) -> tuple[Part, ...]:
+    """What an integrator on the device was given to hold as one part; nothing where that is nothing."""
+    given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+    if not given or (len(given) == 1 and isinstance(given[0], KernelRows)):
         return given
-    return (KernelRows(given),) if given or everything else ()
+    return (KernelRows(given),)

@@ -598,7 +598,7 @@ class Kernels:
             words = {"EACH": f"for (int a = LOCAL_ID; a < {n}; a += LOCAL_SIZE)", "ROOM": "", "SYNC": "SYNC_THREADS;"}
             atom = f"atoms[{place.atoms}+({cluster})*{n}+a]"
             words["AT"] = f"RESTS({atom})" if self.resting else atom
-            load = " SYNC_THREADS;\n"
+            load = " SYNC\n"
         else:
             room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n"
             words = {"EACH": f"for (int a = 0; a < {n}; a++)", "ROOM": f"mixed d[{3 * n}];", "SYNC": "", "AT": "at[a]"}

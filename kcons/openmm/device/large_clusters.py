@@ -206,7 +206,7 @@ class LargeClusters:
         parameters = np.concatenate([held.parameters[row] for row in self.rows] + [np.zeros(1)])
         self.arrays += [Array("rows_number", "mixed", numbers.ravel()), Array("rows_parameter", "mixed", parameters)]
         count, slots, entries = used["row"], used["slot"], used["entry"]
-        rooms = {"place": 6 * slots, "now": 3 * slots + count, "there": 3 * slots + count}
+        rooms = {"place": 9 * slots, "now": 3 * slots + count, "there": 3 * slots + count}
         rooms |= {"upper": entries, "lower": entries} | dict.fromkeys(("pivot", "off", "answer", "sum"), count)
         self.arrays += [Array(f"rows_{name}", "mixed", np.zeros(size)) for name, size in rooms.items()]
         self.source = self._source(patterns, held, first_row, cells_begin)

@@ -19,8 +19,6 @@ from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedEr
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.carried_constraints import with_massless_atoms
 from kcons.openmm.device.held_rows import IN_CELLS, STORED, HeldRows, Pattern, constraints_of
-from kcons.openmm.device.held_rows import molecules_of as molecules_of
-from kcons.openmm.device.held_rows import refusal as refusal
 from kcons.openmm.device.kernels import Array, Shape
 from kcons.openmm.device.large_clusters import LargeClusters, group_size
 from kcons.openmm.device.small_clusters import ItemWriter, Record
@@ -96,8 +94,7 @@ class DeviceRows:
         tables = [np.zeros(1)]
         for number, pattern in enumerate(small):
             record = self._record(pattern, sum(table.size for table in tables))
-            timed = [function.second is not None for function in held.functions]
-            texts.append(ItemWriter(f"s{number}", pattern, record, sum(map(len, order)), timed).text())
+            texts.append(ItemWriter(f"s{number}", pattern, record, sum(map(len, order)), held).text())
             tables.append(record.table.ravel())
             order.append(pattern.clusters.ravel())
             self.shapes.append(Shape(f"s{number}", pattern.atoms, False, pattern.rank))

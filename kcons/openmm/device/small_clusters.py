@@ -1,7 +1,7 @@
 """Small clusters: straight code for a work-item, which has the cluster in registers.
 
-Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is written out: what stays zero has no code. J is made
-row by row, so that only the gradients at the start of the drift are kept.
+Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is written out: what stays zero has no code. A distance
+is written as (u.u - t^2)/2t with the gradient u/t, which needs neither root nor division.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FEW = 4
 
 
 class Record:
-    """Numbers of each cluster of a pattern, one after another; targets that all clusters share are in the code.
+    """Numbers of each cluster of a pattern, one after another; targets of the System that all share are in the code.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Record:
     """
 
     def __init__(self, pattern: Pattern, held: HeldRows, start: int, first_cell: int) -> None:
-        self.start, self.first_cell, self.cell_size = start, first_cell, 0
+        self.start, self.first_cell, self.cell_size, self.size = start, first_cell, 0, 0
         self.targets: list[str] = []
         self.scales: list[str] = []
         self.parameters: list[int] = []
@@ -47,105 +47,138 @@ class Record:
                 if not row.summed and np.all(values == values[0]):
                     texts.append(literal(values[0]))
                 else:
-                    texts.append(f"n[{sum(c.shape[1] for c in columns)}]")
+                    texts.append(f"n[{self.size}]")
                     columns.append(values[:, None])
-            self.parameters.append(sum(c.shape[1] for c in columns))
+                    self.size += 1
+            self.parameters.append(self.size)
             columns.append(np.array([held.parameters[i] for i in mine]))
+            self.size += columns[-1].shape[1]
             self.cells.append(self.cell_size)
             self.cell_size += 3 * len(row.atoms) if row.how == IN_CELLS else 0
         self.table: FloatArray = np.hstack(columns)
-        self.size = self.table.shape[1]
-
-
-def _gathered(row: Row, cells: str, moved: bool) -> str:
-    """Positions of a row's atoms into r, and of rows of velocities the way behind them; at x + d or at x."""
-    lines, share = [], "(mixed) 0.5*" if row.rolls else ""
-    first, size = 3 * row.atoms[0], 3 * len(row.atoms)
-    for i, atom in enumerate(row.atoms):
-        a, b = 3 * atom, 3 * row.atoms[i - 1] if row.how == NEAREST and i else first
-        place = [f"x[{a + c}]" if row.how == STORED else f"x[{a + c}]-x[{b + c}]" for c in range(3)]
-        way = [f"d[{a + c}]" if row.how == STORED else f"(d[{a + c}]-d[{b + c}])" for c in range(3)]
-        if row.how != STORED and a == b:
-            place, way = ["0"] * 3, ["0"] * 3
-        lines.append(f" {{mixed ux = {place[0]}, uy = {place[1]}, uz = {place[2]};")
-        if row.how == NEAREST and i:
-            lines.append(" ROWS_NEAR(ux, uy, uz)")
-        if row.how == IN_CELLS and i:
-            n = [f"{cells}[{3 * i + c}]" for c in range(3)]
-            lines.append(f" ux += {n[0]}*box0.x+{n[1]}*box1.x+{n[2]}*box2.x; uy += {n[1]}*box1.y+{n[2]}*box2.y;")
-            lines.append(f" uz += {n[2]}*box2.z;")
-        for c, u in enumerate(("ux", "uy", "uz")):
-            before = f"r[{3 * (i - 1) + c}]+" if row.how == NEAREST and i else ""
-            lines.append(f" r[{3 * i + c}] = {before}{u}{f'+{share}{way[c]}' if moved else ''};")
-            if row.rolls:
-                lines.append(f" r[{size + 3 * i + c}] = {f'd[{a + c}]' if moved else '0'};")
-        lines.append("}\n")
-    return "".join(lines)
 
 
 class ItemWriter:
     """The two functions of a pattern for a work-item; numbers of cluster c begin at ``n``."""
 
-    def __init__(self, name: str, pattern: Pattern, record: Record, first_row: int, timed: list[bool]) -> None:
-        self.name, self.record, self.timed = name, record, timed
+    def __init__(self, name: str, pattern: Pattern, record: Record, first_row: int, held: HeldRows) -> None:
+        self.name, self.record, self.held = name, record, held
         self.rows, self.count = pattern.rows, len(pattern.rows)
-        self.filled: list[set[int]] = []
+        self.row_number = f"{first_row}+cluster*{self.count}"
         #: Whether the matrix is in the precision of forces.
         self.coarse = self.count >= FEW and not any(row.depends for row in self.rows)
-        self.row_number = f"{first_row}+cluster*{self.count}"
-        self.slots = np.concatenate([[0], np.cumsum([len(row.atoms) for row in self.rows])]).tolist()
+        self.filled: list[set[int]] = []
 
     def text(self) -> str:
         return self.positions() + self.velocities()
 
-    def _begin(self, what: str, rest: str, positions: str, changed: str) -> str:
-        rolls = any(row.rolls for row in self.rows)
-        widest = 3 * max(len(row.atoms) for row in self.rows)
-        numbers = f" GLOBAL const mixed* n = rows_numbers+{self.record.start}+cluster*{self.record.size};\n"
+    def _plain(self, row: Row) -> bool:
+        """Whether a row is a distance that is held at one length."""
+        return self.held.functions[row.function].is_distance and not row.moves
+
+    def _each(self, write: Callable[[int, Row], str]) -> str:
+        return "".join(write(k, row) for k, row in enumerate(self.rows))
+
+    def _begin(self, what: str, first: str, changed: str) -> str:
+        def room(k: int, row: Row) -> str:
+            size = 3 * len(row.atoms)
+            kept = f", b{k}[{size}]" if row.how == NEAREST else ""
+            return f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}]{kept};\n"
+
+        lengths = self._each(lambda k, r: f" mixed i{k} = 1/{self.record.targets[k]};\n" if self._plain(r) else "")
         return (
-            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {rest}, mixed time, const mixed* x, "
-            f"mixed* {changed}, const mixed* w) {{\n mixed r[{widest * (1 + rolls)}], o[{1 + widest}], "
-            f"g[{3 * self.slots[-1]}], off[{self.count}], sum[{self.count}];\n"
-            f" {'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n{numbers}"
+            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
+            f"mixed* {changed}, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.record.start}+cluster*"
+            f"{self.record.size};\n{self._each(room)}{lengths} mixed off[{self.count}], sum[{self.count}];\n "
+            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
         )
 
-    def _call(self, k: int, time: str, moved: bool) -> str:
-        """Value and gradient of row k in o."""
-        row = self.rows[k]
-        place = f"{self.record.first_cell + self.record.cells[k]}+cluster*{self.record.cell_size}"
-        cells = f"(rows_cells+{place})" if row.how == IN_CELLS else ""
-        return f"{_gathered(row, cells, moved)} rows_f{row.function}(r, n+{self.record.parameters[k]}, {time}, o);\n"
+    # -- rows ------------------------------------------------------------------------------------
 
-    def _reference(self, time: str, then: Callable[[int], str]) -> str:
-        lines = []
+    def _gathered(self, k: int, row: Row, moved: bool) -> str:
+        """Positions of a row's atoms into r, at x or at x + d; of rows of velocities the way stands behind them."""
+        lines, first, size = [], 3 * row.atoms[0], 3 * len(row.atoms)
+        for i, atom in enumerate(row.atoms):
+            for c in range(3):
+                a, s, own = 3 * atom + c, first + c, f"r{k}[{3 * i + c}]"
+                place, way = f"x[{a}]", f"d[{a}]"
+                if row.how != STORED:
+                    place, way = (f"x[{a}]-x[{s}]", f"(d[{a}]-d[{s}])") if i else ("0", "0")
+                    if row.how == NEAREST:
+                        place = f"b{k}[{3 * i + c}]"
+                if row.how == IN_CELLS and i:
+                    cells = f"{self.record.first_cell + self.record.cells[k] + 3 * i}+cluster*{self.record.cell_size}"
+                    shift = [f"rows_cells[{cells}+{m}]*box{m}.{'xyz'[c]}" for m in range(c, 3)]
+                    place = "+".join([place, *shift])
+                half_way = "(mixed) 0.5*" if row.rolls else ""
+                lines.append(f" {own} = {place}{f'+{half_way}{way}' if moved else ''};")
+                if row.rolls:
+                    lines.append(f" r{k}[{size + 3 * i + c}] = {f'd[{a}]' if moved else '0'};")
+        return "".join(lines) + "\n"
+
+    def _images(self, k: int, row: Row) -> str:
+        """Shortest images along the list, once: atoms move by less than half the cell."""
+        if row.how != NEAREST:
+            return ""
+        lines = [f" b{k}[{c}] = 0;" for c in range(3)]
+        for i in range(1, len(row.atoms)):
+            a, s = 3 * row.atoms[i], 3 * row.atoms[i - 1]
+            lines.append(f" {{mixed ux = x[{a}]-x[{s}], uy = x[{a + 1}]-x[{s + 1}], uz = x[{a + 2}]-x[{s + 2}];")
+            lines.append(" ROWS_NEAR(ux, uy, uz)")
+            lines += [f" b{k}[{3 * i + c}] = b{k}[{3 * i - 3 + c}]+{u};" for c, u in enumerate(("ux", "uy", "uz"))]
+            lines.append("}")
+        return "".join(lines) + "\n"
+
+    def _value(self, k: int, row: Row, time: str, moved: bool, out: str) -> str:
+        """Value less target, or value alone, and gradient of a row."""
+        text = self._gathered(k, row, moved)
+        if not self._plain(row):
+            return f"{text} rows_f{row.function}(r{k}, n+{self.record.parameters[k]}, {time}, {out});\n"
+        u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.record.targets[k]
+        square = "+".join(f"{each}*{each}" for each in u)
+        lines = [f" {out}[{1 + c}] = -i{k}*{u[c]}; {out}[{4 + c}] = i{k}*{u[c]};" for c in range(3)]
+        return f"{text} {out}[0] = ({square}-{t}*{t})*((mixed) 0.5*i{k});{''.join(lines)}\n"
+
+    def _reference(self, time: str) -> str:
+        def one(k: int, row: Row) -> str:
+            kept = "".join(f" g{k}[{c}] = o{k}[{1 + c}];" for c in range(3 * len(row.atoms)))
+            return f"{self._images(k, row)}{self._value(k, row, time, False, f'o{k}')}{kept} sum[{k}] = 0;\n"
+
+        return self._each(one)
+
+    def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
+        """Target of a row at a time, or its rate; of rows of velocities there is no rate."""
+        if row.moves:
+            return f"rows_moving(rows_knots, (int) {self.record.targets[k]}, {time}, {rate})"
+        return "0" if rate else self.record.targets[k]
+
+    # -- algebra ---------------------------------------------------------------------------------
+
+    def _product(self, k: int, j: int, left: str) -> str:
+        """Entry of J: the gradient of row k in `left` times M^-1 that of row j at the start; '' where it is zero."""
+        terms = [
+            f"w[{a}]*({'+'.join(f'{left.format(k, 3 * p + c)}*g{j}[{3 * q + c}]' for c in range(3))})"
+            for p, a in enumerate(self.rows[k].atoms)
+            for q, b in enumerate(self.rows[j].atoms)
+            if a == b
+        ]
+        return "+".join(terms)
+
+    def _factored(self, symmetric: bool) -> str:
+        """J, and its L and U in place, without pivoting: it is nearly symmetric and positive."""
+        n, left = self.count, "g{}[{}]" if symmetric else "o{}[1+{}]"
+        lines = [" mixed whole;\n"] if any(row.depends for row in self.rows) else []
+        filled = self.filled = [set[int]() for _ in self.rows]
+        for k in range(n):
+            for j in range(n):
+                text = self._product(k, j, left)
+                if text:
+                    filled[k].add(j)
+                    lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if symmetric and j < k else text};\n")
         for k, row in enumerate(self.rows):
-            lines.append(self._call(k, time, False))
-            lines += [f" g[{3 * self.slots[k] + c}] = o[{1 + c}];" for c in range(3 * len(row.atoms))]
-            lines.append(then(k) + "\n")
-        return "".join(lines)
-
-    def _products(self, k: int, gradient: Callable[[int], str]) -> tuple[str, set[int]]:
-        """Row k of J, from its gradient and those at the reference; which entries are not zero."""
-        lines, there = [], set()
-        for j, other in enumerate(self.rows):
-            terms = [
-                f"w[{a}]*({'+'.join(f'{gradient(3 * p + c)}*g[{3 * (self.slots[j] + q) + c}]' for c in range(3))})"
-                for p, a in enumerate(self.rows[k].atoms)
-                for q, b in enumerate(other.atoms)
-                if a == b
-            ]
-            if terms:
-                there.add(j)
-                lines.append(f" J[{k * self.count + j}] = {'+'.join(terms)};\n")
-        return "".join(lines), there
-
-    def _factored(self, there: list[set[int]]) -> str:
-        """L and U in place, without pivoting: J is nearly symmetric and positive."""
-        n, lines = self.count, []
-        filled = [set(each) for each in there]
-        for k, row in enumerate(self.rows):
+            pivot = f"J[{k * n + k}]"
             if row.depends:
-                lines.append(f" whole = fabs((mixed) J[{k * n + k}]);\n")
+                lines.append(f" whole = fabs((mixed) {pivot});\n")
             for m in range(k):
                 if m not in filled[k]:  # which grows
                     continue
@@ -154,12 +187,9 @@ class ItemWriter:
                     old = f"J[{k * n + j}]" if j in filled[k] else "0"
                     filled[k].add(j)
                     lines.append(f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n")
-            pivot = f"J[{k * n + k}]"
             none = f"fabs((mixed) {pivot}) <= ROWS_PIVOT*whole ? 0 : " if row.depends else ""
             lines.append(f" {pivot} = {none}1/{pivot};\n")
-        declared = " mixed whole;\n" if any(row.depends for row in self.rows) else ""
-        self.filled = filled
-        return f"{declared}{''.join(lines)}"
+        return "".join(lines)
 
     def _solved(self) -> str:
         """J y = off, y, and what it takes from d or v, which is called `d`."""
@@ -171,83 +201,64 @@ class ItemWriter:
             taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(self.filled[k]) if j > k)
             lines.append(f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n")
         for k, row in enumerate(self.rows):
-            for p, a in enumerate(row.atoms):
-                for c in range(3):
-                    lines.append(f" d[{3 * a + c}] -= w[{a}]*g[{3 * (self.slots[k] + p) + c}]*y[{k}];")
-            lines.append("\n")
+            each = [(3 * a + c, a, 3 * p + c) for p, a in enumerate(row.atoms) for c in range(3)]
+            lines += [f" d[{place}] -= w[{a}]*g{k}[{slot}]*y[{k}];" for place, a, slot in each] + ["\n"]
         return "".join(lines)
 
     def _sums(self, by: str) -> str:
-        lines = [f" rows_sums[{self.row_number}+{k}] -= sum[{k}]{by};" for k, r in enumerate(self.rows) if r.summed]
-        return "".join(lines) + "\n"
+        return self._each(lambda k, r: f" rows_sums[{self.row_number}+{k}] -= sum[{k}]{by};\n" if r.summed else "")
 
-    def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
-        """Target of a row at a time, or its rate."""
-        if row.moves:
-            return f"rows_moving(rows_knots, (int) {self.record.targets[k]}, {time}, {rate})"
-        return self.record.targets[k] if not rate else "0"
+    # -- functions -------------------------------------------------------------------------------
 
     def positions(self) -> str:
-        rows = self.rows
-        start = "".join(
-            f" mixed t{k} = {'h*' if r.rolls else ''}{self._wanted(k, r, 'time-h/2' if r.rolls else 'time', 0)}, "
-            f"a{k} = tolerance*{self.record.scales[k]}{'*(mixed) 0.0625' if r.rolls else ''};\n"
-            for k, r in enumerate(rows)
-        )
+        """x + d on the rows."""
 
-        def rounded(k: int) -> str:
-            if rows[k].how != STORED:
-                return f" sum[{k}] = 0;"
-            size = "+".join(f"fabs(o[{1 + c}]*r[{c}])" for c in range(3 * len(rows[k].atoms)))
-            return f" sum[{k}] = 0;\n#ifdef SINGLE\n a{k} += (mixed) 5e-7*({size});\n#endif"
+        def start(k: int, row: Row) -> str:
+            goal = self._wanted(k, row, "time-h/2" if row.rolls else "time", 0)
+            rounded = ""
+            if row.how == STORED:
+                size = "+".join(f"fabs(o{k}[{1 + c}]*r{k}[{c}])" for c in range(3 * len(row.atoms)))
+                rounded = f"\n#ifdef SINGLE\n a{k} += (mixed) 5e-7*({size});\n#endif\n"
+            return (
+                f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, "
+                f"a{k} = tolerance*{self.record.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
+            )
 
-        there, turn = [], []
-        for k, row in enumerate(rows):
-            turn.append(self._call(k, "time-h/2" if row.rolls else "time", True))
-            off = f"off[{k}] = o[0]-t{k};"
+        def turn(k: int, row: Row) -> str:
+            text = self._value(k, row, "time-h/2" if row.rolls else "time", True, f"o{k}")
+            text += f" off[{k}] = o{k}[0]{'' if self._plain(row) else f'-t{k}'};"
             if row.period:
-                off += f" off[{k}] -= {literal(row.period)}*rint(off[{k}]/{literal(row.period)});"
-            along = "+".join(f"o[{1 + c}]*g[{3 * self.slots[k] + c}]" for c in range(3 * len(row.atoms)))
-            turn.append(f" {off} there = there && fabs(off[{k}]) <= a{k} && {along} > 0;   // so that NaN fails\n")
-            turn.append(f" size += fabs(off[{k}]);\n")
-            products, some = self._products(k, lambda c: f"o[{1 + c}]")
-            turn.append(products)
-            there.append(some)
-        told = "".join(f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};" for k in range(self.count - 1, -1, -1))
+                text += f" off[{k}] -= {literal(row.period)}*rint(off[{k}]/{literal(row.period)});"
+            return f"{text} there = there && fabs(off[{k}]) <= a{k};\n"  # so that NaN fails
+
+        def turned(k: int, row: Row) -> str:
+            along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(row.atoms)))
+            return f" if (!({along} > 0)) bad = {k};\n"
+
+        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
+        fail = f"{{FAIL({self.row_number}+bad, off[bad]); return;}}\n"
         return (
-            f"{self._begin('positions', 'h', 'x', 'd')}{start}{self._reference('time-h', rounded)}"
-            f" for (int turn = 0;; turn++) {{\n int there = 1; mixed size = 0;\n{''.join(turn)} if (there) break;\n"
-            f" if (turn == ROWS_TURNS || !(size < ROWS_FAR)) {{\n int bad = 0;{told}\n"
-            f" FAIL({self.row_number}+bad, off[bad]);\n return;\n }}\n"
-            f"{self._factored(there)}{self._solved()} }}\n{self._sums('/h')}}}\n"
+            f"{self._begin('positions', 'h', 'd')}{self._reference('time-h')}{self._each(start)} int bad = -1;\n"
+            f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if (there) break;\n"
+            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
+            f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
         )
 
     def velocities(self) -> str:
-        rows = self.rows
-        kept = "".join(f" mixed c{k} = 0;\n" for k in range(self.count))
+        """v, which is called d, along the rows."""
 
-        def demanded(k: int) -> str:
-            row = rows[k]
-            moving = self._wanted(k, row, "time", 0 if row.rolls else 1)
-            drift = f"-rows_f{row.function}_rate(r, n+{self.record.parameters[k]}, time)"
-            rate = "" if moving == "0" and not row.rolls else moving
-            rate += drift if self.timed[row.function] else ""
-            return f" sum[{k}] = 0;" + (f" if (rate != 0) c{k} = rate*({rate});" if rate else "")
+        def demanded(k: int, row: Row) -> str:
+            rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
+            if self.held.functions[row.function].second is not None:
+                rate += f"-rows_f{row.function}_rate(r{k}, n+{self.record.parameters[k]}, time)"
+            return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
 
-        there, products = [], []
-        for k in range(self.count):
-            slot = 3 * self.slots[k]
-            text, some = self._products(k, lambda c, slot=slot: f"g[{slot + c}]")  # type: ignore[misc]
-            products.append(text)
-            there.append(some)
-        factored = self._factored(there)
-        off = []
-        for k, row in enumerate(rows):
-            slot = 3 * self.slots[k]
-            parts = [f"g[{slot + 3 * p + c}]*d[{3 * a + c}]" for p, a in enumerate(row.atoms) for c in range(3)]
-            off.append(f" off[{k}] = {'+'.join(parts)}-c{k};\n")
+        def speed(k: int, row: Row) -> str:
+            parts = [f"g{k}[{3 * p + c}]*d[{3 * a + c}]" for p, a in enumerate(row.atoms) for c in range(3)]
+            return f" off[{k}] = {'+'.join(parts)}-c{k};\n"
+
         return (
-            f"{self._begin('velocities', 'rate', 'x', 'd')}{kept}{self._reference('time', demanded)}"
-            f"{''.join(products)}{factored} for (int pass = 0; pass < {2 + self.coarse}; pass++) {{\n"
-            f"{''.join(off)}{self._solved()} }}\n if (rate != 0) {{{self._sums('')} }}\n}}\n"
+            f"{self._begin('velocities', 'rate', 'd')}{self._reference('time')}{self._each(demanded)}"
+            f"{self._factored(True)} for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n"
+            f"{self._each(speed)}{self._solved()} }}\n if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )

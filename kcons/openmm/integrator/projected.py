@@ -158,7 +158,7 @@ class ProjectedIntegrator(Integrator):
                 item="ensemble",
             )
         self._ensemble.check(self.scheme)
-        self.parts = _listed(parts)
+        self.parts = self._held(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         _refuse_shared(self.parts)
@@ -168,6 +168,10 @@ class ProjectedIntegrator(Integrator):
         self.program = self._program_type(self)
         self._step = self._write(self.program)
         self.program.hand_over()
+
+    def _held(self, parts: Any) -> tuple[Part, ...]:
+        """The parts, of what was given."""
+        return _listed(parts)
 
     def _make(self, dt: float) -> None:
         """Make the integrator of OpenMM."""

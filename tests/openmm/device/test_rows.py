@@ -7,9 +7,9 @@ from kcons.constraints import Angle, CenterDistance, Custom, Distance, Formula, 
 from kcons.constraints.target import MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.device.c_writer import c_function
-from kcons.openmm.device.held_rows import refusal
+from kcons.openmm.device.held_rows import molecules_of, refusal
 from kcons.openmm.device.large_clusters import elimination
-from kcons.openmm.device.rows import molecules_of, rows_of
+from kcons.openmm.device.rows import rows_of
 from tests.systems.constraint_cases import CASES, MASSES, TIME, scattered
 from tests.systems.device_rows import PlainRows
 from tests.systems.rows_in_cells import CHAIN, ROWS
@@ -104,7 +104,7 @@ def test_targets_move_between_their_knots():
         d = plain.positions(x, np.zeros((2, 3)), np.ones(2), STEP, time)
         assert np.linalg.norm(x[1] + d[1] - x[0] - d[0]) == pytest.approx(1.5 + 0.1 * np.sin(7 * time), abs=2e-13)
         v = plain.velocities(x, np.zeros((2, 3)), np.ones(2), 1.0, time)
-        # Knots are 0.005 apart; their differences round by the value, times the largest coefficient of their polynomial.
+        # Knots are 0.005 apart: what rounds is the difference of two values, times the largest of the coefficients.
         assert v[1, 0] - v[0, 0] == pytest.approx(0.7 * np.cos(7 * time), abs=30 * 1.6 * 2.2e-16 / 0.005)
         assert not plain.velocities(x, np.zeros((2, 3)), np.ones(2), 0.0, time).any()
     plain.positions(x, np.zeros((2, 3)), np.ones(2), STEP, 1.2 + STEP * rows.block)
@@ -149,7 +149,8 @@ def test_residuals_are_the_tolerance_that_was_asked_for(precision, tolerance, n)
     assert np.abs(off).max() <= tolerance + rounding / 0.1
     v = rng.normal(size=x.shape)
     across = plain.rows.set.jacobian(start) @ plain.velocities(start, v, w).ravel()
-    assert np.abs(across).max() <= (3e-5 if precision == "single" else 1e-13)
+    # Small clusters of four rows and more have a matrix of single numbers, which is used twice.
+    assert np.abs(across).max() <= (3e-5 if precision == "single" else 1e-13 if n == 60 else 1e-11)
 
 
 @pytest.mark.parametrize("n", [4, 9])
