@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import GPUS, dumbbell, masses_of, residuals, started, state_of, water_box
+from openmm_systems import GPUS, LONG, dumbbell, masses_of, residuals, started, state_of, water_box
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import (
@@ -47,7 +47,8 @@ def waters(n=8, groups=False):
     """Rigid water on its constraints to rounding, moving along them; in a field of its own group where asked for."""
     system, x = water_box(n, exact=True)  # OpenMM keeps the lengths of rigid water as single numbers
     if groups:
-        field = openmm.CustomExternalForce("40*(sin(3*x)+cos(4*y+z))")
+        # As periodic as the box: GPUs compute it where they have moved molecules to.
+        field = openmm.CustomExternalForce(f"20*(sin({2 * np.pi / 0.62}*x)+cos({2 * np.pi / 0.62}*(y+z)))")
         for k in range(system.getNumParticles()):
             field.addParticle(k)
         field.setForceGroup(1)
@@ -81,28 +82,37 @@ def difference(one, other):
 # -- trajectories -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("platform", PLATFORMS)
-@pytest.mark.parametrize("name", STEPS)
+def cases():
+    """All on platforms that all have; on others what goes through each kind of kernel, the rest in long runs."""
+    for name in STEPS:
+        yield from (pytest.param(name, platform, id=f"{name}-{platform}") for platform in PLAIN)
+        for given in GPUS:
+            usual = name in ("rattle", "Isokinetic", "NoseHoover") and given.id.endswith(("mixed", "none"))
+            if usual or given.id.endswith("double") or name in ("rattle", "Isokinetic"):
+                marks = [*given.marks, *([] if usual else [LONG])]
+                yield pytest.param(name, *given.values, id=f"{name}-{given.id}", marks=marks)
+
+
+@pytest.mark.parametrize(("name", "platform"), cases())
 def test_trajectories_are_those_of_the_custom_integrator(name, platform):
     scheme, ensemble = STEPS[name]
     precision = platform.partition(" ")[2] or "double"
-    if precision != "double" and name not in ("rattle", "Isokinetic", "NoseHoover"):
-        pytest.skip("schemes are compared in double; what precision changes is in OpenMM's forces")
     system, x, v = waters(groups=name == "several steps")
-    calls = (60, 40) if precision == "double" else (6, 4)
+    # With a cutoff below the size of atoms, what differs grows fast.
+    calls = (60, 40) if precision == "double" and not (name == "several steps" and platform not in PLAIN) else (6, 4)
     tolerance = {"double": 1e-13, "mixed": 1e-9, "single": 3e-6}[precision]
     made = {"scheme": scheme, "ensemble": ensemble, "tolerance": tolerance}
     contexts = [run(ProjectedIntegrator(0.001, device=d, **made), system, x, v, platform, calls) for d in (True, False)]
     assert type(contexts[0].getIntegrator()) is DeviceIntegrator
     (x1, v1), (x2, v2) = (state_of(context) for context in contexts)
-    # OpenMM's constraint solvers go on from what they were given, ours to the lengths; chaos multiplies what differs.
-    allowed = {"double": 1e-8, "mixed": 1e-6, "single": 1e-4}[precision]
+    # OpenMM's solvers leave 1e-8 of the lengths on GPUs, whatever is asked for; chaos multiplies what differs.
+    allowed = 1e-9 if platform in PLAIN[:1] else {"double": 1e-7, "mixed": 1e-6, "single": 1e-4}[precision]
     assert np.abs(x1 - x2).max() < allowed and np.abs(v1 - v2).max() < 1e3 * allowed
-    assert np.abs(x1 - x).max() > 0.01
+    assert np.abs(x1 - x).max() > 1e-3 * sum(calls) / 10
     energies = [context.getState(energy=True).getKineticEnergy()._value for context in contexts]
-    assert energies[0] == pytest.approx(energies[1], rel=1e5 * allowed)
+    assert energies[0] == pytest.approx(energies[1], rel=1e3 * allowed)
     assert residuals(system, contexts[0])[0] < 10 * tolerance + (1e-6 if precision == "single" else 1e-11)
-    assert contexts[0].getStepCount() == 100 if precision == "double" else 10
+    assert contexts[0].getStepCount() == sum(calls)
     assert contexts[0].getTime()._value == pytest.approx(sum(calls) * 0.001)
 
 
