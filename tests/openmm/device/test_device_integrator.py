@@ -93,7 +93,7 @@ def cases():
                 yield pytest.param(name, *given.values, id=f"{name}-{given.id}", marks=marks)
 
 
-@pytest.mark.parametrize(("name", "platform"), cases())
+@pytest.mark.parametrize(("name", "platform"), list(cases()))
 def test_trajectories_are_those_of_the_custom_integrator(name, platform):
     scheme, ensemble = STEPS[name]
     precision = platform.partition(" ")[2] or "double"
@@ -183,7 +183,7 @@ def test_operations_are_joined_where_nobody_looks():
     head, middle, tail = divided(verlet, noisy=False)
     assert [(op.verb, op.share) for op in middle] == [("kick", 1.0), ("fly", 1.0), ("evaluate", 0.0)]
     assert [op.verb for op in head] == ["kick", "fly", "evaluate"] and [op.verb for op in tail] == ["kick", "project"]
-    assert tail[0].begun == -1 and [op.verb for op in divided(verlet, noisy=True)[2]][0] == "note"
+    assert tail[0].begun == -1 and divided(verlet, noisy=True)[2][0].verb == "note"
     apart = joined([Op("kick", 0.5, "0"), Op("kick", 0.5, "1")])
     assert [op.group for op in apart] == ["0", "1"]
     turns = [Op("turn", 0.5), Op("project"), Op("turn", 0.5)]
