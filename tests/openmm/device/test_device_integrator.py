@@ -162,7 +162,7 @@ def test_langevin_has_the_temperature_of_its_bath(platform):
 
 
 def test_noise_belongs_to_particle_and_step():
-    """Other seeds give other runs; the same seed the same, however steps are divided into calls, by threads or order."""
+    """Other seeds give other runs; the same seed the same, however steps are divided into calls."""
     system, x, v = dumbbell()
     runs = []
     for seed, calls, platform in ((1, (9,), "Reference"), (1, (4, 5), "Reference"), (1, (9,), "CPU"), (2, (9,), "CPU")):
