@@ -90,7 +90,10 @@ void ProgramIntegrator::step(int steps) {
 }
 void ProgramIntegrator::stateChanged(State::DataType changed) {
     if (context == nullptr) return;
-    if (changed == State::Velocities) middleKinetic = -1;
+    if (changed == State::Velocities) {
+        middleKinetic = restoredKinetic;       // OpenMM says so of a checkpoint, too, once it is loaded
+        restoredKinetic = -1;
+    }
     else handle.getAs<StepKernel>().valid = false;
 }
 double ProgramIntegrator::computeKineticEnergy() {
@@ -121,7 +124,7 @@ void ProgramIntegrator::loadCheckpoint(istream& in) {
         in.read((char*) values.data(), values.size()*sizeof(double));
         write(name, values);
     }
-    middleKinetic = kinetic;
+    middleKinetic = restoredKinetic = kinetic;
     kernel().valid = false;
 }
 static string text(const vector<double>& values) {

@@ -84,7 +84,7 @@ private:
     Plan planned(bool whole) const;
     std::vector<std::string> savedNames() const;
     mutable OpenMM::Kernel handle;
-    double middleKinetic = -1;     // -1: none is known
+    double middleKinetic = -1, restoredKinetic = -1;   // -1: none is known
 };
 
 // What platforms have in common; each says how a kernel is launched and where arrays are.
