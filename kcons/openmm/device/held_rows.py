@@ -6,7 +6,7 @@ whose code or tables are written once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -26,12 +26,12 @@ ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
 STORED, RELATIVE, NEAREST, IN_CELLS = range(4)
 
 
-def refusal(parts: Sequence[Any]) -> str:
+def refusal(parts: Any) -> str:
     """Why parts of an integrator cannot be held on the device; '' if they can.
 
     Parameters
     ----------
-    parts : sequence of Part or Constraint
+    parts : Part, Constraint or sequence of such
         Of the integrator.
     """
     try:
@@ -42,7 +42,7 @@ def refusal(parts: Sequence[Any]) -> str:
     return ""
 
 
-def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
+def constraints_of(parts: Any) -> list[Constraint]:
     """The constraint objects of parts as they were given, targets that were found included.
 
     Raises
@@ -51,7 +51,7 @@ def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
         Rows of another kind.
     """
     found: list[Constraint] = []
-    for part in parts:
+    for part in parts if isinstance(parts, Iterable) else (parts,):
         if isinstance(part, Constraint):
             found.append(part)
         elif hasattr(part, "given"):  # all of an integrator, as it has them
@@ -66,7 +66,7 @@ def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
     return found
 
 
-def molecules_of(pairs: IntArray, parts: Sequence[Any]) -> list[IntArray]:
+def molecules_of(pairs: IntArray, parts: Any) -> list[IntArray]:
     """Atoms that OpenMM has to keep together, row by row: `pairs` of the System, shape (n, 2), and rows of parts."""
     return [
         row for table in [pairs, *(item.atoms for item in constraints_of(parts) if item.width > 1)] for row in table
