@@ -17,8 +17,8 @@
 
 // Values and gradients at x + d (moved) or at x, of rows first to last; those of velocities `half_way` before `time`.
 // Shortest images are found at x, and kept.
-DEVICE void rows_evaluate(ROWS int first, int last, mixed time, mixed half_way, int moved, GLOBAL const mixed* x, GLOBAL const mixed* d, GLOBAL mixed* result) {
-    for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
+DEVICE void rows_evaluate(ROWS int cluster, mixed time, mixed half_way, int moved, GLOBAL const mixed* x, GLOBAL const mixed* d, GLOBAL mixed* result) {
+    for (int k = rows_cluster[3*cluster]+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
         int begin = ROW(k, 1), end = ROW(k+1, 1), how = ROW(k, 3), rolls = ROW(k, 6) & 1, size = 3*(end-begin), s = PLACE(begin);
         GLOBAL mixed *r = rows_place+9*begin, *base = r+2*size;
         mixed share = rolls ? (mixed) 0.5 : (mixed) 1;
@@ -53,9 +53,9 @@ DEVICE void rows_evaluate(ROWS int first, int last, mixed time, mixed half_way, 
 DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, GLOBAL const mixed* there, GLOBAL const mixed* w) {
     int levels = rows_cluster[3*cluster+2], top = rows_cluster[3*cluster+5];
     for (int level = levels; level < top; level++) {
-        int first = rows_level[level], last = rows_level[level+1];
+        int first = rows_level[level];
         if (factors)
-            for (int e = ROW(first, 4)+LOCAL_ID; e < ROW(last, 4); e += LOCAL_SIZE) {
+            for (int e = ROW(first, 4)+LOCAL_ID; e < ROW(rows_level[level+1], 4); e += LOCAL_SIZE) {
                 int i = ENTRY(e, 0), j = ENTRY(e, 1);
                 mixed up = 0, low = 0;
                 for (int u = ENTRY(e, 2); u < ENTRY(e+1, 2); u++) {
@@ -74,7 +74,7 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
                 if (i == j) rows_pivot[i] = (ROW(i, 6) & 2) && fabs(up) <= ROWS_PIVOT*whole ? (mixed) 0 : 1/up;
                 else {rows_upper[e] = up; rows_lower[e] = low;}
             }
-        for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
+        for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
             mixed y = rows_off[k];
             for (int u = ROW(k, 5); u < ROW(k+1, 5); u++) {
                 int e = rows_earlier[u], m = ENTRY(e, 0);
@@ -96,8 +96,8 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
 
 // d -= M^-1 A^T y, atom by atom.
 DEVICE void rows_push(ROWS int cluster, GLOBAL const mixed* there, GLOBAL mixed* d, GLOBAL const mixed* w) {
-    int base = rows_cluster[3*cluster+1], end = rows_cluster[3*cluster+4];
-    for (int a = base+LOCAL_ID; a < end; a += LOCAL_SIZE) {
+    int base = rows_cluster[3*cluster+1];
+    for (int a = base+LOCAL_ID; a < rows_cluster[3*cluster+4]; a += LOCAL_SIZE) {
         mixed sx = 0, sy = 0, sz = 0;
         for (int u = rows_atom[a]; u < rows_atom[a+1]; u++) {
             int p = rows_touch[u], k = rows_slot[2*p+1], g = 3*p+k+1;
@@ -113,11 +113,11 @@ DEVICE void rows_push(ROWS int cluster, GLOBAL const mixed* there, GLOBAL mixed*
 // How far rows are off at x + d; returns a row that is off more than it may be by its number + 1, 0 if there is none, and
 // the negative where a row is not finite.
 DEVICE int rows_measure(ROWS int cluster, mixed h, mixed time, GLOBAL const mixed* x, GLOBAL const mixed* d) {
-    int first = rows_cluster[3*cluster], last = rows_cluster[3*cluster+3];
+    int first = rows_cluster[3*cluster];
     if (LOCAL_ID == 0) {scratch[0] = 0; scratch[1] = 0;}
-    rows_evaluate(ROWS_PASS first, last, time, h/2, 1, x, d, rows_now);
+    rows_evaluate(ROWS_PASS cluster, time, h/2, 1, x, d, rows_now);
     SYNC_THREADS;
-    for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
+    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
         int begin = ROW(k, 1), rolls = ROW(k, 6) & 1;
         mixed wanted = rows_number[3*k], period = rows_number[3*k+2], along = 0, reach = 0;
         if (ROW(k, 7) >= 0) wanted = rows_moving(rows_knots, ROW(k, 7), rolls ? time-h/2 : time, 0);
@@ -139,15 +139,15 @@ DEVICE int rows_measure(ROWS int cluster, mixed h, mixed time, GLOBAL const mixe
 }
 
 DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const mixed* x, GLOBAL mixed* d, GLOBAL const mixed* w) {
-    int first = rows_cluster[3*cluster], last = rows_cluster[3*cluster+3], turn = 0;
-    rows_evaluate(ROWS_PASS first, last, time-h, 0, 0, x, d, rows_there);
-    for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) rows_sum[k] = 0;
+    int first = rows_cluster[3*cluster], turn = 0;
+    rows_evaluate(ROWS_PASS cluster, time-h, 0, 0, x, d, rows_there);
+    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) rows_sum[k] = 0;
     SYNC_THREADS;
     int missed = rows_measure(ROWS_PASS cluster, h, time, x, d);
-    while (missed > 0 && turn < ROWS_TURNS) {
+    while ((missed > 0) & (turn < ROWS_TURNS)) {   // one way out: barriers are inside
         rows_solve(ROWS_PASS cluster, turn%ROWS_CHORD == 0, rows_now, rows_there, w);
         rows_push(ROWS_PASS cluster, rows_there, d, w);
-        for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) rows_sum[k] += rows_answer[k];
+        for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) rows_sum[k] += rows_answer[k];
         SYNC_THREADS;
         missed = rows_measure(ROWS_PASS cluster, h, time, x, d);
         turn++;
@@ -156,16 +156,16 @@ DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const 
         int k = (missed > 0 ? missed : -missed)-1;
         FAIL(ROWS_FIRST_LARGE+k, rows_off[k])
     }
-    for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_sum[k]/h;
+    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_sum[k]/h;
     SYNC_THREADS;
 }
 
 DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL const mixed* x, GLOBAL mixed* v, GLOBAL const mixed* w) {
-    int first = rows_cluster[3*cluster], last = rows_cluster[3*cluster+3];
-    rows_evaluate(ROWS_PASS first, last, time, 0, 0, x, x, rows_there);
+    int first = rows_cluster[3*cluster];
+    rows_evaluate(ROWS_PASS cluster, time, 0, 0, x, x, rows_there);
     SYNC_THREADS;
     for (int pass = 0; pass < 2; pass++) {
-        for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) {
+        for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
             int begin = ROW(k, 1), rolls = ROW(k, 6) & 1;
             mixed off = 0;
             if (ROW(k, 7) >= 0) off = -rate*rows_moving(rows_knots, ROW(k, 7), time, rolls ? 0 : 1);
@@ -180,7 +180,7 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
         SYNC_THREADS;
         rows_solve(ROWS_PASS cluster, pass == 0, rows_there, rows_there, w);
         rows_push(ROWS_PASS cluster, rows_there, v, w);
-        if (rate != 0) for (int k = first+LOCAL_ID; k < last; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_answer[k];
+        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_answer[k];
         SYNC_THREADS;
     }
 }
