@@ -146,6 +146,9 @@ class KernelRows(CarriedConstraints):
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
 
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Nothing: velocities come from multipliers, and not from rounded positions."""
+
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
         self._engine.passage.precision = precision
 

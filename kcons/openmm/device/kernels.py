@@ -192,7 +192,7 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
         ]
         unpack = " ".join(lines)
     else:
-        own_arrays = [f"GLOBAL {array.kind}* RESTRICT {array.name}" for array in arrays]
+        own_arrays = [f"GLOBAL {array.kind}* {array.name}" for array in arrays]
         given = ", ".join([*_GIVEN, *(f"GLOBAL const mm_long* RESTRICT {name}" for name in forces), *own_arrays])
         unpack = ""
     words = {
@@ -700,7 +700,7 @@ class Kernels:
         items = [(place, code) for place, code in zip(self.places, self._code, strict=True) if not place.shape.together]
         text = ""
         for loop, kinds in (
-            (f" for (int item = GROUP_ID; item < {self.crowds}; item += NUM_GROUPS) {{\n", crowds),
+            (" {\n", crowds),
             (f" for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE) {{\n", items),
         ):
             if any(code for _, code in kinds):
@@ -735,7 +735,12 @@ class Kernels:
         words |= {"EVERY": f"for (int a = 0; a < {n}; a++)", "FIRST": "LOCAL_ID == 0" if shape.together else "1"}
         for word, meaning in words.items():
             text = text.replace(word, meaning)
-        return f" if (item >= {place.begin} && item < {place.begin + clusters}) {{\n{room}{text} }}\n"
+        end = place.begin + clusters
+        if shape.together:  # barriers are inside, which no condition may be about
+            loop = f"for (int item = {place.begin}+GROUP_ID; item < {end}; item += NUM_GROUPS)"
+        else:
+            loop = f"if (item >= {place.begin} && item < {end})"
+        return f" {loop} {{\n{room}{text} }}\n"
 
 
 class Plan(NamedTuple):
