@@ -27,6 +27,7 @@ try:
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
     from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
+    from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
     from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
@@ -48,6 +49,7 @@ __all__ = [
     "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",
+    "IsokineticSpheres",
     "Langevin",
     "LangevinRespa",
     "NoseHoover",

@@ -20,11 +20,12 @@ from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, plan
+from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, Spheres, plan
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
+from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
@@ -40,7 +41,7 @@ from kcons.thermostats.nose_hoover import chain_fractions
 logger = logging.getLogger("kcons.openmm")
 
 #: Ensembles whose operations kernels have.
-ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa)
+ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
 _EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
 _DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
 #: What a solve that failed leaves of a call.
@@ -103,7 +104,9 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
             assert isinstance(ensemble, NoseHoover)
             flights = tuple(operation.fraction * f for f in chain_fractions(ensemble.chain_order, ensemble.repeats))
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
-    return done
+        if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
+            done.append(Op("rescale"))
+    return [Op("restore"), *done] if isinstance(ensemble, IsokineticSpheres) else done
 
 
 class DeviceProgram(Program):
@@ -115,6 +118,7 @@ class DeviceProgram(Program):
         Variables that belong to a state, in the order of the array `memory`.
     """
 
+    on_device = True
     integrator: DeviceIntegrator
     kept: list[str]
 
@@ -201,6 +205,7 @@ class DeviceIntegrator(ProjectedIntegrator):
                 "memory": program.kept,
                 "seed": self._seed,
                 "noisy": self.ensemble.noisy,
+                "spheres": [getattr(self.ensemble, name, None) for name in ("spheres", "auxiliary")],
                 "integrator": self._key,
                 "parts": bool(self.parts),
             }
@@ -411,6 +416,8 @@ def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, gr
         seed=seed,
         noisy=described["noisy"],
         tidy=described["parts"],
+        spheres=Spheres(*described["spheres"]) if described["spheres"][0] else None,
+        moving=masses > 0,
     )
 
 

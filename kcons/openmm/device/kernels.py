@@ -14,7 +14,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 
 #: Platforms whose kernels are plain C++.
 PLAIN = ("Reference", "CPU")
@@ -258,7 +258,7 @@ class Op(NamedTuple):
 
 
 #: What kernels can do.
-VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note")
+VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note", "rescale", "restore")
 
 
 def divided(operations: Sequence[Op], noisy: bool) -> tuple[list[Op], list[Op], list[Op]]:
@@ -369,6 +369,68 @@ _LOOK = (
 )
 
 
+#: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
+#: its part of the center of mass, which is on sphere OF[c], and the rest on OF[3]; -1 for none. KEEP and PUSH are what
+#: v and d are multiplied by, OWN what auxiliary variables are.
+_SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
+ GLOBAL mixed* own = auxiliary+PLACE;
+ mixed cv[3] = {0, 0, 0}, cd[3] = {0, 0, 0}, vv[COUNT] = {0}, vd[COUNT] = {0}, dd[COUNT] = {0}, mass = 0;
+ mixed keep[COUNT], push[COUNT], kept_own[COUNT];
+ SYNC
+ if (of[0] >= 0) {
+  EVERY if (w[a] != 0) {mass += 1/w[a]; for (int c = 0; c < 3; c++) {cv[c] += v[3*a+c]/w[a]; cd[c] += D/w[a];}}
+  for (int c = 0; c < 3; c++) {
+   cv[c] /= mass; cd[c] /= mass;
+   vv[of[c]] += mass*cv[c]*cv[c]; vd[of[c]] += mass*cv[c]*cd[c]; dd[of[c]] += mass*cd[c]*cd[c];
+  }
+ }
+ if (of[3] >= 0) EVERY if (w[a] != 0) for (int c = 0; c < 3; c++) {
+  mixed m = 1/w[a], p = v[3*a+c]-cv[c], q = D-cd[c];
+  vv[of[3]] += m*p*p; vd[of[3]] += m*p*q; dd[of[3]] += m*q*q;
+ }
+ for (int s = 0; s < COUNT; s++) {
+  mixed R = squares[s]*P_kT, o = 0;
+  for (int k = 0; k < AUXILIARY; k++) o += own[s*AUXILIARY+k]*own[s*AUXILIARY+k];
+  keep[s] = kept_own[s] = 1; push[s] = 0;
+  RULE
+ }
+ SYNC
+ EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {
+  mixed r = v[3*a+c]-cv[c];
+  if (of[3] >= 0) r = keep[of[3]]*r+push[of[3]]*(D-cd[c]);
+  if (of[c] >= 0) r += keep[of[c]]*cv[c]+push[of[c]]*cd[c];
+  v[3*a+c] = r;
+ }
+ if (FIRST) for (int s = 0; s < COUNT; s++) for (int k = 0; k < AUXILIARY; k++) own[s*AUXILIARY+k] *= kept_own[s];
+ SYNC
+ }
+"""
+_RULES = {
+    "turn": """if (dd[s] > 0) {
+   mixed z = sqrt(dd[s]/R), cosine = min(max((mixed) (vd[s]/sqrt(dd[s]*R)), (mixed) -1), (mixed) 1);
+   mixed once = expm1(-z), twice = expm1(-2*z), scale = 1+(1-cosine)*twice/2;
+   if (scale > 0) {keep[s] = kept_own[s] = (1+once)/scale; push[s] = (cosine*once*once-twice)/(2*z*scale);}
+  }""",
+    "restore": "if (vv[s]+o > 0) keep[s] = kept_own[s] = sqrt(R/(vv[s]+o));",
+    "rescale": "if (vv[s] > 0) keep[s] = sqrt(max((mixed) (R-o), (mixed) 0)/vv[s]);",
+}
+
+
+class Spheres(NamedTuple):
+    """Spheres of clusters: of which kind, and how many auxiliary variables each has; see `IsokineticSpheres`."""
+
+    kind: str
+    auxiliary: int
+
+    def of(self, shape: Shape, moving: Any, placed: bool) -> tuple[tuple[int, ...], list[int]]:
+        """Spheres of the center of mass along x, y, z and of the rest, -1 for none; degrees of freedom on each."""
+        free = 3 * int(moving.sum()) - shape.n_rows
+        if self.kind == "cluster" or placed or not moving.all():
+            return (-1, -1, -1, 0 if free else -1), [free] if free else []
+        centers, parts = ((0, 1, 2), [1, 1, 1]) if self.kind == "axes" else ((0, 0, 0), [3])
+        return (*centers, len(parts) if free > 3 else -1), [*parts, *([free - 3] if free > 3 else [])]
+
+
 class Action(NamedTuple):
     """What the plugin does: launch a kernel, let a solver of OpenMM act on positions or velocities, evaluate forces."""
 
@@ -403,6 +465,10 @@ class Kernels:
         Whether kernels hold the rows themselves; else OpenMM's solvers do.
     tidy : bool
         Whether noise is made tangent, so that multipliers are those of forces.
+    spheres : Spheres, optional
+        Velocities of clusters stay on spheres.
+    moving : ndarray of bool, optional
+        Particles that move, where there are spheres.
     fixed : ndarray of int
         Particles with a mass that rest.
     placed : ndarray of int
@@ -418,9 +484,11 @@ class Kernels:
         tidy: bool = False,
         fixed: IntArray = _NONE,
         placed: IntArray = _NONE,
+        spheres: Spheres | None = None,
+        moving: Any = None,
     ) -> None:
         self.groups, self.own, self.tidy, self.resting = dict(groups), own, tidy, len(fixed) > 0
-        self.placed = placed
+        self.placed, self.spheres, self.sphere_of, self.auxiliary = placed, spheres, list[Any](), 0
         self.places: list[_Place] = []
         self.order: list[IntArray] = []
         counts, at, work = {True: 0, False: 0}, 0, 0
@@ -432,6 +500,10 @@ class Kernels:
             counts[shape.together] += clusters
             at += shape.atoms.size
             work += 10 * shape.atoms.size * shape.together
+            if spheres is not None:
+                found = spheres.of(shape, moving[shape.atoms[0]], bool(np.isin(shape.atoms, placed).any()))
+                self.sphere_of.append((*found, self.auxiliary))
+                self.auxiliary += clusters * len(found[1]) * spheres.auxiliary
         self.items, self.crowds, self.work = counts[False], counts[True], work
         self.particles = at
         self.source: list[str] = []
@@ -490,6 +562,9 @@ class Kernels:
             self._close(Action(VELOCITIES))
 
     def _exchange(self, op: Op) -> None:
+        if self.spheres is not None:
+            self._stir(op)
+            return
         noise = (
             f" {{mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);\n"
             f" EACH if (w[a] != 0) {{\n  mixed g[4], s = size*sqrt(w[a]);\n"
@@ -500,7 +575,34 @@ class Kernels:
         if self.tidy:
             self._add("", " SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, v, w);\n")
 
+    def _stir(self, op: Op) -> None:
+        """Friction and noise on spheres, the noise along the rows; auxiliary variables have noise of their own."""
+        assert self.spheres is not None
+        size = f"mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);"
+        draw = f"gaussians(g, ORDER(AT), step+({op.begun}), {{}}, seed[0]);"
+        start = (
+            f" {{ROOM {size}\n EACH {{mixed g[4], s = sqrt(w[a]); {draw.format(op.use)}\n"
+            "  for (int c = 0; c < 3; c++) d[3*a+c] = s*g[c];}\n"
+        )
+        ends = " EACH for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+size*d[3*a+c];\n"
+        self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
+        self._add(ends)
+        for k, (_, freedom, first) in enumerate(self.sphere_of):
+            number = len(freedom) * self.spheres.auxiliary
+            own = f"auxiliary[{first}+(ITEM)*{number}+j]"
+            self._code[k] += (
+                f" if (FIRST) for (int j = 0; j < {number}; j++) {{int a = 0; mixed g[4]; "
+                f"{draw.format(f'{op.use}+1024*(j+1)')} {own} = damp*{own}+size*g[0];}}\n }}\n"
+            )
+        self._rescale(Op("restore"))
+
     def _turn(self, op: Op) -> None:
+        if self.spheres is not None:
+            start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
+            self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
+            self._rescale(op)
+            self._add(" }\n")
+            return
         push = f"{_of_dt(op.share)}*{self._force(op)}*w[a]"
         sums = (
             " EACH {if (w[a] != 0) for (int c = 0; c < 3; c++) {mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a];"
@@ -532,6 +634,23 @@ class Kernels:
         shares = ", ".join(f"(mixed) {share!r}" for share in op.flights)
         self._before += _CHAIN.replace("SHARES", shares).replace("PARTS", str(len(op.flights)))
         self._add(" EACH for (int c = 0; c < 3; c++) v[3*a+c] *= factor;\n")
+
+    def _rescale(self, op: Op) -> None:
+        """Velocities back to their spheres; `restore` and `turn` move auxiliary variables, too."""
+        assert self.spheres is not None
+        self._used = True
+        for k, (of, freedom, start) in enumerate(self.sphere_of):
+            if freedom:
+                number = self.spheres.auxiliary
+                squares = ", ".join(f"(mixed) {g + number - 1}" for g in freedom)
+                text = _SPHERES.replace("RULE", _RULES[op.verb]).replace("OF}", f"{', '.join(map(str, of))}}}")
+                text = text.replace("D-", "d[3*a+c]-" if op.verb == "turn" else "0-")
+                text = text.replace("+= D/", "+= d[3*a+c]/" if op.verb == "turn" else "+= 0/")
+                text = text.replace("SQUARES", squares).replace("COUNT", str(len(freedom)))
+                place = f"{start}+(ITEM)*{len(freedom) * number}"
+                self._code[k] += text.replace("PLACE", place).replace("AUXILIARY", str(number))
+
+    _restore = _rescale
 
     def _evaluate(self, op: Op) -> None:
         self._close(Action(EVALUATE, "", self.groups[op.group], list(self.groups).index(op.group)))
@@ -612,7 +731,8 @@ class Kernels:
         )
         store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
         text = load + code + store
-        words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}"}
+        words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}", "ITEM": cluster}
+        words |= {"EVERY": f"for (int a = 0; a < {n}; a++)", "FIRST": "LOCAL_ID == 0" if shape.together else "1"}
         for word, meaning in words.items():
             text = text.replace(word, meaning)
         end = place.begin + clusters
@@ -676,6 +796,8 @@ def plan(
     seed: int = 0,
     noisy: bool = False,
     tidy: bool = False,
+    spheres: Spheres | None = None,
+    moving: Any = None,
 ) -> Plan:
     """Everything that the plugin needs.
 
@@ -698,18 +820,28 @@ def plan(
     seed : int
     noisy : bool
         Whether the kinetic energy that is told is that before the end of a step.
-    tidy : bool
+    tidy, spheres
         See `Kernels`.
+    moving : ndarray of bool
+        Which particles have a mass.
     """
     held = NoRows() if rows is None else rows
     loose = np.setdiff1d(np.arange(particles), np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
     shapes = [*held.shapes, *([Shape("", loose[:, None])] if len(loose) else [])]
-    kernels = Kernels(shapes, groups, rows is not None, tidy=tidy, fixed=held.fixed, placed=held.placed)
+    if moving is not None:
+        moving = moving & ~np.isin(np.arange(particles), held.fixed)
+    made = {"tidy": tidy, "fixed": held.fixed, "placed": held.placed, "spheres": spheres, "moving": moving}
+    kernels = Kernels(shapes, groups, rows is not None, **made)
     parts = divided(operations, noisy)
     actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
     order = np.concatenate(kernels.order)
     arrays = standard_arrays([*parameters.values()], [*memory.values()], seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
+    if spheres is not None:
+        if any(g + spheres.auxiliary < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
+            raise InputError("a sphere of one degree of freedom has the radius 0; give auxiliary=1", item="auxiliary")
+        first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
+        arrays.append(Array("auxiliary", "mixed", first, saved=True))
     arrays += [Array("cells", "int", np.zeros(3 * particles))] * (len(held.placed) > 0)
     work_group = 1 if platform in PLAIN else held.work_group
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
