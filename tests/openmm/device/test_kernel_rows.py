@@ -269,7 +269,7 @@ def test_noise_is_in_no_multiplier():
     integrator.setRandomNumberSeed(3)
     context = started(system, integrator, x)
     integrator.setVelocitiesToTemperature(context, 300, 1)
-    integrator.step(60_000)
+    integrator.step(100_000)
     wanted = -2 * 8.314462618e-3 * 300 / 0.15
     assert integrator.parts[0].mean_multipliers(integrator)[0] == pytest.approx(wanted, rel=0.1)
 
