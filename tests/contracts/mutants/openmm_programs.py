@@ -186,6 +186,12 @@ MUTANTS = {
             "test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
         ),
     ],
+    "openmm/collective/collective_rows.py": [
+        (
+            "(*held[:k], *«held[n:]→()») for k",
+            "test_rows_in_context.py::test_row_that_repeats_a_constraint_of_the_system_is_named",
+        ),
+    ],
     "openmm/collective/row_program.py": [
         (
             "weight{c}*({of('more', i)}«-→+»{of('expected', i)})",
