@@ -448,13 +448,7 @@ def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
-    """Constraints, those that are given as plain data made anew.
-
-    Raises
-    ------
-    InputError
-        What is no constraint of kcons.
-    """
+    """Constraints, those that are given as plain data made anew."""
     given: Iterable[Any] = (constraints,)
     if isinstance(constraints, Iterable) and not isinstance(constraints, str):
         given = constraints

@@ -241,11 +241,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
         Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
-
-    Raises
-    ------
-    InputError
-        Temperature not positive, friction negative, a negative time step.
     """
 
     def __init__(

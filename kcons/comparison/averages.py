@@ -182,13 +182,7 @@ USUAL_WITH_CHEAP = ("langevin", "langevin-respa", "langevin-halfway", "spheres",
 
 
 def choose_samplers(names: Iterable[str] | None, cheap: bool = False) -> list[Sampler]:
-    """Samplers by name; the usual ones by default, all of them for 'all'.
-
-    Raises
-    ------
-    InputError
-        Unknown name, or none; one that needs cheap forces where there are none.
-    """
+    """Samplers by name; the usual ones by default, all of them for 'all'."""
     wanted = list((USUAL_WITH_CHEAP if cheap else USUAL) if names is None else names)
     if wanted == ["all"]:
         wanted = [name for name, sampler in SAMPLERS.items() if cheap or not sampler.several]
@@ -342,11 +336,6 @@ def sample(
         Instead: seconds of processor time.
     rng : int, numpy.random.Generator or None
     watcher : Watcher, optional
-
-    Raises
-    ------
-    InputError
-        Neither or both of `length` and `budget`; a step or friction that is not positive.
     """
     if (length is None) == (budget is None):
         raise InputError("give either length or budget", item="length")

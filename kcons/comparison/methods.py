@@ -128,11 +128,6 @@ def add_method(
     code : str or callable, optional
         Lines of Python that run it, with $made_by (an expression that makes the test system), $step (or the tolerance),
         $steps and $ps (the step in ps); or a test system to them.
-
-    Raises
-    ------
-    InputError
-        An unknown engine or kind; force evaluations below 1.
     """
     METHODS[name] = made = Method(
         name, title or name, start, engine, force_evaluations, adaptive, kind, usual, refuses, code
@@ -145,11 +140,6 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
 
     By default the usual ones that can run the test system: of OpenMM alone where its forces are OpenMM's, else all of
     arrays and ASE and the plainest of OpenMM.
-
-    Raises
-    ------
-    InputError
-        Unknown name, or none.
     """
     if names is None:
         usual = [method for method in METHODS.values() if method.usual]

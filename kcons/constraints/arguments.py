@@ -481,11 +481,13 @@ def rules_of(function: Callable[..., Any]) -> dict[str, Rules]:
         hint = hints.get(name)
         kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
         given = [kind for kind in kinds if kind is not NoneType]
-        told = next((kind.__metadata__ for kind in given if hasattr(kind, "__metadata__")), ())
+        said = next((kind for kind in given if hasattr(kind, "__metadata__")), None)
+        optional = len(given) < len(kinds) or (said is not None and NoneType in get_args(said.__origin__))
+        told: tuple[Any, ...] = () if said is None else said.__metadata__
         if len(given) == 1 and get_origin(given[0]) is Literal:
             told = (functools.partial(one_of, words=get_args(given[0])),)
         kind = next((part for part in told if isinstance(part, Kind)), NUMBER)
-        found[name] = Rules(kind, len(given) < len(kinds), tuple(part for part in told if callable(part)))
+        found[name] = Rules(kind, optional, tuple(part for part in told if callable(part)))
     return found
 
 

@@ -204,10 +204,6 @@ class Profile:
         step = 1e-6 * np.ptp(self.windows)
         return (self._added(at + step) - self._added(at - step)) / (2 * step)
 
-    def next_window(self, *, between: tuple[float, float] | None = None, below: float | None = None) -> float:
-        """Where one more window would tell most; see `next_windows`."""
-        return self.next_windows(1, between=between, below=below)[0]
-
     def next_windows(
         self, count: int, *, between: tuple[float, float] | None = None, below: float | None = None
     ) -> list[float]:
@@ -226,11 +222,6 @@ class Profile:
         below : float, optional
             Only places count where the free energy is this much above its lowest value or less: rates and populations
             do not depend on the others.
-
-        Raises
-        ------
-        InputError
-            `between` is not in the range of the windows; `below` is not positive, or given beside `between`.
         """
         known = self._known
         grid = np.linspace(known.x[0], known.end, _POINTS)

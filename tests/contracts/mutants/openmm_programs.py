@@ -156,20 +156,18 @@ MUTANTS = {
             "test_conserved_momenta.py::test_a_motion_remover_leaves_turns_about_the_center_of_mass",
         ),
     ],
-    "openmm/ensembles/respa_ensemble.py": [
+    "openmm/ensembles/langevin_ensemble.py": [
         (
             "«groups_of(force)→{force.getForceGroup()}» - set(self.groups)",
             "test_respa_ensemble.py::test_forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "test_langevin_ensemble.py"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         (
             'program.let(name, «_before(name)→name», "the chain is back where the step began")',
             "test_nose_hoover_ensemble.py::test_a_step_that_fails_leaves_the_chain_where_it_was",
         ),
-    ],
-    "openmm/ensembles/langevin_ensemble.py": [
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "test_langevin_ensemble.py"),
     ],
     "openmm/surfaces/surface_integrator.py": [
         ('"0.5«+0.5*behind→»"', "test_surface_steps.py"),
