@@ -22,9 +22,8 @@ from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, Spheres, plan
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-from kcons.openmm.ensembles.langevin_ensemble import Langevin
+from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
@@ -64,6 +63,10 @@ class _Given(ctypes.Structure):
 _PLANNER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
 #: Integrators by the key in their description, for parts, which no text describes.
 _ALIVE: weakref.WeakValueDictionary[str, DeviceIntegrator] = weakref.WeakValueDictionary()
+
+
+#: Why the last plan could not be made.
+_REFUSALS: list[Exception] = []
 
 
 # -- what becomes of operations ---------------------------------------------------------------------
@@ -232,7 +235,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         count = library.kcons_read(address, name.encode(), None, 0)
         values = np.zeros(max(count, 0))
         if count < 0 or library.kcons_read(address, name.encode(), values.ctypes.data_as(_DOUBLES), count) < 0:
-            raise openmm.OpenMMException(library.kcons_error().decode())
+            raise _REFUSALS.pop() if _REFUSALS else openmm.OpenMMException(library.kcons_error().decode())
         return values
 
     def write(self, name: str, values: FloatArray) -> None:
@@ -349,7 +352,8 @@ def build_planner() -> None:
 def _planner(made: int, given: Any) -> int:
     try:
         _fill(ctypes.c_void_p(made), given.contents)
-    except Exception as error:  # told by the exception that OpenMM raises
+    except Exception as error:  # told by the exception that OpenMM raises, or by `read`
+        _REFUSALS[:] = [error]
         build.library().kcons_set_error(f"{type(error).__name__}: {error}".encode())
         return 0
     return 1
