@@ -27,8 +27,9 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["results"]
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+exclude_patterns = ["results", "paper"]
+templates_path = ["_templates"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 suppress_warnings = ["myst.header", "config.cache", "ref.python"]
 # Of one name in several classes the nearest is linked. Docstrings write code between single backquotes.

@@ -20,7 +20,7 @@ from kcons.ase.dynamics import ConstrainedDynamics, in_step
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import Rng, generator_of, numbers, positive, seed_from
+from kcons.constraints.arguments import Rng, as_float_array, generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -504,7 +504,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         def force(x: FloatArray, time: float) -> FloatArray:
             atoms = self.atoms
             atoms.arrays["positions"][...] = x
-            found = np.array(numbers(calculator.get_forces(atoms), "forces of the calculator"))
+            found = np.array(as_float_array(calculator.get_forces(atoms), "forces of the calculator"))
             if others and found.shape == (len(atoms), 3):
                 for item in atoms.constraints:
                     if isinstance(item, FORCES_ONLY):
@@ -568,7 +568,7 @@ def _check_calculator(name: str, calculator: Any, atoms: Atoms) -> None:
     """Refuse what is no calculator of these atoms; it is called once where they are."""
     if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
         raise InputError(f"{name} is {calculator!r}; give an ASE calculator", item=name)
-    forces = numbers(calculator.get_forces(atoms), f"forces of {name}")
+    forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
     known = getattr(calculator, "atoms", None)
     other = isinstance(known, Atoms) and not np.array_equal(known.numbers, atoms.numbers)
     if forces.shape != (len(atoms), 3) or other:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from kcons import steppers
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.comparison.runs import InAse, InOpenMM, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint_set import ConstraintSet
@@ -202,8 +203,6 @@ STEPPERS: dict[str, type[steppers.Stepper]] = {
     "blanes-moan4": steppers.BlanesMoan4,
     "blanes-moan6": steppers.BlanesMoan6,
     "blanes-moan6a": steppers.BlanesMoan6a,
-    "projected-verlet": steppers.ProjectedVerlet,
-    "projected-rk4": steppers.ProjectedRungeKutta4,
 }
 #: Those that run unless methods are named: the plain one, and of each order a composition and a splitting.
 USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
@@ -272,31 +271,31 @@ def _code_of_stepper(stepper: str, system: TestSystem) -> str:
     return lines_on_arrays(f"from kcons.steppers import {stepper}", last)
 
 
-def _without_step(kind: type[steppers.Stepper]) -> Callable[[float], steppers.Stepper]:
-    return lambda dt: kind()
+def _without_step(stepper: steppers.Stepper, dt: float) -> steppers.Stepper:
+    return stepper
 
-
-#: Rate of the feedback of Baumgarte's stepper, in inverse time steps: fast, and well within what is stable.
-FEEDBACK = 0.1
 
 for _name, _kind in STEPPERS.items():
     add_method(
         _name,
-        partial(on_arrays, _without_step(_kind)),
+        partial(on_arrays, partial(_without_step, _kind())),
         title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
         force_evaluations=_kind().force_evaluations,
         usual=_name in USUAL,
         code=partial(_code_of_stepper, _kind.__name__),
     )
-
-
-add_method(
-    "baumgarte",
-    partial(on_arrays, lambda dt: steppers.Baumgarte(rate=FEEDBACK / dt)),
-    title="kcons Baumgarte",
-    force_evaluations=steppers.Baumgarte(rate=1.0).force_evaluations,
-    usual=False,
-)
+for _name, _title, _stepper in (
+    ("projected-verlet", "Verlet", ProjectedEquation(2)),
+    ("projected-rk4", "Runge-Kutta", ProjectedEquation(4)),
+):
+    _run = partial(on_arrays, partial(_without_step, _stepper))
+    add_method(
+        _name,
+        _run,
+        title=f"projected equation, {_title}",
+        force_evaluations=_stepper.force_evaluations,
+        usual=False,
+    )
 
 
 def _extrapolated(system: TestSystem, tolerance: float) -> Run:
@@ -491,10 +490,10 @@ def _engine(system: TestSystem) -> OpenMMEngine:
 
 def only_water(system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.callback_rows.hold import take_constraints
+    from kcons.openmm.callback_rows.hold import move_constraints
 
     engine = _engine(system)
-    return not engine.surfaces and not take_constraints(engine.copy())
+    return not engine.surfaces and not move_constraints(engine.copy())
 
 
 def _in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem, dt: float) -> Run:

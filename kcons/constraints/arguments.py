@@ -33,7 +33,7 @@ _REAL = "biuf"
 LARGEST = 1e150
 
 
-def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
+def as_float_array(values: ArrayLike | Any, item: str) -> FloatArray:
     """`values` themselves if they are an array of float64, or a float64 copy of real numbers.
 
     Complex numbers are refused, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities,
@@ -63,7 +63,7 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
     """`values` themselves if the kernels can take them, or a float64 copy of that shape."""
     if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.carray:
         return values
-    array = numbers(values, item)
+    array = as_float_array(values, item)
     if array.shape != shape:
         raise InputError(f"{item} must have shape {shape}, not {array.shape}", item=item)
     # Kernels are compiled for arrays that may be written to; for others Numba would compile them once more.
@@ -72,7 +72,7 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
 
 def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
     """A copy of values for each atom, shape (n_atoms, 3); `InputError` where they are not finite."""
-    array: FloatArray = np.array(numbers(values, item), order="C")
+    array: FloatArray = np.array(as_float_array(values, item), order="C")
     if array.shape != (n_atoms, 3):
         raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
     bad = ~np.isfinite(array).all(axis=1)
@@ -230,7 +230,7 @@ def positive(value: float, item: str) -> float:
 
 def all_positive(values: ArrayLike, item: str) -> FloatArray:
     """Numbers above zero, infinite ones included, as an array of any shape."""
-    array = numbers(values, item)
+    array = as_float_array(values, item)
     if not np.all(array > 0):
         raise InputError(
             f"{item} {array[~(array > 0)].flat[0]:g} is not positive; give numbers above zero",
@@ -241,7 +241,7 @@ def all_positive(values: ArrayLike, item: str) -> FloatArray:
 
 def unit(vectors: ArrayLike, item: str) -> FloatArray:
     """Vectors of length 1 along the given ones, shape (..., 3)."""
-    array, name = numbers(vectors, item), item.rpartition(": ")[2]
+    array, name = as_float_array(vectors, item), item.rpartition(": ")[2]
     if array.ndim == 0 or array.shape[-1] != 3:
         raise InputError(f"{item} must be vectors of three numbers; its shape is {array.shape}", item=name)
     length = np.sqrt(np.einsum("...i,...i->...", array, array))

@@ -27,9 +27,9 @@ from kcons.constraints.arguments import (
     LENGTH,
     MD_UNITS,
     Kind,
+    as_float_array,
     atom_array,
     checked,
-    numbers,
     out_of_range,
     plain_target,
     read_only,
@@ -156,7 +156,7 @@ class Constraint:
         for name, value in data.items():
             shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
             try:
-                array = np.broadcast_to(numbers(value, f"{self.family}: {name}"), shape)
+                array = np.broadcast_to(as_float_array(value, f"{self.family}: {name}"), shape)
             except InputError:
                 raise
             except ValueError:

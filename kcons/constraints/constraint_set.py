@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import finite_number, numbers, read_only, refuse_other
+from kcons.constraints.arguments import as_float_array, finite_number, read_only, refuse_other
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import Images, find_images, image_error
@@ -310,8 +310,8 @@ class ConstraintSet:
                 rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
                 speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
         allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * joined(reach))
-        found = (joined(rates), joined(speeds)) if v is not None else (None, None)
-        return Residuals(joined(sigma), allowed, *found, joined(norms), joined(sizes))
+        found = [None if v is None else joined(parts) for parts in (rates, speeds)]
+        return Residuals(joined(sigma), allowed, found[0], found[1], joined(norms), joined(sizes))
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -378,7 +378,7 @@ class ConstraintSet:
         return self._rows(lambda c: function(c, self._gather(c, positions, whole), time))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
-        array = numbers(x, item)
+        array = as_float_array(x, item)
         if array.shape != (self.n_atoms, 3):
             raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
         return array
@@ -620,7 +620,7 @@ def joined(pieces: Sequence[FloatArray]) -> FloatArray:
 
 
 def contiguous(values: ArrayLike, item: str) -> FloatArray:
-    return np.ascontiguousarray(numbers(values, item))
+    return np.ascontiguousarray(as_float_array(values, item))
 
 
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:

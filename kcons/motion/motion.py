@@ -20,7 +20,6 @@ from kcons.constraints.arguments import (
     check_out,
     check_pairs,
     finite_number,
-    numbers,
     refuse_other,
 )
 from kcons.constraints.constraint import IntArray
@@ -416,14 +415,9 @@ class Motion:
 
     # -- accelerations, forces ------------------------------------------------------------------
 
-    def acceleration(
-        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
-    ) -> FloatArray:
-        """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected).
-
-        `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilization).
-        """
-        return self._accelerated(x, v, f, time, feedback)[0]
+    def acceleration(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
+        """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected)."""
+        return self._accelerated(x, v, f, time)[0]
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
@@ -440,13 +434,11 @@ class Motion:
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
-    def respond(
-        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def respond(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """`acceleration` and `multipliers` of one solve."""
         time = finite_number(time, "time")
         mu = np.zeros(self._local.n_rows)
-        a, local_a, local_x, force = self._accelerated(x, v, f, time, feedback, mu)
+        a, local_a, local_x, force = self._accelerated(x, v, f, time, mu)
         lam = self.plan.least_norm(local_x, -mu, time)
         if len(self.plan.pinned):
             # What the fixed atoms' rows supply: M a - f less the other rows' forces.
@@ -464,7 +456,6 @@ class Motion:
         v: ArrayLike,
         f: ArrayLike,
         time: float,
-        feedback: FloatArray | None,
         mu: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Accelerations, those of local atoms, local positions, forces; `mu` receives the solvers' multipliers."""
@@ -479,8 +470,6 @@ class Motion:
         local_a = a if self._atoms is None else a[self._atoms]
         with np.errstate(all="ignore"):
             b = self._local.acceleration_target(local_x, local_v, time)
-            if feedback is not None:
-                b = b + numbers(feedback, "feedback")
         if not np.all(np.isfinite(b)):
             raise self._solve.failures.undefined(int(np.argmin(np.isfinite(b))), velocity=local_v, position=local_x)
         self._solve.tangents(local_x, local_a, b, time, mu, "force")

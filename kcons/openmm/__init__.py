@@ -16,9 +16,9 @@ from kcons.errors import with_extra
 
 try:
     from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-    from kcons.openmm.callback_rows.hold import hold, take_constraints
+    from kcons.openmm.callback_rows.hold import hold, move_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
-    from kcons.openmm.collective.coordinates import Row, each_term
+    from kcons.openmm.collective.coordinates import Row, forces_by_term
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
@@ -54,12 +54,12 @@ __all__ = [
     "Row",
     "SurfaceIntegrator",
     "constraints_of",
-    "each_term",
+    "forces_by_term",
     "hold",
     "masses_of",
+    "move_constraints",
     "positions_of",
     "surface_parts",
-    "take_constraints",
     "velocities_of",
     "worst_length",
 ]

@@ -22,7 +22,7 @@ from kcons.thermostats.correlated_series import Estimate, autocorrelation_time, 
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
-from kcons.thermostats.monte_carlo import Counts, HamiltonianMonteCarlo, Tuned, best_share, exchange, tune
+from kcons.thermostats.monte_carlo import Counts, HamiltonianMonteCarlo, Tuned, best_acceptance, exchange, tune
 from kcons.thermostats.multistep import (
     ForceGroups,
     IsokineticSpheres,
@@ -63,7 +63,7 @@ __all__ = [
     "TemperatureSplit",
     "Tuned",
     "autocorrelation_time",
-    "best_share",
+    "best_acceptance",
     "configurational_sample",
     "configurational_temperature",
     "evaluations_per_sample",

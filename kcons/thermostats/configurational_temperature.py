@@ -34,7 +34,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import Rng, as_array, generator_of, numbers, positive, refuse_other, whole_number
+from kcons.constraints.arguments import (
+    Rng,
+    as_array,
+    as_float_array,
+    generator_of,
+    positive,
+    refuse_other,
+    whole_number,
+)
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -43,7 +51,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import State, System
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.correlated_series import FEWEST, Estimate, checked, few, spread
+from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate, checked, few, spread
 from kcons.thermostats.freedom import UNCHANGED, atom_numbers, bodies, row_changes
 from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -84,7 +92,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
         Fewer than 10 independent samples; a mean curvature that is 0 within three standard errors, so that the ratio
         has no error: it is given as infinite.
     """
-    above, below = numbers(squares, "squares"), numbers(curvatures, "curvatures")
+    above, below = as_float_array(squares, "squares"), as_float_array(curvatures, "curvatures")
     if above.shape != below.shape:
         raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
     for series, name in ((above, "squares"), (below, "curvatures")):
@@ -374,9 +382,9 @@ class TemperatureSplit:
         UserWarning
             Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
         """
-        if len(self._series) < FEWEST or self._clusters is None or self._rest is None:
+        if len(self._series) < MIN_SAMPLES or self._clusters is None or self._rest is None:
             raise InputError(
-                f"{len(self._series)} samples are too few for an error; add {FEWEST} or more", item="samples"
+                f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
             )
         names = [None, *self._groups]
         if group not in names:

@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dct
 
-from kcons.constraints.arguments import numbers, positive
+from kcons.constraints.arguments import as_float_array, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Fewest values that `mean` takes an error from, and independent ones below which it is not to be relied on.
-FEWEST, FEW_INDEPENDENT = 32, 10
+MIN_SAMPLES, FEW_INDEPENDENT = 32, 10
 #: Cosines of a long series. Their number is halved while the faster ones have hardly anything of the spread and
 #: `_FEWEST_COSINES` remain: what matters is how the spectrum begins, not how smooth a series is from value to value.
 _COSINES, _FEWEST_COSINES, _SMOOTH = 64, 16, 0.8
@@ -160,8 +160,8 @@ def spread(series: FloatArray) -> Spread:
 
 def checked(series: FloatArray, item: str) -> FloatArray:
     """The same series, if an error can be taken from it; `InputError` otherwise."""
-    if series.ndim != 1 or len(series) < FEWEST:
-        raise InputError(f"{series.shape} {item} are too few for an error; give {FEWEST} or more", item=item)
+    if series.ndim != 1 or len(series) < MIN_SAMPLES:
+        raise InputError(f"{series.shape} {item} are too few for an error; give {MIN_SAMPLES} or more", item=item)
     if not np.isfinite(series).all():
         bad = int(np.argmin(np.isfinite(series)))
         raise InputError(f"number {bad} of {item} is not finite; leave it out", item=item)
@@ -196,7 +196,7 @@ def mean(values: ArrayLike) -> Estimate:
     UserWarning
         Fewer than 10 independent values.
     """
-    series = checked(numbers(values, "values"), "values")
+    series = checked(as_float_array(values, "values"), "values")
     found = spread(series)
     doubt = few(len(series), found.independent)
     if doubt:
@@ -213,7 +213,7 @@ def autocorrelation_time(values: ArrayLike) -> float:
 
     1 for a series that does not change, or whose values swing back; 32 values or more are needed.
     """
-    series = checked(numbers(values, "values"), "values")
+    series = checked(as_float_array(values, "values"), "values")
     n = len(series)
     off = series - series.mean()
     power = np.fft.rfft(off, 2 * n)

@@ -452,7 +452,7 @@ class Tuned:
     state: State
 
 
-def best_share(order: int) -> float:
+def best_acceptance(order: int) -> float:
     """The share of accepted proposals that costs least, p/(p + 1) for order p.
 
     For many degrees of freedom dH is normal, its deviation s is proportional to dt^p and its mean s^2/2, and
@@ -485,7 +485,7 @@ def tune(
     sampler : HamiltonianMonteCarlo
         Its number of steps stays, so that trajectories become longer or shorter with the step.
     wanted : float, optional
-        Between 0 and 1; by default what costs least for the order of the stepper, see `best_share`.
+        Between 0 and 1; by default what costs least for the order of the stepper, see `best_acceptance`.
     proposals : int
 
     Raises
@@ -497,7 +497,7 @@ def tune(
     KconsError
         As `HamiltonianMonteCarlo.step`.
     """
-    search = DualAveraging(dt, best_share(sampler.order) if wanted is None else wanted)
+    search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
     check_proposals(proposals)
     sampler.check(system)
     known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None

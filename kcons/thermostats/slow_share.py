@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import Rng, generator_of, numbers, refuse_other
+from kcons.constraints.arguments import Rng, as_float_array, generator_of, refuse_other
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
@@ -58,7 +58,7 @@ def slow_share(
         raise UnsupportedError("the System has no groups of forces; make it with System(motion, ForceGroups({...}))")
     if group not in force.groups:
         raise InputError(f"there is no group {group!r} of forces; there are {', '.join(force.groups)}", item="group")
-    x = numbers(frames, "frames")
+    x = as_float_array(frames, "frames")
     if x.ndim != 3 or not len(x):
         raise InputError(f"frames have shape {x.shape}; give (n_frames, n_atoms, 3)", item="frames")
     generator = generator_of(rng)

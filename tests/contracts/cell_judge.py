@@ -19,6 +19,7 @@ from cell_worlds import World, world, wrapping
 
 from kcons import ConstraintSet, Motion, State, System, run, steppers
 from kcons.ase import ConstrainedDynamics, constrain
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.errors import KconsError
 
 OUTCOMES = ("right", "refused", "unfounded", "silent")
@@ -637,7 +638,7 @@ def _stepper(name: str) -> Any:
     if name.startswith("Geodesic"):
         return steppers.Geodesic(int(name[8:]), great_circles=False)
     if name == "ProjectedVerlet":
-        return steppers.ProjectedVerlet(project=True)
+        return ProjectedEquation(project=True)
     return getattr(steppers, name)()
 
 

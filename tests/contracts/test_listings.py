@@ -85,10 +85,7 @@ def test_every_public_stepper_is_here() -> None:
         each.__name__ for each in listed
     }
     assert others == {
-        "Baumgarte",
         "HamiltonianMonteCarlo",
-        "ProjectedRungeKutta4",
-        "ProjectedVerlet",
         "Stepper",
     }
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from reference import cases
 from reference.cases import Case, Snapshot
-from stepper_systems import EVERY
+from stepper_systems import SYMMETRIC
 
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
@@ -22,7 +22,7 @@ from kcons.motion import Motion
 from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, State, Stepper, System, run
 
 EPS = float(np.finfo(float).eps)
-STEPPERS: list[Stepper] = EVERY
+STEPPERS: list[Stepper] = SYMMETRIC
 #: Run on all cases by every test run; all steppers by the long one.
 USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "KahanLi6()", "BlanesMoan4()", "BlanesMoan6()"}
 #: Slopes are measured from this error (or 8 times the lowest allowed one) down: small enough for the leading term.

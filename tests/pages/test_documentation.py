@@ -79,10 +79,11 @@ def test_example_runs(script, tmp_path, monkeypatch):
     assert said(script, *(["--quick", "--out", "found"] if quick else [])).strip()
 
 
-def test_examples_are_short_and_on_the_front_page():
+def test_examples_are_short_and_listed_under_the_tutorials():
     """Fourteen scripts that a user reads and changes; each says what it shows and how it is run."""
     scripts = sorted((ROOT / "examples").glob("*.py"))
-    listed = re.findall(r"\]\(\.\./examples/(\w+\.py)\)", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"))
+    page = (ROOT / "docs" / "tutorials" / "index.md").read_text(encoding="utf-8")
+    listed = re.findall(r"\]\(\.\./\.\./examples/(\w+\.py)\)", page)
     assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 14
     for script in scripts:
         text = script.read_text(encoding="utf-8")
@@ -139,7 +140,7 @@ def in_the_tables(page):
         r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
     ):
         for entry in listing.split():
-            if not entry.startswith(":") and (inner := page.parent / f"{entry}.md").is_file():
+            if not entry.startswith(":") and (inner := (page.parent / f"{entry}.md").resolve()).is_file():
                 found |= {inner, *in_the_tables(inner)}
     return found
 
@@ -152,9 +153,9 @@ def test_every_page_is_found_from_the_front():
     assert sorted(page.relative_to(ROOT).as_posix() for page in set(PAGES) - found) == []
 
 
-def test_names_in_the_notation_exist():
+def test_names_in_the_glossary_exist():
     owners = {"projection": projection, "Motion": Motion, "ConstraintSet": ConstraintSet, "Constraint": Constraint}
-    text = (ROOT / "docs/notation.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
     named = re.findall(r"`(projection|Motion|ConstraintSet|Constraint)\.(\w+)", text)
     assert len(named) > 20
     for owner, name in named:

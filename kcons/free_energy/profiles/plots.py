@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import as_float_array
 from kcons.errors import InputError
 from kcons.free_energy.profiles.mean_force_surface import Surface
 from kcons.free_energy.profiles.profile import Profile
@@ -91,9 +91,9 @@ def plot_works(forward: ArrayLike, backward: ArrayLike | None, found: Pulled, *,
     Works are those that `pull_free_energy` was given; `found` is what it gave.
     """
     figure, (axes,) = _axes(1, (6.4, 4.2))
-    works = [("W forward", numbers(forward, "forward"), _BLUE)]
+    works = [("W forward", as_float_array(forward, "forward"), _BLUE)]
     if backward is not None:
-        works.append(("-W backward", -numbers(backward, "backward"), _GREEN))
+        works.append(("-W backward", -as_float_array(backward, "backward"), _GREEN))
     edges = np.histogram_bin_edges(np.concatenate([each for _, each, _ in works]), bins="auto")
     for label, values, color in works:
         axes.hist(values, edges.tolist(), density=True, color=color, alpha=0.5, label=label)

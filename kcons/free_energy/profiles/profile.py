@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from kcons.constraints.arguments import FloatArray, numbers, positive, whole_number
+from kcons.constraints.arguments import FloatArray, as_float_array, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
@@ -372,7 +372,7 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
 
 def _places(at: ArrayLike, known: _Windows, item: str) -> FloatArray:
     """Places within the range of the windows; into it by periods where there is one."""
-    points = numbers(at, item)
+    points = as_float_array(at, item)
     if points.ndim != 1 or not np.isfinite(points).all():
         raise InputError(f"{item} must be a list of finite numbers", item=item)
     low, high = float(known.x[0]), known.end

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, IntArray, Rng, generator_of, numbers, positive
+from kcons.constraints.arguments import FloatArray, IntArray, Rng, as_float_array, generator_of, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
-FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03
+MIN_PULLS, _SAMPLES, _OVERLAP = 5, 500, 0.03
 #: Standard errors by which pulls both ways may gain work before that is warned of.
 _GAIN = 4.0
 #: Works over kT that differ by less are the same, but for rounding.
@@ -171,7 +171,7 @@ def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
     InputError
         Shapes that do not go together; a NaN or infinity.
     """
-    path, pushes = numbers(x, "x"), numbers(force, "force")
+    path, pushes = as_float_array(x, "x"), as_float_array(force, "force")
     if path.ndim != 1 or len(path) < 2 or pushes.ndim not in (1, 2) or pushes.shape[-1] != len(path):
         raise InputError(f"forces of shape {pushes.shape} do not go with a path of shape {path.shape}", item="force")
     if not (np.isfinite(path).all() and np.isfinite(pushes).all()):
@@ -200,11 +200,11 @@ def work_profile(
     -------
     F, errors : ndarray, shape (m,)
     """
-    done = numbers(works, "works")
+    done = as_float_array(works, "works")
     if done.ndim != 2 or not done.shape[1]:
         raise InputError(f"works must have shape (n, m), not {done.shape}", item="works")
     reduced = np.stack([_works(column, "works", thermal_energy) for column in done.T], axis=1)
-    weights = np.zeros_like(reduced) if log_weights is None else numbers(log_weights, "log_weights")
+    weights = np.zeros_like(reduced) if log_weights is None else as_float_array(log_weights, "log_weights")
     if weights.shape != reduced.shape or not np.isfinite(weights).all():
         raise InputError(f"log_weights must be finite and have shape {reduced.shape}", item="log_weights")
 
@@ -234,8 +234,8 @@ def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
 def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
     """Works over kT."""
     values = finite(works, item, "work")
-    if values.ndim != 1 or len(values) < FEWEST:
-        raise InputError(f"{item} has works of shape {values.shape}; give {FEWEST} pulls or more", item=item)
+    if values.ndim != 1 or len(values) < MIN_PULLS:
+        raise InputError(f"{item} has works of shape {values.shape}; give {MIN_PULLS} pulls or more", item=item)
     return values / positive(thermal_energy, "thermal_energy")
 
 

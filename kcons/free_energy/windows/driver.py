@@ -32,7 +32,7 @@ from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
-from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
+from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
 from kcons.steppers.files import ResultFolder, in_one_piece, text
@@ -491,7 +491,7 @@ class Windows:
         InputError
             No steps to pull in; fewer than 5 pulls that did not fail.
         """
-        whole_number(count, "count", FEWEST)
+        whole_number(count, "count", MIN_PULLS)
         if not self.settings.pull:
             raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
         ends = np.vstack([places_of([np.atleast_1d(end)], self.sampler.names) for end in (start, end)])
@@ -508,8 +508,8 @@ class Windows:
             failed = self._sample(missing, len(jobs) * count)
         if failed:
             said = f"{len(failed)} of {len(jobs) * count} pulls failed; {': '.join(next(iter(failed.items())))}"
-            if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs):
-                raise InputError(f"{said}. A difference needs {FEWEST} each way", item="pull")
+            if any(sum(job.name not in failed for job in each) < MIN_PULLS for each in jobs):
+                raise InputError(f"{said}. A difference needs {MIN_PULLS} each way", item="pull")
             warnings.warn(f"{said}. They are left out, which makes the result doubtful", UserWarning, stacklevel=2)
         found = [[Series.load(self.file(job)) for job in each if job.name not in failed] for each in jobs]
         return _pulled(found, self.sampler.kJ, BOLTZMANN * self.settings.temperature)

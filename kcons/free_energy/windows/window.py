@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import ANGLE, LENGTH, numbers, positive, whole_number
+from kcons.constraints.arguments import ANGLE, LENGTH, as_float_array, positive, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
@@ -208,7 +208,7 @@ def digest_of(*parts: Any) -> str:
 def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[str]) -> FloatArray:
     """Values of the coordinates, one row for each window, shape (n, d)."""
     listed = list(targets) if isinstance(targets, Iterable) and not isinstance(targets, np.ndarray) else targets
-    places = np.array(numbers(listed, "targets"))
+    places = np.array(as_float_array(listed, "targets"))
     places = places[:, None] if places.ndim == len(names) == 1 else places
     if places.ndim != 2 or places.shape[1] != len(names) or not len(places) or not np.all(np.isfinite(places)):
         raise InputError("targets must be finite numbers, one row for each window", item="targets")
@@ -217,7 +217,7 @@ def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[st
 
 def approach_of(approach: ArrayLike, names: Sequence[str]) -> FloatArray:
     """From how far away each coordinate is pulled, shape (d,)."""
-    given = numbers(approach, "approach")
+    given = as_float_array(approach, "approach")
     if given.shape not in ((), (len(names),)) or not np.isfinite(given).all():
         raise InputError(
             f"approach is {approach!r}; give a finite number, or one for each of {', '.join(names)}", item="approach"

@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import (
     FloatArray,
+    as_float_array,
     check_call,
     finite_number,
-    numbers,
     positive,
     refuse_other,
     whole_number,
@@ -191,7 +191,7 @@ class LinearRow(HolonomicRow):
         *,
         name: str = "linear row",
     ) -> None:
-        c = numbers(coefficients, "coefficients").copy()
+        c = as_float_array(coefficients, "coefficients").copy()
         if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
             raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
         self.coefficients: FloatArray = c
@@ -207,7 +207,7 @@ class LinearRow(HolonomicRow):
     def _moved(self, t: float) -> FloatArray:
         """Target and rate."""
         given = self.moving(t)
-        pair = numbers(given, "target")
+        pair = as_float_array(given, "target")
         if pair.shape != (2,):
             raise InputError(
                 f"the target of {self.name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
@@ -253,7 +253,9 @@ class VelocityRow(Row):
         for what, given in (("coefficients", coefficients), ("rate", rate)):
             if callable(given):
                 check_call(f"{name}: {what}", given, ("t", "x"))
-        self._coefficients = coefficients if callable(coefficients) else numbers(coefficients, "coefficients").copy()
+        self._coefficients = (
+            coefficients if callable(coefficients) else as_float_array(coefficients, "coefficients").copy()
+        )
         self._rate = rate if callable(rate) else finite_number(rate, "rate")
         self.name = name
 

@@ -170,21 +170,18 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
             broken.append(np.eye(3))
         turns.keep(turns.fields(x[fixed]))
     for part in integrator.parts:
-        engine = part.engine_at(context)
-        if engine is not None:
-            motion, places = engine
-            open_ones = open_directions(motion, places)
+        solver = part.solver_at(context)
+        if solver is not None:
+            motion, atoms, time = solver
+            open_ones = open_directions(motion, x[atoms], time)
             broken.append(np.eye(3) - open_ones.T @ open_ones)
-            turns.keep_rows(motion, places)
+            turns.keep_rows(motion, x[atoms], time)
     acting = groups_in(integrator)
     for force in forces_of(system):
-        if force.getForceGroup() in integrator.row_groups:
-            if not _carries(force):
-                broken.append(_totals(context, force, x, fixed, turns))
-        elif momentum == "auto" and groups_of(force) & acting and knows_a_place(force):
+        if momentum == "auto" and groups_of(force) & acting and knows_a_place(force):
             if not removed:
                 broken.append(_totals(context, force, x, fixed, turns))
-            elif turns.found and not _carries(force):  # what Python computes is taken for forces between particles
+            elif turns.found and not isinstance(force, openmm.PythonForce):  # taken for forces between particles
                 _totals(context, force, x, fixed, turns)
     if removed:  # the center of mass rests
         turns.keep(np.tensordot(masses, turns.fields(x).reshape(-1, 3, 6), 1) / masses.sum())
@@ -195,11 +192,6 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     if momentum == "conserved" and not len(directions):
         raise UnsupportedError("total momentum is not conserved: rows or particles without mass are held in space")
     return Momenta(directions, turns.found)
-
-
-def _carries(force: openmm.Force) -> bool:
-    """Whether a force is a messenger to the engine of kcons, no row itself."""
-    return isinstance(force, openmm.PythonForce)
 
 
 def _totals(

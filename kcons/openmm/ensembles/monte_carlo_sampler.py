@@ -29,7 +29,7 @@ from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats import Counts, best_share
+from kcons.thermostats import Counts, best_acceptance
 from kcons.thermostats.freedom import drift_velocity
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import (
@@ -271,7 +271,7 @@ class HamiltonianMonteCarlo:
         assert integrator.scheme is not None
         search = DualAveraging(
             integrator.getStepSize().value_in_unit(unit.picosecond),
-            best_share(integrator.scheme.order) if wanted is None else wanted,
+            best_acceptance(integrator.scheme.order) if wanted is None else wanted,
         )
         check_proposals(proposals)
         begun = integrator.getStepSize()

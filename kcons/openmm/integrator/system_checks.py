@@ -335,7 +335,7 @@ def _refuse_lopsided(rows: SystemRows) -> None:
             raise UnsupportedError(
                 f"particles {i}, {j} and {k} are a rigid triangle, of which {first} and {second} have the masses "
                 f"{rows.masses[first]:g} and {rows.masses[second]:g}: OpenMM's SETTLE needs equal ones, and moves "
-                "others wildly. Hold it with kcons: take_constraints(system, keep_water=False), then hold"
+                "others wildly. Hold it with kcons: move_constraints(system, keep_water=False), then hold"
             )
 
 

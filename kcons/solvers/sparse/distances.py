@@ -16,7 +16,7 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
-from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, piece
+from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, table_array
 from kcons.solvers.kernels.lattices import OPEN, nearest_image
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
@@ -440,4 +440,4 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 def _resolved(x, lattice, kind, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
-    return resolved(x, piece(halves(tables), h, _PAIRS), piece(tables, h, _LENGTHS), lattice, kind)
+    return resolved(x, table_array(halves(tables), h, _PAIRS), table_array(tables, h, _LENGTHS), lattice, kind)

@@ -17,7 +17,7 @@ import numpy as np
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import MORE, packed_tangents
-from kcons.solvers.kernels.array_views import flat, integers, piece
+from kcons.solvers.kernels.array_views import flat, integers, table_array
 from kcons.steppers.stages.compiled_operations import all_finite
 
 #: Sums may be taken in any order, so that they are compiled to vector instructions; NaN stays NaN.
@@ -175,7 +175,7 @@ def after_drift(u, pace, masses, twice, t):  # type: ignore[no-untyped-def]
 def first_turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
     """`before_drift`, from velocities on the constraints."""
     n = v.size
-    weights, masses = piece(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    weights, masses = table_array(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
     if not all_finite(forces):
         return 1
     growth, done = before_drift(v, forces, weights, masses, numbers[SQUARE], numbers[TWICE], time)
@@ -189,7 +189,7 @@ def first_turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-
 def turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
     """`after_drift`, from velocities on the constraints and forces, which are projected first."""
     n = v.size
-    weights, masses = piece(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    weights, masses = table_array(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
     if not all_finite(forces):
         return 1
     pace = numbers[SIZE + n : SIZE + 2 * n]

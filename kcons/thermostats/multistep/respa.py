@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import Rng, check_call, numbers, read_only_view, whole_number
+from kcons.constraints.arguments import Rng, as_float_array, check_call, read_only_view, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -122,7 +122,7 @@ class ForceGroups:
 
     def of(self, name: str, x: FloatArray, time: float) -> FloatArray:
         """Forces of one group."""
-        f = numbers(self.groups[name](x, time), f"forces of group {name!r}")
+        f = as_float_array(self.groups[name](x, time), f"forces of group {name!r}")
         self.evaluations[name] += 1
         return f
 
@@ -132,8 +132,8 @@ def _difference(cheap: ForceFunction, expensive: ForceFunction) -> ForceFunction
 
     def force(x: FloatArray, time: float) -> FloatArray:
         # A function may use its array again, also where both share it.
-        less = np.array(numbers(cheap(x, time), "cheap forces"))
-        whole = numbers(expensive(x, time), "expensive forces")
+        less = np.array(as_float_array(cheap(x, time), "cheap forces"))
+        whole = as_float_array(expensive(x, time), "expensive forces")
         if less.shape != whole.shape:
             raise InputError(
                 f"cheap forces have shape {less.shape}, expensive ones {whole.shape}: they are of different systems, "

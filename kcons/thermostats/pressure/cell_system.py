@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, check_call, numbers
+from kcons.constraints.arguments import as_array, as_float_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -162,7 +162,7 @@ class CellSystem(System):
 
 
 def _number(energy: ArrayLike) -> float:
-    found = numbers(energy, "potential")
+    found = as_float_array(energy, "potential")
     if found.ndim:
         raise InputError(
             f"the potential function returned shape {found.shape}; it must return one number", item="potential"

@@ -41,7 +41,7 @@ from kcons.errors import (
 from kcons.motion import Motion
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.collective.coordinates import Row, each_term
+from kcons.openmm.collective.coordinates import Row, forces_by_term
 from kcons.steppers import System, run
 
 # -- held to rounding -----------------------------------------------------------------------------------
@@ -186,7 +186,7 @@ def terms():
     several = openmm.CustomBondForce("r")
     for pair in ((0, 3), (1, 4), (2, 5)):
         several.addBond(*pair)
-    return [*each_term(several), each_term(with_variable("a+b", a=bond(0, 3), b=dihedral(0, 1, 2, 3)))[1]]
+    return [*forces_by_term(several), forces_by_term(with_variable("a+b", a=bond(0, 3), b=dihedral(0, 1, 2, 3)))[1]]
 
 
 @pytest.mark.parametrize(

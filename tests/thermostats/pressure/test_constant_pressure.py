@@ -11,7 +11,7 @@ from scipy import stats
 from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import ProjectedVerlet, Rattle, State, Suzuki4, interpreter, run
+from kcons.steppers import Rattle, State, Suzuki4, interpreter, run
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, autocorrelation_time, thermal_velocities
 from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
 
@@ -143,9 +143,7 @@ def swaying(x, t, h):
     return -np.sin(2 * np.pi * x @ np.linalg.inv(h))
 
 
-@pytest.mark.parametrize(
-    "stepper", [*(make() for make in STEPPERS.values()), Rattle(), Suzuki4(), ProjectedVerlet()], ids=repr
-)
+@pytest.mark.parametrize("stepper", [*(make() for make in STEPPERS.values()), Rattle(), Suzuki4()], ids=repr)
 def test_other_steppers_go_on_in_the_cell_of_the_state(stepper):
     """Which they keep, wherever the System has been since."""
     system, state = begun(force=swaying, potential=lambda x, t, h: 0.0)
