@@ -39,6 +39,8 @@ MADE_BY = {
     "trajectory_check": "check_speed",
     "whole_comparison": "whole_comparison",
 }
+#: With an error and a unit, or without.
+NUMBER = re.compile(r"[-+\d.,e]+( ± [\d.]+)?( \S{1,5})?")
 BLOCK = re.compile(r"<!-- table: (\w+) (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
@@ -54,8 +56,9 @@ def study(result: str) -> ModuleType:
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """Numbers and what looks like numbers to the right."""
+    """Numbers and what looks like numbers to the right; a number, its error and its unit on one line."""
     cells = [[str(cell).replace("|", r"\|") for cell in row] for row in table.astype(object).fillna("").to_numpy()]
+    cells = [[cell.replace(" ", "\u00a0") if NUMBER.fullmatch(cell) else cell for cell in row] for row in cells]
     rules = ["---:" if all(re.match(r"[-–\d.]", row[k]) for row in cells) else "---" for k in range(len(table.columns))]
     return "\n".join(f"| {' | '.join(row)} |" for row in ([str(c) for c in table.columns], rules, *cells))
 

@@ -20,7 +20,7 @@ from kcons.ase.dynamics import ConstrainedDynamics, in_step
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import Rng, as_float_array, generator_of, positive, seed_from
+from kcons.constraints.arguments import Rng, as_float_array, checked, generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -200,7 +200,7 @@ class IsokineticDynamics(ThermostattedDynamics):
         timestep: float,
         temperature_K: float | None = None,
         *,
-        order: int = 2,
+        order: Literal[2, 4, 6] = 2,
         convention: Convention = "exact",
         indices: ArrayLike | None = None,
         momentum: Momentum = "auto",
@@ -241,11 +241,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
         Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
-
-    Raises
-    ------
-    InputError
-        Temperature not positive, friction negative, a negative time step.
     """
 
     def __init__(
@@ -447,6 +442,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         Spheres with constraints that move or that hold velocities.
     """
 
+    @checked
     def __init__(
         self,
         atoms: Atoms,
@@ -463,8 +459,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
         **kwargs: Any,
     ) -> None:
         kinds: dict[str, Callable[..., Any]] = {"langevin": LangevinRespa, "spheres": IsokineticSpheres}
-        if bath not in kinds:
-            raise InputError(f"bath is {bath!r}; choose 'langevin' or 'spheres'", item="bath")
         kind = kinds.pop(bath)
         options = {name: kwargs.pop(name) for name in signature(kind).parameters if name in kwargs}
         for name in set(signature(*kinds.values()).parameters) & set(kwargs):

@@ -66,13 +66,7 @@ def run(chosen: argparse.Namespace) -> int:
 
 
 def _asks_for_averages(chosen: argparse.Namespace) -> bool:
-    """Whether averages are compared, and not trajectories.
-
-    Raises
-    ------
-    InputError
-        Options that are wrong or do not go together.
-    """
+    """Whether averages are compared, and not trajectories."""
     from kcons.comparison import methods
 
     target, forces = chosen.target_error, (chosen.slow, chosen.fast)

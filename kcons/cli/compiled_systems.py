@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 
@@ -22,6 +23,7 @@ from kcons.constraints import (
     Sphere,
     Torus,
 )
+from kcons.constraints.compilation import announcer
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.steppers import BlanesMoan6, Rattle, Stepper
@@ -142,8 +144,21 @@ def _use(molecule: FloatArray, *rows: Constraint, copies: int = 1, steppers: tup
             motion.report(end.positions, end.velocities)
 
 
-KINDS: dict[str, Callable[[], None]] = {
-    use.__name__: use for use in (molecules, water, bonds, proteins, surfaces, thermostats, ase, check)
+def device() -> str:
+    """steps on the device: the plugin of OpenMM"""
+    from kcons.openmm.device import build
+
+    why = build.refusal()
+    if not why and not build.is_built():
+        begun = time.perf_counter()
+        build.library()
+        announcer.seconds += time.perf_counter() - begun
+    return why
+
+
+#: What each returns is why it cannot be compiled here.
+KINDS: dict[str, Callable[[], str | None]] = {
+    use.__name__: use for use in (molecules, water, bonds, proteins, surfaces, thermostats, ase, check, device)
 }
 #: Packages that some of them need.
-NEEDS = {"check": "MDAnalysis"}
+NEEDS = {"check": "MDAnalysis", "device": "openmm"}

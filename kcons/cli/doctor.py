@@ -46,6 +46,7 @@ def examine() -> dict[str, Any]:
         "packages": {name: version(name) or "not installed" for name in NEEDED},
         "extras": {name: version(name) or f"pip install 'kcons[{EXTRAS[name]}]'" for name in EXTRAS},
         "OpenMM platforms": _platforms(wrong) if find_spec("openmm") else {},
+        "steps on the device": _device() if find_spec("openmm") else {},
         "caches": caches(wrong),
         "wrong": wrong,
     }
@@ -116,6 +117,20 @@ def _tried(name: str) -> str:
             device = f" ({chosen.getPropertyValue(context, 'Threads')} threads)"
         del context
     return f"runs: {', '.join(running)}{device}" if running else f"does not run: {failure}"
+
+
+def _device() -> dict[str, str]:
+    """Whether there is the plugin of OpenMM, or why there can be none."""
+    from kcons.openmm.device import build
+
+    known = {
+        "compiler": " ".join(build.compiler()) or "none",
+        "for": ", ".join(["Reference", "CPU", *build.accelerated()]),
+    }
+    if why := build.refusal():
+        return {**known, "plugin": f"none: {why}"}
+    there = next((path for path in build.places() if (path / "libKcons.so").exists()), None)
+    return {**known, "plugin": f"in {there}" if there else "not compiled yet; kcons warmup device compiles it"}
 
 
 def caches(wrong: list[str]) -> dict[str, str]:

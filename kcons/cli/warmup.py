@@ -34,7 +34,10 @@ def _warmup(chosen: argparse.Namespace) -> int:
             continue
         begun, before = time.perf_counter(), announcer.seconds
         with all_compiled(), terminal.status(f"{name}: {KINDS[name].__doc__}"):
-            KINDS[name]()
+            refused = KINDS[name]()
+        if refused:
+            terminal.print(f"{name}: {refused}")
+            continue
         compiled, whole = announcer.seconds - before, time.perf_counter() - begun
         terminal.print(f"{name}: compiled in {compiled:.1f} s" if compiled else f"{name}: is there ({whole:.1f} s)")
     return 0

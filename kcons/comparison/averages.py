@@ -20,7 +20,7 @@ from kcons.comparison.measure import COLUMNS, described, first_line, processor_c
 from kcons.comparison.methods import lines_on_arrays
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
-from kcons.constraints.arguments import Rng, positive, seed_from
+from kcons.constraints.arguments import Positive, Rng, checked, positive, seed_from
 from kcons.errors import InputError, did_you_mean
 from kcons.steppers import BlanesMoan4, State, Stepper, System
 from kcons.thermostats import (
@@ -182,13 +182,7 @@ USUAL_WITH_CHEAP = ("langevin", "langevin-respa", "langevin-halfway", "spheres",
 
 
 def choose_samplers(names: Iterable[str] | None, cheap: bool = False) -> list[Sampler]:
-    """Samplers by name; the usual ones by default, all of them for 'all'.
-
-    Raises
-    ------
-    InputError
-        Unknown name, or none; one that needs cheap forces where there are none.
-    """
+    """Samplers by name; the usual ones by default, all of them for 'all'."""
     wanted = list((USUAL_WITH_CHEAP if cheap else USUAL) if names is None else names)
     if wanted == ["all"]:
         wanted = [name for name, sampler in SAMPLERS.items() if cheap or not sampler.several]
@@ -210,6 +204,7 @@ def inner_step(system: TestSystem) -> float:
     return sorted(system.time_steps, reverse=True)[:2][-1]
 
 
+@checked
 def compare_averages(
     system: TestSystem,
     methods: Iterable[str] | None = None,
@@ -217,7 +212,7 @@ def compare_averages(
     cheap: TestSystem | None = None,
     steps: Sequence[float] | None = None,
     frictions: Sequence[float] | None = None,
-    budget: float = 20.0,
+    budget: Positive = 20.0,
     rng: Rng = 1,
     done: pd.DataFrame | None = None,
     keep: Callable[[pd.DataFrame], None] | None = None,
@@ -257,8 +252,6 @@ def compare_averages(
         Unknown sampler; a system without a temperature; other atoms or constraints with the cheap forces; steps,
         frictions or a budget that are not positive.
     """
-    if not budget > 0:
-        raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
     if not system.thermal_energy:
         raise InputError(f"{system.name} has no temperature: compare its trajectories instead", item="criterion")
     chosen, watching, seed = choose_samplers(methods, cheap is not None), watcher or Watcher(), seed_from(rng)
@@ -315,6 +308,7 @@ def _refuse(system: TestSystem, step: float, friction: float) -> None:
         raise InputError(f"a step of {shown} is too long", item="dt")
 
 
+@checked
 def sample(
     system: TestSystem,
     sampler: Sampler,
@@ -322,8 +316,8 @@ def sample(
     friction: float,
     *,
     cheap: TestSystem | None = None,
-    length: float | None = None,
-    budget: float | None = None,
+    length: Positive | None = None,
+    budget: Positive | None = None,
     rng: Rng = 1,
     watcher: Watcher | None = None,
 ) -> dict[str, Any]:
@@ -342,17 +336,9 @@ def sample(
         Instead: seconds of processor time.
     rng : int, numpy.random.Generator or None
     watcher : Watcher, optional
-
-    Raises
-    ------
-    InputError
-        Neither or both of `length` and `budget`; a step or friction that is not positive.
     """
-    given = {name: value for name, value in {"length": length, "budget": budget}.items() if value is not None}
-    if len(given) != 1:
+    if (length is None) == (budget is None):
         raise InputError("give either length or budget", item="length")
-    for name, value in given.items():
-        positive(value, name)
     _refuse(system, step, friction)
     row: dict[str, Any] = {
         "method": sampler.name,

@@ -20,6 +20,7 @@ from kcons import steppers
 from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.comparison.runs import InAse, InOpenMM, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
+from kcons.constraints.arguments import Count, checked
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, did_you_mean
@@ -37,7 +38,8 @@ Refuses = Callable[[TestSystem], str | None]
 Code = str | Callable[[TestSystem], str]
 
 Kind = Literal["trajectory", "baseline", "thermostat"]
-ENGINES = ("arrays", "ASE", "OpenMM")
+Engine = Literal["arrays", "ASE", "OpenMM"]
+ENGINES = get_args(Engine)
 
 
 @dataclass(frozen=True)
@@ -87,13 +89,14 @@ class Method:
 METHODS: dict[str, Method] = {}
 
 
+@checked
 def add_method(
     name: str,
     start: Start,
     *,
     title: str = "",
-    engine: str = "arrays",
-    force_evaluations: int = 1,
+    engine: Engine = "arrays",
+    force_evaluations: Count = 1,
     adaptive: bool = False,
     kind: Kind = "trajectory",
     usual: bool = True,
@@ -125,18 +128,7 @@ def add_method(
     code : str or callable, optional
         Lines of Python that run it, with $made_by (an expression that makes the test system), $step (or the tolerance),
         $steps and $ps (the step in ps); or a test system to them.
-
-    Raises
-    ------
-    InputError
-        An unknown engine or kind; force evaluations below 1.
     """
-    if engine not in ENGINES:
-        raise InputError(f"engine is {engine!r}; there are {', '.join(ENGINES)}", item="engine")
-    if kind not in get_args(Kind):
-        raise InputError(f"kind is {kind!r}; there are {', '.join(get_args(Kind))}", item="kind")
-    if not (isinstance(force_evaluations, int) and force_evaluations >= 1):
-        raise InputError(f"force_evaluations is {force_evaluations!r}; give 1 or more", item="force_evaluations")
     METHODS[name] = made = Method(
         name, title or name, start, engine, force_evaluations, adaptive, kind, usual, refuses, code
     )
@@ -148,11 +140,6 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
 
     By default the usual ones that can run the test system: of OpenMM alone where its forces are OpenMM's, else all of
     arrays and ASE and the plainest of OpenMM.
-
-    Raises
-    ------
-    InputError
-        Unknown name, or none.
     """
     if names is None:
         usual = [method for method in METHODS.values() if method.usual]

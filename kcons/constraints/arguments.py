@@ -16,7 +16,20 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, TypeAlias, get_args, get_type_hints
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +38,9 @@ from kcons.errors import InputError
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _FLOAT = np.dtype(np.float64)
 #: Kinds of dtype whose values are real numbers: boolean, integers, floating point.
@@ -263,6 +279,37 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
     return found
 
 
+def not_negative(value: Any, item: str) -> float:
+    """`value` as a float, which has to be finite and not below zero."""
+    found = finite_number(value, item)
+    if found < 0:
+        raise InputError(f"{item} is {_value_text(value)}; give a number of 0 or more", item=item)
+    return found
+
+
+def share(value: Any, item: str) -> float:
+    """`value` as a float, a part of one: from 0 to less than 1."""
+    found = finite_number(value, item)
+    if not 0 <= found < 1:
+        raise InputError(f"{item} is {_value_text(value)}; give a number from 0 to less than 1", item=item)
+    return found
+
+
+def one_of(value: Any, item: str, words: tuple[Any, ...]) -> Any:
+    """`value`, which has to be one of `words`."""
+    if not isinstance(value, str | int | np.integer) or value not in words:
+        *others, last = map(repr, words)
+        raise InputError(f"{item} is {_value_text(value)}; choose {', '.join(others)} or {last}", item=item)
+    return value
+
+
+#: For `checked`.
+Positive: TypeAlias = Annotated[float, positive]
+NotNegative: TypeAlias = Annotated[float, not_negative]
+Finite: TypeAlias = Annotated[float, finite_number]
+Count: TypeAlias = Annotated[int, whole_number]
+FromZero: TypeAlias = Annotated[int, functools.partial(whole_number, least=0)]
+Share: TypeAlias = Annotated[float, share]
 #: What random numbers are drawn from, as in NumPy: a seed, a generator, or the operating system for None.
 Rng: TypeAlias = int | np.random.Generator | None
 
@@ -415,42 +462,62 @@ def plain_target(target: Any, item: str, kind: Kind) -> tuple[Any, bool]:
 # -- arguments looked at by what their annotations say ----------------------------------------------
 
 
+Rule: TypeAlias = Callable[[Any, str], Any]
+
+
+class Rules(NamedTuple):
+    """What an annotation says of an argument: its units, or `NUMBER`; whether None may pass, unseen; rules."""
+
+    kind: Kind
+    optional: bool
+    rules: tuple[Rule, ...]
+
+
 @functools.cache
-def rules_of(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
-    """What ``Annotated`` says of each argument but the first: its `Kind`, `NUMBER` if not said, then its rules."""
-    hints = get_type_hints(function, include_extras=True)
-    found = {}
-    for name in list(inspect.signature(function).parameters)[1:]:
+def rules_of(function: Callable[..., Any]) -> dict[str, Rules]:
+    """What ``Annotated`` and ``Literal`` say of each argument."""
+    hints, found = get_type_hints(function, include_extras=True), {}
+    for name in inspect.signature(function).parameters:
         hint = hints.get(name)
-        said = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)  # or None
-        told: tuple[Any, ...] = getattr(said, "__metadata__", ())
-        found[name] = told if told and isinstance(told[0], Kind) else (NUMBER, *told)
+        kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        given = [kind for kind in kinds if kind is not NoneType]
+        said = next((kind for kind in given if hasattr(kind, "__metadata__")), None)
+        optional = len(given) < len(kinds) or (said is not None and NoneType in get_args(said.__origin__))
+        told: tuple[Any, ...] = () if said is None else said.__metadata__
+        if len(given) == 1 and get_origin(given[0]) is Literal:
+            told = (functools.partial(one_of, words=get_args(given[0])),)
+        kind = next((part for part in told if isinstance(part, Kind)), NUMBER)
+        found[name] = Rules(kind, optional, tuple(part for part in told if callable(part)))
     return found
 
 
-def checked(init: Callable[..., None]) -> Callable[..., None]:
-    """Let the annotations of an ``__init__`` look at its arguments.
+def checked(function: Callable[P, R], *, units: bool = False) -> Callable[P, R]:
+    """Let the annotations of a function look at its arguments.
 
-    Of ``Annotated[type, kind, rule, ...]`` the `Kind` says what units Quantities may have: they become plain numbers,
-    and the object remembers that in its `units`. A rule ``rule(value, item)`` gives what is taken in place of the
-    value, or raises `InputError`; for None it is not asked.
+    A rule ``rule(value, item)`` of ``Annotated[type, kind, rule, ...]`` gives what is taken in place of the value, or
+    raises `InputError`; what is no word of a ``Literal`` is refused.
+
+    With `units`, for an ``__init__``, the `Kind` says what units Quantities may have: they become plain numbers, and
+    the object remembers that in its `units`.
     """
-    signature = inspect.signature(init)
+    signature = inspect.signature(function)
 
-    @functools.wraps(init)
-    def checked_init(self: Any, *args: Any, **kwargs: Any) -> None:
-        bound, remembered = signature.bind(self, *args, **kwargs), False
-        rules = rules_of(init)
-        for name, value in list(bound.arguments.items())[1:]:
-            kind, *asked = rules[name]
-            item = f"{type(self).__name__}: {name}"
-            value, matters = plain_target(value, item, self.held if kind is HELD else kind)
-            remembered |= matters
-            for rule in asked if value is not None else ():
+    @functools.wraps(function)
+    def checked_function(*args: P.args, **kwargs: P.kwargs) -> R:
+        bound, rules, remembered = signature.bind(*args, **kwargs), rules_of(function), False
+        self: Any = args[0] if units else None
+        for name, value in list(bound.arguments.items())[units:]:
+            kind, optional, asked = rules[name]
+            item = f"{type(self).__name__}: {name}" if units else name
+            if units:
+                value, matters = plain_target(value, item, self.held if kind is HELD else kind)
+                remembered |= matters
+            for rule in () if optional and value is None else asked:
                 value = rule(value, item)
             bound.arguments[name] = value
-        init(*bound.args, **bound.kwargs)
+        result = function(*bound.args, **bound.kwargs)
         if remembered:
             self.units = MD_UNITS
+        return result
 
-    return checked_init
+    return checked_function

@@ -143,7 +143,7 @@ class Constraint:
         if cls.row is not None and cls.kind is RowKind.INTERPRETED:
             cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
         if "__init__" in cls.__dict__ or cls.__init__ is Constraint.__init__:
-            cls.__init__ = checked(cls.__init__)  # type: ignore[method-assign]
+            cls.__init__ = checked(cls.__init__, units=True)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = read_only(_atom_table(atoms, type(self).__name__, self.row_width))

@@ -191,11 +191,6 @@ def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_cov
     covariance, other_covariance : array_like, shape (d, d) or ()
         Of the means. Where the sum of both is singular, only what has an error counts; a difference in what has none
         has the probability 0. Differences of rounding, 1e-9 of the largest mean, are none.
-
-    Raises
-    ------
-    InputError
-        Shapes that do not go together; a NaN or infinity.
     """
     arrays = [as_float_array(values, name) for values, name in ((one, "one"), (other, "other"))]
     spreads = [as_float_array(values, "covariance") for values in (covariance, other_covariance)]

@@ -15,13 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import (
-    as_array,
-    check_out,
-    check_pairs,
-    finite_number,
-    refuse_other,
-)
+from kcons.constraints.arguments import Finite, as_array, check_out, check_pairs, checked, finite_number, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -76,18 +70,16 @@ class Motion:
     Notes, section 4.1; eqs. 94-107.
     """
 
+    @checked
     def __init__(
         self,
         constraint_set: ConstraintSet,
         positions: ArrayLike,
         *,
         degenerate: Literal["convert", "raise"] = "convert",
-        time: float = 0.0,
+        time: Finite = 0.0,
     ) -> None:
-        if degenerate not in ("convert", "raise"):
-            raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         refuse_other(constraint_set, ConstraintSet, "constraint_set", "a kcons.ConstraintSet")
-        time = finite_number(time, "time")
         self._shape = (constraint_set.n_atoms, 3)
         x = as_array(positions, self._shape, "positions")
         self._given = constraint_set

@@ -11,35 +11,26 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.motion.condition import worst_condition
 from kcons.plan.independent_blocks import fixed_atoms
-from kcons.plan.plan import Plan
+from kcons.plan.plan import ClusterKind, Plan
 
 #: Conversions that a printed report names.
 SHOWN = 4
 
 
 @dataclass(frozen=True)
-class KindReport:
+class KindReport(ClusterKind):
     """Clusters of one kind at given positions.
 
     Attributes
     ----------
-    solver : str
-    clusters, rows, rank : int
     condition : float
         Of the worst cluster, see `kcons.motion.condition`; NaN where it was not asked for or is out of reach.
     iterations : int
         Newton iterations of the worst cluster in the last position projection; 0 before the first.
-    example : str
-        Name of one row.
     """
 
-    solver: str
-    clusters: int
-    rows: int
-    rank: int
     condition: float
     iterations: int
-    example: str
 
 
 @dataclass(frozen=True)
@@ -125,7 +116,7 @@ def make_report(
             for solver, kind in zip(plan.solvers, plan.kinds, strict=True)
         ]
     kinds = [
-        KindReport(k.solver, k.clusters, k.rows, k.rank, ratio, count, k.example)
+        KindReport(**vars(k), condition=ratio, iterations=count)
         for k, ratio, count in zip(plan.kinds, conditions, iterations, strict=True)
     ]
     return Report(

@@ -10,6 +10,7 @@ collective variables, surfaces and the constraint objects of kcons.
 - `collective`: collective variables
 - `callback_rows`: constraint objects of kcons
 - `surfaces`: particles on surfaces
+- `device`: steps as kernels of a plugin
 """
 
 from kcons.errors import with_extra
@@ -19,11 +20,12 @@ try:
     from kcons.openmm.callback_rows.hold import hold, move_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
     from kcons.openmm.collective.coordinates import Row, forces_by_term
+    from kcons.openmm.device.device_integrator import DeviceIntegrator
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-    from kcons.openmm.ensembles.langevin_ensemble import Langevin
+    from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-    from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
+    from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
     from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
@@ -31,7 +33,7 @@ try:
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.formulas import ExpressionSurface
+    from kcons.openmm.surfaces.landings import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
@@ -41,9 +43,11 @@ __all__ = [
     "SCHEMES",
     "CarriedConstraints",
     "CollectiveRows",
+    "DeviceIntegrator",
     "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",
+    "IsokineticSpheres",
     "Langevin",
     "LangevinRespa",
     "NoseHoover",

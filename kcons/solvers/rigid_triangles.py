@@ -124,12 +124,8 @@ def _report(multipliers, slots, place, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz)
 def project_triangles(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
     """Project one group of eight triangles after another; `SimdClusterSolver` says what the arguments are."""
     t, h, u = tables, integers(tables), halves(tables)
-    atoms, slots, inv_mass, undo = (
-        table_array(u, h, 0),
-        table_array(u, h, 1),
-        table_array(t, h, 2),
-        table_array(t, h, _UNDO),
-    )
+    atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
+    inv_mass, undo = table_array(t, h, 2), table_array(t, h, _UNDO)
     move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
     n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
     # Arrays that are handed on inside the loop would cost reference counting.

@@ -155,12 +155,8 @@ def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
-    links, atoms, pushes, solution = (
-        table_array(u, h, 0),
-        table_array(u, h, 1),
-        table_array(t, h, _PUSHES),
-        table_array(t, h, _SOLUTION),
-    )
+    links, atoms = table_array(u, h, 0), table_array(u, h, 1)
+    pushes, solution = table_array(t, h, _PUSHES), table_array(t, h, _SOLUTION)
     for k in range(len(solution)):
         change = factor * load_double(solution, k)
         for p in range(load_index(links, 3 * k), load_index(links, 3 * k + 3)):
@@ -177,12 +173,8 @@ def _positions(  # type: ignore[no-untyped-def]
     """As `kcons.solvers.addressable_solvers` says; all is careful here."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses, base = table_array(u, h, 0), table_array(u, h, 1), table_array(t, h, 2), table_array(t, h, 3)
-    state, scale, pushes, solution = (
-        table_array(t, h, 4),
-        table_array(t, h, 5),
-        table_array(t, h, _PUSHES),
-        table_array(t, h, _SOLUTION),
-    )
+    state, scale = table_array(t, h, 4), table_array(t, h, 5)
+    pushes, solution = table_array(t, h, _PUSHES), table_array(t, h, _SOLUTION)
     if not wanted.size:
         wanted = table_array(t, h, 6)
     runs, periodic = table_array(h, h, _RUNS), kind != OPEN

@@ -211,12 +211,8 @@ def _kernel(n_rows: int) -> Any:
     def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
         """Project one group of eight clusters after another; `SimdClusterSolver` says what the arguments are."""
         t, h, u = tables, integers(tables), halves(tables)
-        atoms, slots, ends, weights = (
-            table_array(u, h, 0),
-            table_array(u, h, 1),
-            table_array(h, h, 2),
-            table_array(t, h, 3),
-        )
+        atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
+        ends, weights = table_array(h, h, 2), table_array(t, h, 3)
         couplings, undo = table_array(t, h, 4), table_array(t, h, 5)
         move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]

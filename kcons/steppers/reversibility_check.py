@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
+from kcons.errors import ConvergenceError, ReversibilityError, UnsupportedError
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
 from kcons.steppers.stepper import Listed, Stepper, require_stepper, retold
@@ -35,15 +36,14 @@ class ReversibilityCheck(Listed):
         The scheme is not reversible at all.
     """
 
-    def __init__(self, stepper: Stepper, tolerance: float = 1e-9) -> None:
+    @checked
+    def __init__(self, stepper: Stepper, tolerance: Positive = 1e-9) -> None:
         require_stepper(stepper)
         if not stepper.reversible:
             raise UnsupportedError(
                 f"{stepper!r} is not reversible, so there is nothing to check; use Rattle, Geodesic, a Composition "
                 "or a RungeKuttaNystrom stepper"
             )
-        if not tolerance > 0:
-            raise InputError(f"tolerance is {tolerance}; give a positive number", item="tolerance")
         self.stepper = stepper
         self.tolerance = tolerance
         self.order = stepper.order

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray
@@ -120,6 +121,7 @@ class Freedom:
     turns: bool = False
 
 
+@checked
 def freedom(
     system: System, state: State, forces: FloatArray, atoms: ArrayLike | None = None, momentum: Momentum = "auto"
 ) -> Freedom:
@@ -148,8 +150,6 @@ def freedom(
     OverdeterminedError
         No degree of freedom is left.
     """
-    if momentum not in ("auto", "conserved", "free"):
-        raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
     chosen, count = _counted(system, state, atoms)
     directions = np.zeros((0, 3))
     turns = False

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraints.arguments import Rng, finite_number, positive, seed_from, whole_number
+from kcons.constraints.arguments import Count, NotNegative, Positive, Rng, checked, seed_from
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -79,13 +79,10 @@ class SeededBath(Interpreted):
     symplectic = False
     force_evaluations = 1
 
-    def __init__(self, thermal_energy: float, friction: float, rng: Rng, substeps: int) -> None:
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        self.friction = finite_number(friction, "friction")
-        if self.friction < 0:
-            raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
+    @checked
+    def __init__(self, thermal_energy: Positive, friction: NotNegative, rng: Rng, substeps: Count) -> None:
+        self.thermal_energy, self.friction, self.substeps = thermal_energy, friction, substeps
         self.seed = seed_from(rng)
-        self.substeps = whole_number(substeps, "substeps")
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""

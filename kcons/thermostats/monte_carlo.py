@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import is_
+from typing import Annotated, TypeAlias
 from weakref import ref
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import Rng, finite_number, positive, seed_from, whole_number
+from kcons.constraints.arguments import Positive, Rng, Share, checked, positive, seed_from, share, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import (
@@ -194,21 +196,20 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     reversible = False
     symplectic = False
 
+    @checked
     def __init__(
         self,
-        thermal_energy: float,
+        thermal_energy: Positive,
         steps: int | tuple[int, int],
         rng: Rng,
         *,
         stepper: Stepper | None = None,
-        keep: float = 0.0,
+        keep: Share = 0.0,
         conserve_momentum: bool = False,
-        tolerance: float = 1e-9,
+        tolerance: Positive = 1e-9,
     ) -> None:
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        self.steps = step_range(steps)
-        self.seed = seed_from(rng)
-        self.keep = kept_part(keep)
+        self.thermal_energy, self.keep, self.tolerance = thermal_energy, keep, tolerance
+        self.steps, self.seed = step_range(steps), seed_from(rng)
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
         if not (getattr(self.stepper, "reversible", False) and getattr(self.stepper, "symplectic", False)):
@@ -217,7 +218,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
                 "Rattle, Geodesic, a Composition or a RungeKuttaNystrom stepper"
             )
         self.conserve_momentum = bool(conserve_momentum)
-        self.tolerance = positive(tolerance, "tolerance")
         self._known: tuple[System, ReversedSteps, FloatArray] | None = None
 
     def __repr__(self) -> str:
@@ -375,27 +375,20 @@ def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
     return int(both[0]), int(both[1])
 
 
-def kept_part(keep: float) -> float:
-    """`keep`, in [0, 1), as a float."""
-    part = finite_number(keep, "keep")
-    if not 0 <= part < 1:
-        raise InputError(f"keep is {keep!r}; give a number from 0 (new velocities) to less than 1", item="keep")
-    return part
-
-
 #: Of dual averaging: how strongly proposals move the step, how many count as made already, how fast old ones are
 #: forgotten.
 PULL, BEFORE, FORGET = 0.2, 10, 0.75
+
+Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
 
 
 class DualAveraging:
     """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5)."""
 
-    def __init__(self, dt: float, wanted: float) -> None:
-        self.wanted = finite_number(wanted, "wanted")
-        if not 0 < self.wanted < 1:
-            raise InputError(f"wanted is {wanted!r}; give a share between 0 and 1", item="wanted")
-        self._center = self._log = math.log(positive(dt, "dt"))
+    @checked
+    def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
+        self.wanted = wanted
+        self._center = self._log = math.log(dt)
         self._sum = self._mean = 0.0
         self._told: list[float] = []
         self.made = 0
@@ -462,6 +455,7 @@ def best_acceptance(order: int) -> float:
     return order / (order + 1)
 
 
+@checked
 def tune(
     system: System,
     state: State,
@@ -469,7 +463,7 @@ def tune(
     sampler: HamiltonianMonteCarlo,
     *,
     wanted: float | None = None,
-    proposals: int = 80,
+    proposals: Proposals = 80,
 ) -> Tuned:
     """Find the time step for a share of accepted proposals, by proposals with steps that differ.
 
@@ -498,7 +492,6 @@ def tune(
         As `HamiltonianMonteCarlo.step`.
     """
     search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
-    check_proposals(proposals)
     sampler.check(system)
     known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
     held = np.zeros(SIZE) if known is None else known
@@ -511,11 +504,6 @@ def tune(
     potential, held = held[POTENTIAL], np.zeros(SIZE)
     held[POTENTIAL] = potential
     return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
-
-
-def check_proposals(proposals: int) -> None:
-    """Raise `InputError` for fewer than 20."""
-    whole_number(proposals, "proposals", 20)
 
 
 def exchange(

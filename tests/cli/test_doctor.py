@@ -9,6 +9,7 @@ import openmm
 import pytest
 
 from kcons.cli import doctor, main
+from kcons.openmm.device import build
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +30,15 @@ def test_platforms_are_tried_not_listed(found):
     assert set(found["OpenMM platforms"]) >= names
     assert found["OpenMM platforms"]["Reference"] == "runs: double"
     assert found["OpenMM platforms"]["CPU"].startswith("runs: mixed (")
+
+
+def test_whether_there_can_be_steps_on_the_device(found, monkeypatch):
+    assert found["steps on the device"]["for"].startswith("Reference, CPU")
+    monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
+    assert doctor.examine()["steps on the device"]["plugin"] == "none: there is no C++ compiler"
+    monkeypatch.setattr(build, "refusal", str)
+    monkeypatch.setattr(build, "places", list)
+    assert "kcons warmup device" in doctor.examine()["steps on the device"]["plugin"]
 
 
 def test_the_command_says_it(found, monkeypatch, capsys):

@@ -67,7 +67,7 @@ MISTAKES = [
     ("compare chain --size 3 --dt 3", "does not divide the horizon"),
     ("compare chain --size 3 --dt ,", "--dt is empty"),
     ("compare chain --seed -1", "non-negative"),
-    ("compare chain --size 3 --budget -1", "positive number of seconds"),
+    ("compare chain --size 3 --budget -1", "budget is -1.0; give a positive number"),
     ("compare chain --size 3 --out /dev/null/x", "/dev/null"),
     ("compare chain --criterion drift --target-error 1e-3", "leave --criterion drift out"),
     (f"plan {ALANINE} --constrain none", "none with kcons compare --forces"),

@@ -16,6 +16,7 @@ import kcons
 from kcons.cli import compiled_systems, main, warmup
 from kcons.constraints import compilation
 from kcons.constraints.compilation import announcer
+from kcons.openmm.device import build
 
 #: A small molecule with angles, as a user's first script has it; says what it compiled.
 MOLECULE = """
@@ -23,6 +24,7 @@ import numpy as np
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Angle, Distance
 from kcons.constraints.compilation import announcer
+from kcons.openmm.device import build
 x = np.array([[0, 0, 0], [1.5, 0, 0], [2, 1.4, 0], [3.5, 1.4, 0.5], [-0.4, -1, 0.1]])
 rows = [Distance([[0, 1], [1, 2], [2, 3], [0, 4]]), Angle([[0, 1, 2], [1, 2, 3]])]
 motion = Motion(ConstraintSet(rows, x, [12, 12, 16, 1, 1]), x)
@@ -103,3 +105,9 @@ def test_what_is_not_installed_is_said(monkeypatch, capsys):
     monkeypatch.setattr(warmup, "find_spec", lambda name: None)
     assert main.main(["warmup", "check"]) == 0
     assert "check: MDAnalysis is not installed" in capsys.readouterr().out
+
+
+def test_a_plugin_that_cannot_be_compiled_is_said(monkeypatch, capsys):
+    monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
+    assert main.main(["warmup", "device"]) == 0
+    assert capsys.readouterr().out == "device: there is no C++ compiler\n"

@@ -78,11 +78,11 @@ def test_a_method_of_ones_own_is_compared(registry):
 
 
 def test_what_is_wrong_with_a_method_is_said(registry):
-    with pytest.raises(InputError, match="engine is 'gromacs'; there are arrays, ASE, OpenMM"):
+    with pytest.raises(InputError, match="engine is 'gromacs'; choose 'arrays', 'ASE' or 'OpenMM'"):
         add_method("wrong", lambda system, dt: None, engine="gromacs")
-    with pytest.raises(InputError, match="force_evaluations is 0; give 1 or more"):
+    with pytest.raises(InputError, match="force_evaluations is 0; give a whole number, 1 or more"):
         add_method("wrong", lambda system, dt: None, force_evaluations=0)
-    with pytest.raises(InputError, match="kind is 'bath'; there are trajectory, baseline, thermostat"):
+    with pytest.raises(InputError, match="kind is 'bath'; choose 'trajectory', 'baseline' or 'thermostat'"):
         add_method("wrong", lambda system, dt: None, kind="bath")
     assert "wrong" not in registry
     with pytest.raises(InputError, match=r"there is no method 'ratle' \(did you mean 'rattle'"):

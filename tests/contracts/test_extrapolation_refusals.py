@@ -141,7 +141,3 @@ def test_what_the_base_refuses_is_refused_before_any_step() -> None:
     swinging, start = rotor()
     with pytest.raises(UnsupportedError, match="great circles"):
         Extrapolation(base=Geodesic(great_circles=True)).states(swinging, start, 1.0)
-
-
-def test_repr() -> None:
-    assert repr(Extrapolation(1e-9)) == "Extrapolation(1e-09, base=Geodesic(substeps=4))"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stepper_systems import PROJECTED, SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
+from stepper_systems import SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
 
 from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Distance
@@ -155,29 +155,14 @@ def test_projected_runge_kutta_loses_energy_steadily() -> None:
 # -- reversal ---------------------------------------------------------------------------------------
 
 
-def check_reversal(stepper: Stepper, steps: int) -> None:
+@pytest.mark.validation
+@REVERSIBLE
+def test_ten_thousand_steps_and_back(stepper) -> None:
+    """A few hundred of each stepper: `tests/steppers/test_stepper.py`."""
     system, start = spherical_pendulum()
-    end = run(system, start, 0.02, steps, stepper=stepper)
-    back = run(system, end, -0.02, steps, stepper=stepper)
+    end = run(system, start, 0.02, 10_000, stepper=stepper)
+    back = run(system, end, -0.02, 10_000, stepper=stepper)
     assert np.abs(back.positions - start.positions).max() <= 1e-11
     assert np.abs(back.velocities - start.velocities).max() <= 1e-11
     assert np.abs(end.positions - start.positions).max() > 1e-3  # it went somewhere
     assert back.time == pytest.approx(0.0, abs=1e-12)
-
-
-@REVERSIBLE
-def test_some_hundred_steps_and_back(stepper) -> None:
-    check_reversal(stepper, 250 if isinstance(stepper, LONGEST) else 1_000)
-
-
-@pytest.mark.validation
-@REVERSIBLE
-def test_ten_thousand_steps_and_back(stepper) -> None:
-    check_reversal(stepper, 10_000)
-
-
-@pytest.mark.parametrize("stepper", [s for s in PROJECTED if s.order == 2], ids=repr)
-def test_projected_schemes_do_not_come_back(stepper) -> None:
-    system, start = spherical_pendulum()
-    back = run(system, run(system, start, 0.02, 1000, stepper=stepper), -0.02, 1000, stepper=stepper)
-    assert np.abs(back.positions - start.positions).max() > 1e-7

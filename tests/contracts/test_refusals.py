@@ -296,6 +296,7 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("constrain(ATOMS.copy(), 3)", InputError, "constraints"),
     ("constrain(ATOMS.copy(), Distance([0, 9]))", InputError, "atoms"),
     ("constrain(ATOMS.copy(), Distance([0, 1], 2.0))", InputError, "positions"),
+    ("constrain(ATOMS.copy(), [Distance([0, 1], 0.9), Distance([1, 0], 1.0)])", ContradictionError, None),
     ('constrain(ATOMS.copy(), Distance([0, 1]), degenerate="maybe")', InputError, "degenerate"),
     ('constraints_of(ATOMS, "bond")', InputError, "constrain"),
     ("constraints_of(ATOMS, 3)", InputError, "constrain"),

@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,8 @@ OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "
 PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
 EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
+#: Pages on a program that no extra installs.
+NEEDS = {"tutorials/replica_exchange.md": "openmmtools"}
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 #: Between the cells of a table.
@@ -55,7 +58,11 @@ def python_pages():
 
 
 @pytest.mark.parametrize("code", python_pages())
-def test_python_snippets_run(code, tmp_path, monkeypatch):
+def test_python_snippets_run(code, tmp_path, monkeypatch, request):
+    if package := NEEDS.get(request.node.callspec.id):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
 

@@ -78,8 +78,8 @@ def test_a_page_is_read_in_one_sitting(page):
 
 
 def test_the_prose_stays_a_guide():
-    """What is written by hand, but for docs/evidence."""
-    pages = [*DOCS.glob("*.md"), *(DOCS / "tutorials").glob("*.md"), ROOT / "README.md"]
+    """What is written by hand; docs/evidence is made from results, docs/reference from docstrings."""
+    pages = [*DOCS.glob("*.md"), *(DOCS / "tutorials").glob("*.md")]
     assert sum(len(page.read_text(encoding="utf-8").splitlines()) for page in pages) <= 4500
 
 

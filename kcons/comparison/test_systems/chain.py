@@ -67,13 +67,7 @@ def build(size: int, rng: int, *, shape: str = "zigzag") -> TestSystem:
 
 
 def positions(size: int, shape: str, rng: int = 1) -> FloatArray:
-    """Atoms of a chain of `size` bonds, shape (size + 1, 3), in Å.
-
-    Raises
-    ------
-    InputError
-        Unknown shape.
-    """
+    """Atoms of a chain of `size` bonds, shape (size + 1, 3), in Å."""
     if shape not in SHAPES:
         raise InputError(f"no chain shape {shape!r}; there are {', '.join(SHAPES)}", item="shape")
     if shape == "free":

@@ -323,13 +323,7 @@ def molecules_at_300_k(
 
 
 def platform_of(n_atoms: int, platform: str) -> str:
-    """The platform of OpenMM that was asked for, or by default one that is fast enough.
-
-    Raises
-    ------
-    InputError
-        There is none of this name.
-    """
+    """The platform of OpenMM that was asked for, or by default one that is fast enough."""
     platform = platform or ("Reference" if n_atoms <= FEW_ATOMS else "CPU")
     place(platform)  # complain before the long part
     return platform

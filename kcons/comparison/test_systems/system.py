@@ -156,13 +156,7 @@ class TestSystem:
         return atoms
 
     def with_time_steps(self, shown: Sequence[float]) -> TestSystem:
-        """The same test system with other steps, in the unit of time it shows.
-
-        Raises
-        ------
-        InputError
-            A step that is not positive, or does not divide the horizon.
-        """
+        """The same test system with other steps, in the unit of time it shows."""
         steps = []
         for dt in shown:
             internal = dt * self.units.time_unit

@@ -44,8 +44,8 @@ _FLOAT = np.dtype(np.float64)
 _PLACES = (1, -1, 2, -2)
 _DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
 
-_Length: TypeAlias = Annotated[float | None, LENGTH, positive]
-_Period: TypeAlias = Annotated[float | None, ANY, positive]
+_Length: TypeAlias = Annotated[float, LENGTH, positive] | None
+_Period: TypeAlias = Annotated[float, ANY, positive] | None
 
 
 class PythonRows(Constraint, base=True):

@@ -82,7 +82,7 @@ class Formula(Constraint):
         parameters: Mapping[str, ArrayLike] | None = None,
         target: Target = 0.0,
         *,
-        period: Annotated[float | None, ANY, positive] = None,
+        period: Annotated[float, ANY, positive] | None = None,
     ) -> None:
         if not isinstance(parameters, Mapping | None):
             raise InputError(

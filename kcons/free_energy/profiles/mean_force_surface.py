@@ -82,13 +82,7 @@ class Surface:
     _process: Learned
 
     def free_energy(self, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """F and its standard error, both against `zero`, at places of shape (m, d).
-
-        Raises
-        ------
-        InputError
-            A place outside of the range of the windows.
-        """
+        """F and its standard error, both against `zero`, at places of shape (m, d)."""
         found = []
         for places in np.array_split(self._places(x), max(1, math.ceil(len(as_float_array(x, "x")) / _TOGETHER))):
             values, covariance = self._process.posterior((np.vstack([places, self.zero]), [-1]))

@@ -165,11 +165,6 @@ def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
     Returns
     -------
     ndarray, shape of `force`
-
-    Raises
-    ------
-    InputError
-        Shapes that do not go together; a NaN or infinity.
     """
     path, pushes = as_float_array(x, "x"), as_float_array(force, "force")
     if path.ndim != 1 or len(path) < 2 or pushes.ndim not in (1, 2) or pushes.shape[-1] != len(path):

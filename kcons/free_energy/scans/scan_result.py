@@ -338,11 +338,6 @@ class Scan:
             Numbers of its values in the lists of the scan.
         hold : bool
             Whether the atoms get the constraints they had there: what was held besides, and the coordinates.
-
-        Raises
-        ------
-        InputError
-            The point was not reached.
         """
         if point not in self.best:
             raise InputError(

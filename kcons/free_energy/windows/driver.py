@@ -131,13 +131,7 @@ class FreeEnergy:
 
     @cached_property
     def profile(self) -> Profile:
-        """Free energy along the only coordinate, kJ/mol.
-
-        Raises
-        ------
-        InputError
-            There are several coordinates, or too few windows.
-        """
+        """Free energy along the only coordinate, kJ/mol."""
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
         f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
@@ -146,13 +140,7 @@ class FreeEnergy:
 
     @cached_property
     def surface(self) -> Surface:
-        """Free energy in all coordinates, kJ/mol.
-
-        Raises
-        ------
-        InputError
-            Too few windows.
-        """
+        """Free energy in all coordinates, kJ/mol."""
         x, periods = self._places()
         f = np.array([w.force for w in self.windows])
         return fit_surface(x, f, np.array([w.covariance for w in self.windows]), periods=periods)

@@ -8,13 +8,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import ANGLE, LENGTH, as_float_array, positive, whole_number
+from kcons.constraints.arguments import (
+    ANGLE,
+    LENGTH,
+    Count,
+    FromZero,
+    Positive,
+    as_float_array,
+    checked,
+)
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
@@ -73,31 +81,26 @@ class Settings:
         Steps from one sample to the next. Multipliers forget in 50 to 100 fs, and closer samples tell nothing more.
     """
 
-    temperature: float = 300.0
-    timestep: float = 1.0
+    temperature: Positive = 300.0
+    timestep: Positive = 1.0
     thermostat: Thermostat = "langevin"
-    friction: float = 5.0
-    relax: int = 50
-    pull: int = 1000
-    equilibration: int = 2000
-    production: int = 20000
-    every: int = 50
+    friction: Positive = 5.0
+    relax: FromZero = 50
+    pull: FromZero = 1000
+    equilibration: FromZero = 2000
+    production: Count = 20000
+    every: Count = 50
 
     def __post_init__(self) -> None:
-        for name in ("temperature", "timestep", "friction"):
-            object.__setattr__(self, name, positive(getattr(self, name), name))
-        for name in ("relax", "pull", "equilibration", "production", "every"):
-            least = int(name in ("production", "every"))
-            object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
-        known = get_args(Thermostat)
-        if self.thermostat not in known:
-            raise InputError(f"no thermostat {self.thermostat!r}; there are {', '.join(known)}", item="thermostat")
         if self.production // self.every < 32:
             raise InputError(
                 f"production of {self.production} steps with a sample every {self.every} gives fewer than 32 samples; "
                 "an error needs more; take a longer production, or a smaller `every`",
                 item="production",
             )
+
+
+Settings.__init__ = checked(Settings.__init__)  # type: ignore[method-assign]
 
 
 class Sampler(ABC):

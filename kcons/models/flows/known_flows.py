@@ -13,9 +13,11 @@ from scipy.special import ellipj, ellipkinc
 
 from kcons.constraints.arguments import (
     FloatArray,
+    NotNegative,
+    Positive,
     as_float_array,
     check_call,
-    finite_number,
+    checked,
     positive,
     whole_number,
 )
@@ -32,10 +34,9 @@ NEAR_SEPARATRIX = 1e-9
 class DampedOscillator(LinearFlow):
     """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22)."""
 
-    def __init__(self, omega: float = 1.0, eta: float = 0.2) -> None:
-        self.omega, self.eta = positive(omega, "omega"), finite_number(eta, "eta")
-        if self.eta < 0:
-            raise InputError(f"eta is not negative, so it cannot be {eta}", item="eta")
+    @checked
+    def __init__(self, omega: Positive = 1.0, eta: NotNegative = 0.2) -> None:
+        self.omega, self.eta = omega, eta
         super().__init__([[0.0, self.omega], [-self.omega, -self.eta]])
 
     @property
@@ -106,8 +107,9 @@ class HarmonicOscillator(DampedOscillator):
 class Pendulum(HamiltonianFlow):
     """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57)."""
 
-    def __init__(self, omega: float = 1.0) -> None:
-        self.omega = positive(omega, "omega")
+    @checked
+    def __init__(self, omega: Positive = 1.0) -> None:
+        self.omega = omega
         super().__init__(
             lambda q, p: float(self.omega * (0.5 * p[0] ** 2 + 2.0 * np.sin(0.5 * q[0]) ** 2)),
             1,

@@ -23,10 +23,12 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import (
     FloatArray,
+    NotNegative,
+    Positive,
     as_float_array,
     check_call,
+    checked,
     finite_number,
-    positive,
     refuse_other,
     whole_number,
 )
@@ -318,12 +320,9 @@ class Relaxation(EntropyLaw):
         Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
     """
 
-    def __init__(self, tau: float, budget: float | None = None, *, partial: bool = False) -> None:
-        self.tau = positive(tau, "tau")
-        self.budget = None if budget is None else finite_number(budget, "budget")
-        if self.budget is not None and self.budget < 0:
-            raise InputError(f"the budget T(s_eq - s_0) is not negative, so it cannot be {budget}", item="budget")
-        self.partial = partial
+    @checked
+    def __init__(self, tau: Positive, budget: NotNegative | None = None, *, partial: bool = False) -> None:
+        self.tau, self.budget, self.partial = tau, budget, partial
         self.relaxation_rate = None if partial else 1.0 / (2.0 * self.tau)
 
     def _budget(self, excess0: float) -> float:

@@ -41,7 +41,6 @@ from kcons.openmm.collective.coordinates import (
     number,
     period_of,
     put_in_groups,
-    rows_alone,
     unit_of,
 )
 from kcons.openmm.collective.row_program import GroupRows, owner, require_holder, variables_of
@@ -50,6 +49,7 @@ from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
+    forces_alone,
     groups_in,
     refuse_agents,
     require_context,
@@ -301,7 +301,7 @@ class CollectiveRows(GroupRows):
                 "were added to",
                 item="context",
             )
-        alone, values = rows_alone(system, forces, box_of(context), context.getParameters()), self.values(context)
+        alone, values = forces_alone(system, forces, box_of(context), context.getParameters()), self.values(context)
         rows: list[Constraint] = []
         for k, (target, rate) in enumerate(zip(*self._targets_and_rates(context), strict=True)):
             atoms = np.array(self.atoms[k])
@@ -316,7 +316,7 @@ class CollectiveRows(GroupRows):
 
     def _beside(self, context: openmm.Context) -> list[Constraint]:
         """The constraints of the System in the clusters that the rows touch."""
-        held = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
+        held = SystemRows.of(context.getSystem())
         if not (self.meets_system and held.n_rows):
             return []
         body = _components(len(held.masses), held.pairs)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.system_checks import ROW_NAME, groups_of
+from kcons.openmm.integrator.system_checks import ROW_NAME, forces_alone, groups_of
 from kcons.openmm.quantities import nanometers
 from kcons.openmm.states import energy_of
 
@@ -402,38 +402,6 @@ def put_in_groups(system: openmm.System, forces: Sequence[openmm.Force | int], g
                 system.addForce(force)
 
 
-def rows_alone(
-    system: openmm.System,
-    rows: Sequence[Sequence[openmm.Force]],
-    box: Sequence | None = None,
-    parameters: Mapping[str, float] | None = None,
-) -> openmm.Context:
-    """A Context of the Forces of rows alone, each in the group of its number, in double precision.
-
-    Raises
-    ------
-    UnsupportedError
-        A PythonForce whose function cannot be copied.
-    """
-    alone = openmm.System()
-    for k in range(system.getNumParticles()):
-        alone.addParticle(system.getParticleMass(k))
-    alone.setDefaultPeriodicBoxVectors(*(system.getDefaultPeriodicBoxVectors() if box is None else box))
-    for group, forces in enumerate(rows):
-        for force in forces:
-            try:
-                copy = deepcopy(force)
-            except openmm.OpenMMException as error:
-                raise UnsupportedError(f"row {group}: {error} Define the function in a module") from error
-            copy.setForceGroup(group)
-            alone.addForce(copy)
-    context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
-    for name in context.getParameters():
-        if parameters is not None:
-            context.setParameter(name, parameters[name])
-    return context
-
-
 def found_values(
     system: openmm.System, rows: Sequence[Sequence[openmm.Force]], positions: object, box: Sequence | None = None
 ) -> FloatArray:
@@ -445,7 +413,7 @@ def found_values(
         Positions of the wrong shape, or at which a row is not a number.
     """
     x = nanometers(positions, system.getNumParticles())  # type: ignore[arg-type]
-    context = rows_alone(system, rows, box)
+    context = forces_alone(system, rows, box)
     context.setPositions(x)
     values = np.array([energy_of(context, {group}) for group in range(len(rows))])
     for k, value in enumerate(values):

@@ -10,7 +10,7 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
+from kcons.constraints.arguments import Positive, Rng, Share, checked, positive, seed_from, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -46,8 +46,7 @@ from kcons.thermostats.monte_carlo import (
     SUM,
     UNSOLVED,
     DualAveraging,
-    check_proposals,
-    kept_part,
+    Proposals,
     step_range,
 )
 
@@ -148,6 +147,7 @@ class HamiltonianMonteCarlo:
     Energies decide, so they have to be good to a part of kT: in single precision those of large systems are not.
     """
 
+    @checked
     def __init__(
         self,
         simulation: app.Simulation | openmm.Context,
@@ -155,9 +155,9 @@ class HamiltonianMonteCarlo:
         steps: int | tuple[int, int],
         rng: Rng,
         *,
-        keep: float = 0.0,
+        keep: Share = 0.0,
         conserve_momentum: bool = False,
-        tolerance: float = 1e-4,
+        tolerance: Positive = 1e-4,
         restart: str | PathLike[str] | None = None,
     ) -> None:
         self.simulation = simulation if isinstance(simulation, app.Simulation) else None
@@ -165,9 +165,8 @@ class HamiltonianMonteCarlo:
         self.setTemperature(temperature)
         self.steps = step_range(steps)
         self.seed = seed_from(rng)
-        self.keep = kept_part(keep)
         self.conserve_momentum = bool(conserve_momentum)
-        self.tolerance = positive(tolerance, "tolerance")
+        self.keep, self.tolerance = keep, tolerance
         self.integrator = _integrator_of(self.context)
         self._masses = masses_of(self.context.getSystem())[:, None]
         with np.errstate(divide="ignore"):
@@ -255,7 +254,8 @@ class HamiltonianMonteCarlo:
                 )
                 reporter.report(self.simulation, found)
 
-    def tune(self, wanted: float | None = None, proposals: int = 80) -> float:
+    @checked
+    def tune(self, wanted: float | None = None, proposals: Proposals = 80) -> float:
         """Find the time step for a wanted share of accepted proposals, and use it from now on; returns it in ps.
 
         The proposals that it takes are no sample, and are not counted; see `kcons.thermostats.tune`.
@@ -273,7 +273,6 @@ class HamiltonianMonteCarlo:
             integrator.getStepSize().value_in_unit(unit.picosecond),
             best_acceptance(integrator.scheme.order) if wanted is None else wanted,
         )
-        check_proposals(proposals)
         begun = integrator.getStepSize()
         try:
             for number in range(proposals):

@@ -73,6 +73,9 @@ class Program:
         Expression of the kinetic energy that a State tells.
     """
 
+    #: Whether a plugin has kernels in place of the lines.
+    on_device = False
+
     def __init__(self, integrator: openmm.CustomIntegrator) -> None:
         # Weak, for the integrator owns its program.
         self._integrator = weakref.ref(integrator)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from types import MethodType
-from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, cast
+from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
 import openmm
@@ -89,6 +89,9 @@ class ProjectedIntegrator(Integrator):
         take more than a hundredth of the time.
     ensemble : Ensemble, optional
         How velocities change between drifts; constant energy by default.
+    device : bool, optional
+        Whether a compiled plugin makes the steps, see `kcons.openmm.device`: True demands it, None takes it where it
+        can be had and has this step, False is the program of a CustomIntegrator.
 
     Attributes
     ----------
@@ -122,6 +125,14 @@ class ProjectedIntegrator(Integrator):
     #: Of the System's constraints; None where the platform decides.
     asked_tolerance: float | None = None
     _guard: Guard | None = None
+    _program_type = Program
+    #: Makes integrators whose steps are made on the device; given by `kcons.openmm.device`.
+    _on_device: ClassVar[Callable[..., type[ProjectedIntegrator]]]
+
+    def __new__(cls, *args: Any, device: bool | None = False, **kwargs: Any) -> ProjectedIntegrator:
+        """Of this class, or of the one that runs on the device."""
+        kind = cls._on_device(device, *args, **kwargs) if cls is ProjectedIntegrator and device is not False else cls
+        return cast(ProjectedIntegrator, object.__new__(kind))
 
     def __init__(
         self,
@@ -132,8 +143,9 @@ class ProjectedIntegrator(Integrator):
         tolerance: float | None = None,
         check_every: int | None = None,
         ensemble: Ensemble | None = None,
+        device: bool | None = False,
     ) -> None:
-        super().__init__(picoseconds(timestep))
+        self._make(picoseconds(timestep))
         self.asked_tolerance = None if tolerance is None else relative_tolerance(tolerance)
         openmm.CustomIntegrator.setConstraintTolerance(self, self.asked_tolerance or TOLERANCES["double"])
         if check_every is not None:
@@ -146,16 +158,24 @@ class ProjectedIntegrator(Integrator):
                 item="ensemble",
             )
         self._ensemble.check(self.scheme)
-        self.parts = _listed(parts)
+        self.parts = self._held(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         _refuse_shared(self.parts)
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
         if self.row_groups:
             openmm.Integrator.setIntegrationForceGroups(self, set(range(32)) - self.row_groups)
-        self.program = Program(self)
+        self.program = self._program_type(self)
         self._step = self._write(self.program)
         self.program.hand_over()
+
+    def _held(self, parts: Any) -> tuple[Part, ...]:
+        """The parts, of what was given."""
+        return _listed(parts)
+
+    def _make(self, dt: float) -> None:
+        """Make the integrator of OpenMM."""
+        super().__init__(dt)
 
     def _write(self, program: Program) -> Step:
         """Write the program; parts keep what they need to know of it, and that it is the one they serve."""
@@ -248,7 +268,7 @@ class ProjectedIntegrator(Integrator):
         """Parts that have served another integrator since serve this one again."""
         if all(part.program is self.program for part in self.parts):
             return
-        self._write(Program(self))  # the same as that which the integrator has
+        self._write(self._program_type(self))  # the same as that which the integrator has
         if self._guard is not None:
             self.take_precision(self._guard.precision)
             self._guard.started = False

@@ -455,12 +455,8 @@ def project(tangent, points, references, velocities, inverse_dt, given, lattice,
     """Project one strip after another; `SimdClusterSolver` says what the arguments are."""
     t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
     starts, atoms, owned, full = table_array(h, h, 0), table_array(u, h, 1), table_array(b, h, 2), table_array(b, h, 3)
-    rows, present, weights, wholes = (
-        table_array(u, h, 4),
-        table_array(t, h, 5),
-        table_array(t, h, 6),
-        table_array(h, h, 7),
-    )
+    rows, present = table_array(u, h, 4), table_array(t, h, 5)
+    weights, wholes = table_array(t, h, 6), table_array(h, h, 7)
     work, undo = table_array(t, h, 10), table_array(t, h, 11)
     small = np.empty(8 * WIDTH)
     cell = lattice_numbers(lattice)

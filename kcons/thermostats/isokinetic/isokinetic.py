@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError
 from kcons.steppers import Splitting, State, System
@@ -200,26 +200,21 @@ class Isokinetic(Splitting):
     reversible = False  # to the order of the scheme only: drifts are followed by a change of length
     symplectic = False
 
+    @checked
     def __init__(
         self,
-        thermal_energy: float | None = None,
+        thermal_energy: Positive | None = None,
         *,
-        kinetic_energy: float | None = None,
-        order: int = 2,
+        kinetic_energy: Positive | None = None,
+        order: Literal[2, 4, 6] = 2,
         convention: Convention = "exact",
         atoms: ArrayLike | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        if order not in SCHEMES:
-            raise InputError(f"order is {order}; choose 2, 4 or 6", item="order")
-        if convention not in ("exact", "notes"):
-            raise InputError(f"convention is {convention!r}; choose 'exact' or 'notes'", item="convention")
         if thermal_energy is not None and kinetic_energy is not None:
             raise InputError("give thermal_energy or kinetic_energy, not both", item="thermal_energy")
         super().__init__(*SCHEMES[order])
-        self.order = order
-        self.thermal_energy = None if thermal_energy is None else positive(thermal_energy, "thermal_energy")
-        self.kinetic_energy = None if kinetic_energy is None else positive(kinetic_energy, "kinetic_energy")
+        self.order, self.thermal_energy, self.kinetic_energy = order, thermal_energy, kinetic_energy
         self.convention: Convention = convention
         self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum

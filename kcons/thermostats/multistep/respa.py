@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import Rng, as_float_array, check_call, read_only_view, whole_number
+from kcons.constraints.arguments import Rng, as_float_array, check_call, checked, read_only_view, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -254,6 +254,7 @@ def _number_of(names: tuple[str, ...]) -> float:
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
 SlowKicks = Literal["ends", "middle"]
+InnerOrder = Literal[2, 4]
 
 
 @dataclass(frozen=True)
@@ -307,8 +308,6 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
 
 def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
     """Whether the slowest group kicks in the middle of the step; `InputError` where that has none."""
-    if slow_kicks not in ("ends", "middle"):
-        raise InputError(f"slow_kicks is {slow_kicks!r}; choose 'ends' or 'middle'", item="slow_kicks")
     if slow_kicks == "ends":
         return False
     if len(levels) == 1:
@@ -381,12 +380,16 @@ class Nesting:
         Steps, and what else is not as by default, as arguments.
     """
 
+    @checked
     def __init__(
-        self, steps: Mapping[str, int] | None, order: int, substeps: int, slow_kicks: SlowKicks, turns: bool = False
+        self,
+        steps: Mapping[str, int] | None,
+        order: InnerOrder,
+        substeps: int,
+        slow_kicks: SlowKicks,
+        turns: bool = False,
     ) -> None:
         levels = levels_of(steps)
-        if order not in (2, 4):
-            raise InputError(f"order is {order}; choose 2 or 4", item="order")
         flight = (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
         self.names = tuple(level.group for level in levels)
         self.middle = middle_of(levels, slow_kicks)
@@ -490,7 +493,7 @@ class LangevinRespa(Langevin):
         rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
-        order: int = 2,
+        order: InnerOrder = 2,
         substeps: int = 3,
         conserve_momentum: bool = False,
         slow_kicks: SlowKicks = "ends",

@@ -15,11 +15,11 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from kcons.constraints.arguments import Rng, whole_number
+from kcons.constraints.arguments import FromZero, Positive, Rng, checked
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
@@ -33,7 +33,7 @@ from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import MARK, placed_rows
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.respa import GroupedForces, Nesting, SlowKicks, group_names
+from kcons.thermostats.multistep.respa import GroupedForces, InnerOrder, Nesting, SlowKicks, group_names
 
 Spheres = Literal["split", "axes", "cluster", "global"]
 
@@ -220,26 +220,23 @@ class IsokineticSpheres(SeededBath):
     3579 (2013).
     """
 
+    @checked
     def __init__(
         self,
         thermal_energy: float,
-        friction: float,
+        friction: Positive,
         rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
         spheres: Spheres = "split",
-        auxiliary: int = 1,
-        order: int = 2,
+        auxiliary: FromZero = 1,
+        order: InnerOrder = 2,
         substeps: int = 3,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, rng, substeps)
-        if not self.friction > 0:
-            raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
-        if spheres not in get_args(Spheres):
-            raise InputError(f"spheres is {spheres!r}; choose one of {', '.join(get_args(Spheres))}", item="spheres")
         self.spheres: Spheres = spheres
-        self.auxiliary = whole_number(auxiliary, "auxiliary", 0)
+        self.auxiliary = auxiliary
         self.inner_order = order
         self.nesting = Nesting(steps, order, self.substeps, slow_kicks, turns=True)
         both = self.nesting.in_flights, self.nesting.on_circles

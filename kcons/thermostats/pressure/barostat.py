@@ -21,7 +21,7 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import Rng, check_pairs, finite_number, positive, seed_from, whole_number
+from kcons.constraints.arguments import Count, Finite, Positive, Rng, check_pairs, checked, finite_number, seed_from
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
@@ -76,9 +76,8 @@ class Strains:
         Largest |e_k| of a trial.
     """
 
+    @checked
     def __init__(self, kind: Kind) -> None:
-        if not isinstance(kind, str) or kind not in GENERATORS:
-            raise InputError(f"kind is {kind!r}; choose {', '.join(map(repr, GENERATORS))}", item="kind")
         self.kind, self.generators, self.flexible = kind, GENERATORS[kind], kind == "flexible"
         self.diagonals: FloatArray = np.ascontiguousarray(np.diagonal(self.generators, axis1=1, axis2=2))
         self.traces: FloatArray = self.diagonals.sum(axis=1)
@@ -220,17 +219,18 @@ class Barostat:
     what = ""
     needs_stress = False
 
+    @checked
     def __init__(
         self,
         pressure: float,
         *,
-        every: int = 100,
+        every: Count = 100,
         kind: Kind = "isotropic",
         rng: Rng = 0,
-        tension: float = 0.0,
+        tension: Finite = 0.0,
         molecules: ArrayLike | None = None,
         held: Held = "refuse",
-        cutoff: float | None = None,
+        cutoff: Positive | None = None,
     ) -> None:
         if not isinstance(pressure, str) and np.ndim(pressure):
             raise InputError(
@@ -239,17 +239,13 @@ class Barostat:
                 "the pressure along them is less by tension over thickness",
                 item="pressure",
             )
-        self.pressure = finite_number(pressure, "pressure")
-        self.tension = finite_number(tension, "tension")
-        self.strains = Strains(kind)
+        self.pressure, self.tension, self.strains = finite_number(pressure, "pressure"), tension, Strains(kind)
         if self.tension and kind not in ("semi-isotropic", "lateral", "anisotropic"):
             raise InputError(f"kind={kind!r} has no surface tension; use 'semi-isotropic' or 'lateral'", item="tension")
-        if held not in ("refuse", "stay"):
-            raise InputError(f"held is {held!r}; choose 'refuse' or 'stay'", item="held")
-        self.every, self.seed = whole_number(every, "every"), seed_from(rng)
+        self.every, self.seed = every, seed_from(rng)
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
-        self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
+        self.cutoff = cutoff
         self._pieces: WeakKeyDictionary[CellSystem, BarostatBodies] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -447,9 +443,10 @@ class MonteCarloBarostat(Barostat):
 
     what = "scale cell and centers of pieces at random, accept by energy"
 
-    def __init__(self, pressure: float, *, width: float = 0.01, **kwargs: Any) -> None:
+    @checked
+    def __init__(self, pressure: float, *, width: Positive = 0.01, **kwargs: Any) -> None:
         super().__init__(pressure, **kwargs)
-        self.width = positive(width, "width")
+        self.width = width
 
     def begin(self, system: CellSystem) -> FloatArray:
         variables = super().begin(system)
@@ -496,10 +493,10 @@ class CellRescaling(Barostat):
     what = "scale cell and centers of pieces by the stress and by noise, accept by energy"
     needs_stress = True
 
-    def __init__(self, pressure: float, tau: float, compressibility: float, **kwargs: Any) -> None:
+    @checked
+    def __init__(self, pressure: float, tau: Positive, compressibility: Positive, **kwargs: Any) -> None:
         super().__init__(pressure, **kwargs)
-        self.tau = positive(tau, "tau")
-        self.compressibility = positive(compressibility, "compressibility")
+        self.tau, self.compressibility = tau, compressibility
 
     def _drift(self, attempt: Attempt, place: Place) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of each mode's change until the next trial."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from ase.build import molecule
 from carried_systems import PEPTIDE, context_of, start, started, state_of
 from openmm import app
 
@@ -255,22 +254,6 @@ def test_what_is_no_system_and_no_context():
 
 
 # -- far targets: bonds of the System lead, and stay as they are --------------------------------------
-
-
-@pytest.mark.parametrize("hydrogen", [1.008, 3.024])
-@pytest.mark.parametrize("degrees", [150, -60])
-def test_distances_say_what_is_bonded_where_there_are_no_forces(degrees, hydrogen):
-    atoms = molecule("CH3CH2OH")
-    x, system = 0.1 * atoms.positions, openmm.System()
-    for number, mass in zip(atoms.numbers, atoms.get_masses(), strict=True):
-        system.addParticle(hydrogen if number == 1 else mass)
-    rows = hold(system, Dihedral([[3, 2, 1, 0]], np.radians(degrees)), x)
-    context = started(context_of(system, ProjectedIntegrator(0.001, parts=[rows])), x)
-    rows.apply_positions(context)
-    y = state_of(context)[0]
-    assert rows.report(context).residual < 1e-13
-    assert abs(np.linalg.norm(y[2] - y[3]) - np.linalg.norm(x[2] - x[3])) < 1e-10
-    rows.check(context)
 
 
 @pytest.mark.parametrize("constraints", [None, app.HBonds, app.AllBonds, app.HAngles])

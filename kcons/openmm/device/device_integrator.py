@@ -1,0 +1,457 @@
+"""The integrator whose steps a plugin of OpenMM makes on the device."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import logging
+import weakref
+from collections.abc import Mapping, Sequence
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import openmm
+
+from kcons.constraints.arguments import whole_number
+from kcons.constraints.target import FloatArray
+from kcons.errors import KconsError, UnsupportedError
+from kcons.openmm.device import build
+from kcons.openmm.device.held_rows import molecules_of
+from kcons.openmm.device.held_rows import refusal as rows_refusal
+from kcons.openmm.device.kernel_rows import KernelRows, as_parts
+from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, Spheres, plan
+from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
+from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
+from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
+from kcons.openmm.integrator.guard import Guard
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.integrator.schemes import to_scheme
+from kcons.openmm.integrator.steps import write_step
+from kcons.openmm.states import box_of, positions_of
+from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
+from kcons.steppers.splitting import Splitting
+from kcons.thermostats.nose_hoover import chain_fractions
+
+logger = logging.getLogger("kcons.openmm")
+
+#: Ensembles whose operations kernels have.
+ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
+_EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
+_DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
+#: What a solve that failed leaves of a call.
+_FAILED = 1
+
+
+class _Given(ctypes.Structure):
+    """What the plugin tells of a Context, as plugin/program_integrator.h has it."""
+
+    _fields_ = (
+        *((name, ctypes.c_char_p) for name in ("description", "platform", "precision")),
+        *((name, ctypes.c_int) for name in ("groups", "particles", "constraints")),
+        ("masses", ctypes.POINTER(ctypes.c_double)),
+        ("pairs", ctypes.POINTER(ctypes.c_int)),
+        *((name, ctypes.POINTER(ctypes.c_double)) for name in ("lengths", "positions", "box")),
+        ("time", ctypes.c_double),
+    )
+
+
+_PLANNER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
+#: Integrators by the key in their description, for parts, which no text describes.
+_ALIVE: weakref.WeakValueDictionary[str, DeviceIntegrator] = weakref.WeakValueDictionary()
+
+
+#: Why the last plan could not be made.
+_REFUSALS: list[Exception] = []
+
+
+# -- what becomes of operations ---------------------------------------------------------------------
+
+
+def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
+    """Why steps of this kind are not made on the device; empty if they are."""
+    if scheme is None:
+        return "the leapfrog has velocities half a step behind; use scheme='rattle'"
+    if type(ensemble) not in ENSEMBLES:
+        return f"{type(ensemble).__name__} has no kernels"
+    if getattr(ensemble, "atoms", None) is not None:
+        return "a thermostat on some of the particles has no kernels"
+    if parts and isinstance(ensemble, LangevinRespa):
+        return f"{type(ensemble).__name__} holds no parts"
+    if why := rows_refusal(parts):
+        return why
+    for operation in ensemble.operations(scheme):
+        if operation.verb not in VERBS or (isinstance(operation, Fly) and operation.exact):
+            return f"the operation {operation.verb!r} has no kernel"
+    return ""
+
+
+def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> list[Op]:
+    """Operations as plain data, with the time of each; what acts in the middle of a drift is written out."""
+    done: list[Op] = []
+    now = 0.0
+    if isinstance(ensemble, NoseHooverMiddle):
+        middle = (Project(), Chain(0.5), Chain(0.5))
+        operations = [o for given in operations for o in (middle if isinstance(given, Exchange) else (given,))]
+    for operation in operations:
+        flights: tuple[float, ...] = ()
+        ends: tuple[float, ...] = (now,)
+        if isinstance(operation, Fly):
+            flights, ends = operation.flights, operation.ends
+            now = ends[-1]
+        elif isinstance(operation, Chain):
+            assert isinstance(ensemble, NoseHoover)
+            flights = tuple(operation.fraction * f for f in chain_fractions(ensemble.chain_order, ensemble.repeats))
+        done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
+        if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
+            done.append(Op("rescale"))
+    return [Op("restore"), *done] if isinstance(ensemble, IsokineticSpheres) else done
+
+
+class DeviceProgram(Program):
+    """Variables of a step on the device: what the CustomIntegrator would have, in arrays of the plugin.
+
+    Attributes
+    ----------
+    kept : list of str
+        Variables that belong to a state, in the order of the array `memory`.
+    """
+
+    on_device = True
+    integrator: DeviceIntegrator
+    kept: list[str]
+
+    def hand_over(self) -> None:
+        """Describe the step to the plugin."""
+        self.kept = sorted({*self.memory, *({"lost"} & set(self.numbers))}, key=lambda name: (len(name), name))
+        self.lines = []
+        self.push()
+
+    def write(self, name: str, value: float) -> None:
+        """Change a variable that is no setting; settings go over at the next call of `step`."""
+        if name in self.kept and self.integrator.bound:
+            values = self.integrator.read("memory")
+            values[self.kept.index(name)] = value
+            self.integrator.write("memory", values)
+
+    def push(self) -> None:
+        """Settings, where they are others than the plugin has."""
+        integrator = self.integrator
+        if integrator.describe() and integrator.bound:
+            integrator.write("parameters", np.array([*self.settings.values(), 0.0]))
+
+    def remembered(self) -> dict[str, Any]:
+        """What belongs to the present state besides x and v."""
+        memory = {"memory": self.integrator.read("memory")}  # which makes the kernels if there are none yet
+        saved = [array.name for array in self.integrator.rows.arrays if array.saved]
+        return memory | {name: self.integrator.read(name) for name in saved}
+
+    def recall(self, values: Mapping[str, Any]) -> None:
+        """Write what `remembered` gave back into the Context."""
+        for name, found in values.items():
+            if self.integrator.bound:
+                self.integrator.write(name, found)
+
+    def listing(self) -> str:
+        """The variables, and what is done between two evaluations of forces."""
+        known = [f"  {name}: {self._words[name]}" for name in [*self.settings, *self.kept]]
+        return "\n".join(["on the device: one kernel between two evaluations of forces or sums", "variables", *known])
+
+
+class DeviceIntegrator(ProjectedIntegrator):
+    """`ProjectedIntegrator` whose steps are kernels of a plugin: what ``ProjectedIntegrator(..., device=True)`` gives.
+
+    Made with the same arguments.
+
+    Raises
+    ------
+    UnsupportedError
+        There is no plugin, or it has no kernels for this step.
+    """
+
+    _program_type = DeviceProgram
+    #: Rows of the Context, once they are known.
+    rows: Any = None
+    _seed = 0
+    _described = ""
+
+    def _make(self, dt: float) -> None:
+        build_planner()
+        made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
+        self.this = made.this  # the proxy of this class owns what XmlSerializer has made
+        openmm.Integrator.setStepSize(self, dt)
+        self._key = uuid4().hex
+        _ALIVE[self._key] = self
+
+    def _held(self, parts: Any) -> tuple[Part, ...]:
+        return as_parts(parts)
+
+    def _write(self, program: Program) -> Step:
+        """A step without parts: kernels hold their rows."""
+        step = Step(program, self.scheme, (), self._ensemble)
+        write_step(step, self._own_step)
+        for part in self.parts:
+            part.program = self.program
+        return step
+
+    def describe(self) -> bool:
+        """Tell the plugin what a step is; returns whether it knew another one."""
+        program = self.program
+        description = json.dumps(
+            {
+                "operations": plain_operations(self._step.operations, self.ensemble),
+                "settings": program.settings,
+                "memory": program.kept,
+                "seed": self._seed,
+                "noisy": self.ensemble.noisy,
+                "spheres": [getattr(self.ensemble, name, None) for name in ("spheres", "auxiliary")],
+                "integrator": self._key,
+                "parts": bool(self.parts),
+            }
+        )
+        if description == self._described:
+            return False
+        self._described = description
+        spread = program.settings.get("kT", 0.0) * program.settings.get("friction", 0.0)
+        build.library().kcons_describe(self._address, description.encode(), int(self.ensemble.noisy and spread > 0))
+        return True
+
+    @property
+    def _address(self) -> ctypes.c_void_p:
+        return ctypes.c_void_p(int(self.this))
+
+    @property
+    def bound(self) -> bool:
+        """Whether there is a Context."""
+        return bool(build.library().kcons_is_bound(self._address))
+
+    def read(self, name: str) -> FloatArray:
+        """An array of the device, by its name in `kcons.openmm.device.kernels`."""
+        library, address = build.library(), self._address
+        count = library.kcons_read(address, name.encode(), None, 0)
+        values = np.zeros(max(count, 0))
+        if count < 0 or library.kcons_read(address, name.encode(), values.ctypes.data_as(_DOUBLES), count) < 0:
+            raise _REFUSALS.pop() if _REFUSALS else openmm.OpenMMException(library.kcons_error().decode())
+        return values
+
+    def write(self, name: str, values: FloatArray) -> None:
+        """Write an array of the device."""
+        given = np.ascontiguousarray(values, dtype=np.float64)
+        library = build.library()
+        if library.kcons_write(self._address, name.encode(), given.ctypes.data_as(_DOUBLES), given.size) < 0:
+            raise openmm.OpenMMException(library.kcons_error().decode())
+
+    # -- running ---------------------------------------------------------------------------------
+
+    def attach(self, context: openmm.Context) -> None:
+        super().attach(context)
+        guard = self._guard
+        assert guard is not None
+        build.library().kcons_set_whole(self._address, int(guard.moving or not guard.undisturbed))
+
+    def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
+        self._run(guard, steps, ends)
+
+    def _run(self, guard: Guard, steps: int, ends: bool) -> None:
+        context = guard.context
+        first = context.getStepCount()
+        try:
+            for done in range(0, steps, self.rows.block):
+                block = min(steps - done, self.rows.block)
+                self._renew(context, block)
+                openmm.Integrator.step(self, block)
+        except openmm.OpenMMException as error:
+            told = self._look()
+            guard.put_back()
+            if told[_FAILED]:
+                raise self._unsolved(told, context.getStepCount()) from error
+            if "NaN" in str(error):
+                raise guard.explosion(str(error), first) from error
+            raise
+        if ends:
+            guard.look()
+
+    def _renew(self, context: openmm.Context, steps: int) -> None:
+        """Targets and cells of the steps that follow."""
+        positions = positions_of(context) if self.rows.looks else None
+        cell = np.array(box_of(context)) if self.rows.looks else None
+        for name, values in self.rows.renew(context.getTime()._value, self._dt, steps, positions, cell).items():
+            self.write(name, values)
+
+    def _unsolved(self, told: Sequence[float], good: int) -> KconsError:
+        error: KconsError = self.rows.failure(int(told[3]), told[4], int(told[2]))
+        error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
+        return error
+
+    def _look(self) -> list[float]:
+        told = (ctypes.c_double * 5)()
+        build.library().kcons_look(self._address, told)
+        return list(told)
+
+    def _execute(self, guard: Guard, steps: int) -> None:
+        raise NotImplementedError
+
+    # -- variables, as the CustomIntegrator has them ------------------------------------------------
+
+    def getGlobalVariableByName(self, name: str) -> float:
+        """A variable of the step, see `listing`."""
+        program = self.program
+        if name == "motion":
+            return self._look()[0]
+        if name == "failed":  # a call that fails raises
+            return 0.0
+        if name in program.kept and self.bound:
+            return float(self.read("memory")[program.kept.index(name)])
+        if name in program.settings:
+            return program.settings[name]
+        return program.numbers[name]
+
+    def setGlobalVariableByName(self, name: str, value: float) -> None:
+        """Set what belongs to a state; settings have methods of their own."""
+        if name not in self.program.kept:
+            raise UnsupportedError(
+                f"{name} cannot be set on the device: use setTemperature or setFriction, or device=False"
+            )
+        self.program.write(name, float(value))
+
+    def getNumComputations(self) -> int:
+        """None: the plugin has kernels."""
+        return 0
+
+    def setRandomNumberSeed(self, seed: int) -> None:
+        """The seed of noise, before the Context is made; 0 for one that nobody knows."""
+        self._seed = whole_number(seed, "seed", -(2**31), 2**31 - 1)
+        self.describe()
+
+    def getRandomNumberSeed(self) -> int:
+        return self._seed
+
+    @classmethod
+    def from_xml(cls, xml: str, scheme: Any = "rattle", **arguments: Any) -> DeviceIntegrator:
+        """As `ProjectedIntegrator.from_xml`."""
+        build_planner()
+        plain = openmm.XmlSerializer.deserialize(xml)
+        made = cls(plain.getStepSize(), scheme, **{"tolerance": plain.getConstraintTolerance(), **arguments})
+        openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
+        return made
+
+
+# -- plans for a Context ------------------------------------------------------------------------------
+
+
+def build_planner() -> None:
+    """Load the plugin, and tell it who makes plans."""
+    build.library().kcons_set_planner(_planner)
+
+
+@_PLANNER
+def _planner(made: int, given: Any) -> int:
+    try:
+        _fill(ctypes.c_void_p(made), given.contents)
+    except Exception as error:  # told by the exception that OpenMM raises, or by `read`
+        _REFUSALS[:] = [error]
+        build.library().kcons_set_error(f"{type(error).__name__}: {error}".encode())
+        return 0
+    return 1
+
+
+def _fill(made: ctypes.c_void_p, given: _Given) -> None:
+    library = build.library()
+    masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
+    n, described = given.constraints, json.loads(given.description)
+    pairs = np.array(given.pairs[: 2 * n], dtype=np.int64).reshape(n, 2)
+    lengths = np.array(given.lengths[:n], dtype=np.float64)
+    integrator = _ALIVE.get(described["integrator"])
+    if described["parts"] and integrator is None:
+        raise UnsupportedError("no text has the parts of an integrator: read it by from_xml(xml, parts=...)")
+    part = integrator.parts[0] if integrator is not None and integrator.parts else None
+    assert part is None or isinstance(part, KernelRows)
+    if not given.positions:
+        for atoms in molecules_of(pairs, () if part is None else part.given):
+            members = np.ascontiguousarray(atoms, dtype=np.int32)
+            library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
+        return
+    rows: Any = NoRows()
+    if n or part is not None:
+        positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
+        box = np.array(given.box[:9]).reshape(3, 3)
+        made_of = masses, (pairs, lengths), positions, box if box.any() else None, given.time
+        rows = KernelRows(()).rows_at(*made_of) if part is None else part.rows_at(*made_of)
+    if integrator is not None:
+        integrator.rows = rows
+    platform = given.platform.decode()
+    done = _plan_of(described, platform, masses, given.groups, rows)
+    compiled = build.kernels_library(done.source) if platform in PLAIN else ""
+    library.kcons_plan_source(
+        made, done.source.encode(), str(compiled).encode(), done.items, done.work_group, done.slots
+    )
+    for array in done.arrays:
+        values = np.ascontiguousarray(array.values, dtype=np.float64)
+        pointer = values.ctypes.data_as(_DOUBLES)
+        whole = array.kind == "int"
+        library.kcons_plan_array(made, array.name.encode(), int(whole), int(array.saved), pointer, values.size)
+    for number, actions in enumerate(done.parts):
+        for action in actions:
+            library.kcons_plan_action(
+                made, number, action.verb, action.kernel.encode(), ctypes.c_int32(action.groups), action.slot
+            )
+    order = np.ascontiguousarray(done.order, dtype=np.int32)
+    library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
+
+
+def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, rows: Any) -> Plan:
+    operations = [
+        Op(*(tuple(value) if isinstance(value, list) else value for value in op)) for op in described["operations"]
+    ]
+    names = list(dict.fromkeys(op.group for op in operations if op.verb == "evaluate"))
+    seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
+    return plan(
+        operations,
+        platform,
+        len(masses),
+        {name: 1 << int(name) if name else groups for name in names},
+        rows,
+        parameters=described["settings"],
+        memory=dict.fromkeys(described["memory"], 0.0),
+        seed=seed,
+        noisy=described["noisy"],
+        tidy=described["parts"],
+        spheres=Spheres(*described["spheres"]) if described["spheres"][0] else None,
+        moving=masses > 0,
+    )
+
+
+def choose(
+    device: bool | None,
+    timestep: Any,
+    scheme: str | Splitting = "rattle",
+    *,
+    parts: Sequence[Any] = (),
+    ensemble: Ensemble | None = None,
+    **others: Any,
+) -> type[ProjectedIntegrator]:
+    """The class of an integrator that may run on the device: `DeviceIntegrator` if it can, see `ProjectedIntegrator`.
+
+    Raises
+    ------
+    UnsupportedError
+        `device` is True, and there is no plugin or it has no kernels for this step.
+    """
+    why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
+    if not why:
+        try:
+            build.library()
+            return DeviceIntegrator
+        except UnsupportedError as error:
+            why = str(error)
+    if device:
+        raise UnsupportedError(f"no steps on the device: {why}; leave out device=True for a CustomIntegrator")
+    logger.info("steps are those of a CustomIntegrator: %s", why)
+    return ProjectedIntegrator
+
+
+ProjectedIntegrator._on_device = staticmethod(choose)

@@ -1,0 +1,209 @@
+"""Rows that kernels hold, as the part of an integrator: what is looked at, measured and told between steps."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import openmm
+
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.errors import InputError
+from kcons.motion.motion import Motion
+from kcons.openmm.callback_rows.callbacks import Passage, cell_of
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
+from kcons.openmm.device.held_rows import constraints_of
+from kcons.openmm.device.rows import DeviceRows, rows_of
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import SystemRows
+from kcons.openmm.quantities import accepted, masses_of
+from kcons.openmm.states import positions_of
+
+
+class _Engine:
+    """The engine of rows in a Context, as the host asks it."""
+
+    def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
+        self.motion, self.masses, self.cell = motion, masses, cell
+        self.atoms: IntArray = motion.sources[0].touched
+        self.passage = Passage(self.atoms, len(masses))
+
+    def follow_cell(self, state: openmm.State) -> None:
+        cell = cell_of(state.getPeriodicBoxVectors())
+        if self.cell is None or not np.array_equal(cell, self.cell):
+            self.motion.set_cell(cell)
+            self.cell = cell
+
+    def rounded(self, x: FloatArray) -> bool:
+        """Whether molecules may have been moved back into the box, which rounds them."""
+        return self.passage.precision.name != "double" and self.cell is not None
+
+
+class KernelRows(CarriedConstraints):
+    """All rows of a Context that its kernels hold: those of parts and the System's constraints.
+
+    Parameters
+    ----------
+    parts : sequence of Constraint or CarriedConstraints
+        What ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; numbers of nm, ps, dalton, radian.
+        Targets left at None are taken from the positions at the first step.
+
+    Notes
+    -----
+    A target that is a function is asked before each call of `step`, and at every half step that the call will make: it
+    may read a context parameter.
+    """
+
+    evaluates = lands_last = False
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        carried = [part for part in parts if isinstance(part, CarriedConstraints)]
+        plain = accepted([part for part in parts if isinstance(part, Constraint)])
+        self.given: list[Constraint] = [*constraints_of(carried), *plain]
+        self.groups = frozenset().union(*(part.groups for part in carried))
+        #: Whether rows take periodic images: as `hold` was told, else as the System.
+        self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
+        self._bound: tuple[DeviceRows, _Engine] | None = None
+        self._of: tuple[Any, ...] = ()
+        self._context: Callable[[], openmm.Context | None] = lambda: None
+        self.code = 0
+        #: Time at which sums of multipliers began, ps.
+        self._since = 0.0
+
+    # -- a Context ------------------------------------------------------------------------------
+
+    def rows_at(
+        self,
+        masses: FloatArray,
+        system_rows: tuple[IntArray, FloatArray],
+        positions: FloatArray,
+        cell: FloatArray | None,
+        time: float,
+    ) -> DeviceRows:
+        """The rows for a System; made where they are asked for first.
+
+        Raises
+        ------
+        KconsError
+            As `rows_of`.
+        """
+        made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
+        if self._bound is None or self._of != made_of:
+            cell = None if self._wraps is False else cell
+            rows = rows_of(masses, system_rows, self.given, positions, cell, time)
+            self._bound, self._of = (rows, _Engine(rows.motion, masses, cell)), made_of
+            self._slopes = None
+        return self._bound[0]
+
+    def bind(self, context: openmm.Context) -> DeviceRows:
+        """The rows for a Context, at its positions."""
+        if self._bound is not None and self._context() is context:
+            return self._bound[0]
+        self._context = weakref.ref(context)
+        system = context.getSystem()
+        known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+        pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
+        lengths = np.array([length._value for _, _, length in known], dtype=float)
+        cell = None
+        if system.usesPeriodicBoundaryConditions():
+            cell = cell_of(context.getState().getPeriodicBoxVectors())
+        masses = masses_of(system)
+        refuse_virtual_sites(system, self.atoms, masses)
+        time = float(context.getTime()._value)
+        return self.rows_at(masses, (pairs, lengths), positions_of(context), cell, time)
+
+    @property
+    def atoms(self) -> IntArray:
+        """Particles that a row of the parts touches, and of the System's constraints once they are known."""
+        if self._bound is not None:
+            return self._bound[1].atoms
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in self.given)]))
+
+    @property
+    def _engine(self) -> Any:  # type: ignore[override]
+        if self._bound is None:
+            raise InputError(
+                "these rows are known at the first step of a Context; call integrator.attach(context) after its "
+                "positions were set",
+                item="context",
+            )
+        return self._bound[1]
+
+    @property
+    def driven(self) -> bool:
+        return any(item.moving or not item.holonomic for item in self.given)
+
+    @property
+    def steered(self) -> bool:
+        """Whether targets may have changed between two calls."""
+        return any(isinstance(item.target, MovingTarget) for item in self.given)
+
+    def attach(self, program: Program, context: openmm.Context) -> None:
+        self.bind(context)
+
+    def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+        self.bind(context)
+        self._engine.passage.precision = Precision.of(context)
+        return super()._state(context)
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Whatever the precision is: residuals are what it can hold."""
+
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Nothing: velocities come from multipliers, and not from rounded positions."""
+
+    def _check_system(self, system: openmm.System, precision: Precision) -> None:
+        self._engine.passage.precision = precision
+
+    def rank(self, context: openmm.Context | None = None) -> int:
+        """Degrees of freedom that the rows take, beyond the constraints of the System."""
+        assert context is not None
+        rows = self.bind(context)
+        fixed = int(np.count_nonzero(rows.motion.masses[self.atoms] == 0))
+        return rows.motion.rank - 3 * fixed - SystemRows.of(context.getSystem()).rank(positions_of(context))
+
+    # -- results --------------------------------------------------------------------------------
+
+    def mean_multipliers(self, integrator: Any) -> FloatArray:
+        """Multipliers averaged over all steps since they were reset, by row of ``motion.constraint_set``.
+
+        Impulses that the kernels have summed over the time: kJ/mol over the unit of the row; NaN for constraints of the
+        System, and before the first step. The weights of `Series.weights`, which blue-moon averages over
+        configurations need, are not in them: take samples by `HeldCoordinatesReporter` where masses enter det Z.
+
+        Parameters
+        ----------
+        integrator : ProjectedIntegrator
+            The one that has made the steps.
+        """
+        rows, time = self.bind(integrator.context), float(integrator.context.getTime()._value) - self._since
+        sums = integrator.read("rows_sums")
+        return rows.multipliers(sums, time) if time > 0 else np.full(rows.set.n_rows, np.nan)
+
+    def reset_multipliers(self, integrator: Any) -> None:
+        """Begin the sums of `mean_multipliers` anew."""
+        integrator.write("rows_sums", np.zeros(len(integrator.read("rows_sums"))))
+        self._since = float(integrator.context.getTime()._value)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> KernelRows:
+        return KernelRows(self.given)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return KernelRows, (self.given,)
+
+    def __repr__(self) -> str:
+        return f"<KernelRows: {sum(item.n_rows for item in self.given)} rows and the constraints of the System>"
+
+
+def as_parts(parts: Any) -> tuple[Part, ...]:
+    """What an integrator on the device was given to hold as one part; nothing where that is nothing."""
+    given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+    if not given or (len(given) == 1 and isinstance(given[0], KernelRows)):
+        return given
+    return (KernelRows(given),)

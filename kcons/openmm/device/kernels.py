@@ -1,0 +1,866 @@
+"""Operations of a step as kernels: one text that OpenCL, CUDA, HIP and C++ compile.
+
+Operations that nobody looks between are joined. What is left is cut where forces are evaluated, where a sum over all
+particles is needed and, for constraints that stay with OpenMM, where its solvers come in; each piece is one kernel. A
+work-item has a cluster of atoms that rows join, or a single atom; a work-group has a large cluster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+
+#: Platforms whose kernels are plain C++.
+PLAIN = ("Reference", "CPU")
+#: Work-groups of a kernel at most; each leaves its share of a sum in a place of its own.
+MOST_GROUPS = 256
+_NONE = np.zeros(0, dtype=np.int64)
+#: Sums over all particles: two times three that are used in turn, and that of the kinetic energy which is told.
+_SUMS = 7
+
+
+class Array(NamedTuple):
+    """An array on the device, which kernels know by its name.
+
+    Attributes
+    ----------
+    name : str
+    kind : {'mixed', 'int'}
+    values : ndarray
+        What it begins with.
+    saved : bool
+        Whether it belongs to a state: checkpoints and States have it.
+    """
+
+    name: str
+    kind: str
+    values: FloatArray | IntArray
+    saved: bool = False
+
+
+class Shape(NamedTuple):
+    """Clusters of atoms whose code is the same.
+
+    Attributes
+    ----------
+    name : str
+        Ending of the names of its functions; empty for single atoms.
+    atoms : ndarray of int, shape (n_clusters, n)
+    together : bool
+        Whether a work-group has a cluster; else a work-item.
+    n_rows : int
+        Independent rows of a cluster.
+    first : int
+        Number of the first cluster among those of this name.
+    """
+
+    name: str
+    atoms: IntArray
+    together: bool = False
+    n_rows: int = 0
+    first: int = 0
+
+
+_COMMON = """
+#ifndef PLAIN
+#define FORCE(f, p, c) (f[(p)+(c)*padded]*(1/(mixed) 0x100000000))
+#define ORDER(p) order[p]
+#define GET_V(a, p) {mixed4 q_ = velm[p]; v[3*(a)] = q_.x; v[3*(a)+1] = q_.y; v[3*(a)+2] = q_.z; w[a] = q_.w;}
+#define PUT_V(a, p) velm[p] = make_mixed4(v[3*(a)], v[3*(a)+1], v[3*(a)+2], w[a]);
+#define GET_D(a, p) {mixed4 q_ = delta[p]; d[3*(a)] = q_.x; d[3*(a)+1] = q_.y; d[3*(a)+2] = q_.z;}
+#define PUT_D(a, p) delta[p] = make_mixed4(d[3*(a)], d[3*(a)+1], d[3*(a)+2], 0);
+#ifdef USE_MIXED_PRECISION
+#define GET_X(a, p) {real4 q_ = posq[p], r_ = correction[p]; x[3*(a)] = q_.x+(mixed) r_.x; \\
+  x[3*(a)+1] = q_.y+(mixed) r_.y; x[3*(a)+2] = q_.z+(mixed) r_.z;}
+#define PUT_X(a, p) {real4 q_ = make_real4((real) x[3*(a)], (real) x[3*(a)+1], (real) x[3*(a)+2], posq[p].w); \\
+  posq[p] = q_; correction[p] = make_real4(x[3*(a)]-q_.x, x[3*(a)+1]-q_.y, x[3*(a)+2]-q_.z, 0);}
+#else
+#define GET_X(a, p) {real4 q_ = posq[p]; x[3*(a)] = q_.x; x[3*(a)+1] = q_.y; x[3*(a)+2] = q_.z;}
+#define PUT_X(a, p) posq[p] = make_real4(x[3*(a)], x[3*(a)+1], x[3*(a)+2], posq[p].w);
+#endif
+#endif
+#ifdef PLAIN
+#define CLAIM(place, value) __sync_val_compare_and_swap(place, 0, value)
+#elif defined(__OPENCL_VERSION__)
+#define CLAIM(place, value) atomic_cmpxchg(place, 0, value)
+#else
+#define CLAIM(place, value) atomicCAS(place, 0, value)
+#endif
+#define GET_U(a, p) {for (int c_ = 0; c_ < 3; c_++) d[3*(a)+c_] = kept[3*(p)+c_];}
+#define PUT_U(a, p) {for (int c_ = 0; c_ < 3; c_++) kept[3*(p)+c_] = d[3*(a)+c_];}
+#define AWAY(a, p, sign) {mixed i_ = cells[3*(p)], j_ = cells[3*(p)+1], k_ = cells[3*(p)+2]; \\
+  x[3*(a)] = x[3*(a)] sign (i_*box0.x+j_*box1.x+k_*box2.x); \\
+  x[3*(a)+1] = x[3*(a)+1] sign (j_*box1.y+k_*box2.y); x[3*(a)+2] = x[3*(a)+2] sign k_*box2.z;}
+#define RESTS(p) ((p) < 0 ? -1-(p) : (p))
+#define TINY ((mixed) 1e-37f)
+/* The first failure is kept; kernels that are launched later do nothing. */
+#define FAIL(row, residual) \\
+  {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; failure_residual[0] = residual;}}
+/* Four normal numbers of a particle, a step and a use within it (Philox 4x32 with 10 rounds, Box and Muller). */
+DEVICE void philox(unsigned int* c, unsigned int key0, unsigned int key1) {
+  for (int k = 0; k < 10; k++) {
+    mm_ulong p = (mm_ulong) 0xD2511F53u*c[0], q = (mm_ulong) 0xCD9E8D57u*c[2];
+    unsigned int first = (unsigned int) (q>>32)^c[1]^key0, third = (unsigned int) (p>>32)^c[3]^key1;
+    c[0] = first; c[1] = (unsigned int) q; c[2] = third; c[3] = (unsigned int) p;
+    key0 += 0x9E3779B9u; key1 += 0xBB67AE85u;
+  }
+}
+DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
+  unsigned int c[4];
+  c[0] = particle; c[1] = step; c[2] = use; c[3] = 0;
+  philox(c, (unsigned int) seed, 0x6b636f6eu);
+  for (int k = 0; k < 4; k += 2) {
+    float size = sqrt(-2.0f*log((c[k]+0.5f)*2.3283064e-10f)), angle = 6.2831853f*(c[k+1]*2.3283064e-10f);
+    g[k] = size*cos(angle); g[k+1] = size*sin(angle);
+  }
+}
+"""
+
+_PLAIN = """
+#include <math.h>
+#define PLAIN
+#define USE_DOUBLE_PRECISION
+template <class T> static inline T max(T a, T b) {return a > b ? a : b;}
+template <class T> static inline T min(T a, T b) {return a < b ? a : b;}
+typedef double real, mixed;
+typedef long mm_long;
+typedef unsigned long mm_ulong;
+struct real4 {double x, y, z, w;};
+typedef real4 mixed4;
+static inline real4 make_real4(double x, double y, double z, double w) {return real4{x, y, z, w};}
+#define make_mixed4 make_real4
+#define DEVICE static inline
+#define KERNEL extern "C"
+#define GLOBAL
+#define LOCAL
+#define LOCAL_ARG
+#define RESTRICT
+#define SYNC_THREADS
+#define LOCAL_ID 0
+#define LOCAL_SIZE 1
+#define WG 1
+#define GLOBAL_ID GROUP_ID
+#define GLOBAL_SIZE NUM_GROUPS
+#define FORCE(f, p, c) f[3*(p)+(c)]
+#define ORDER(p) (p)
+#define GET_3(to, a, from, p) {to[3*(a)] = from[3*(p)]; to[3*(a)+1] = from[3*(p)+1]; to[3*(a)+2] = from[3*(p)+2];}
+#define GET_V(a, p) {GET_3(v, a, velocities, p) w[a] = inverse_masses[p];}
+#define PUT_V(a, p) GET_3(velocities, p, v, a)
+#define GET_X(a, p) GET_3(x, a, positions, p)
+#define PUT_X(a, p) GET_3(positions, p, x, a)
+#define GET_D(a, p) GET_3(d, a, delta, p)
+#define PUT_D(a, p) GET_3(delta, p, d, a)
+"""
+
+_BOX = ("box0", "box1", "box2")
+#: What kernels are given besides arrays of their own, in the order in which the plugin gives it.
+_GIVEN = ["int padded", "int step", "int launch", "mixed dt", "mixed time", "mixed tolerance"]
+_GIVEN += [f"mixed4 {name}" for name in _BOX]
+_GIVEN += ["GLOBAL real4* RESTRICT posq", "GLOBAL real4* RESTRICT correction", "GLOBAL mixed4* RESTRICT velm"]
+_GIVEN += ["GLOBAL mixed4* RESTRICT delta", "GLOBAL const int* RESTRICT order"]
+#: Arrays that functions of rows have, too.
+_PASSED = ("parameters", "failure", "failure_residual")
+
+
+def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_group: int = 64, slots: int = 1) -> str:
+    """What comes before the source of rows: types and names of the platform, `ROWS`, `FAIL`, random numbers."""
+    plain = platform in PLAIN
+    passed = [array for array in arrays if array.name in _PASSED or array.name.startswith("rows_")]
+    typed = ["int step", "int launch", "mixed tolerance", *(f"mixed4 {name}" for name in _BOX)]
+    typed += [f"GLOBAL {a.kind}* {a.name}" for a in passed] + ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
+    names = ["step", "launch", "tolerance", *_BOX, *(a.name for a in passed)] + ["scratch"] * (scratch > 0)
+    forces = [f"force{k}" for k in range(slots)]
+    if plain:
+        given = "void** pointers, const double* reals, const int* integers, int GROUP_ID, int NUM_GROUPS"
+        own = [("mixed", name) for name in ("positions", "velocities", "delta", "inverse_masses", *forces)]
+        own += [(array.kind, array.name) for array in arrays]
+        lines = [
+            f"{kind.replace('mixed', 'double')}* {name} = ({kind}*) pointers[{k}];"
+            for k, (kind, name) in enumerate(own)
+        ]
+        lines += [f"double {name} = reals[{k}];" for k, name in enumerate(("dt", "time", "tolerance"))]
+        lines += [f"int {name} = integers[{k}];" for k, name in enumerate(("step", "launch"))]
+        lines += [
+            f"real4 {b} = {{reals[{k}], reals[{k + 1}], reals[{k + 2}], 0}};"
+            for k, b in zip((3, 6, 9), _BOX, strict=True)
+        ]
+        unpack = " ".join(lines)
+    else:
+        own_arrays = [f"GLOBAL {array.kind}* {array.name}" for array in arrays]
+        given = ", ".join([*_GIVEN, *(f"GLOBAL const mm_long* RESTRICT {name}" for name in forces), *own_arrays])
+        unpack = ""
+    words = {
+        "MOST_GROUPS": str(MOST_GROUPS),
+        "ARGUMENTS": given,
+        "UNPACK": unpack,
+        "SCRATCH": f" LOCAL mixed scratch[{scratch}];" if scratch else "",
+        "ROWS": f"{', '.join(typed)},",
+        "ROWS_PASS": f"{', '.join(names)},",
+    }
+    start = _PLAIN if plain else f"#define WG {work_group}\n"
+    return start + "".join(f"#define {word} {text}\n" for word, text in words.items()) + _COMMON
+
+
+def standard_arrays(
+    parameters: Sequence[float] = (), memory: Sequence[float] = (), seed: int = 0, particles: int = 1
+) -> list[Array]:
+    """Arrays of every program: settings, what belongs to the state, failures, sums, what is read at the end."""
+    return [
+        Array("parameters", "mixed", np.array([*parameters, 0.0])),
+        Array("memory", "mixed", np.array([*memory, 0.0]), saved=True),
+        Array("memory_before", "mixed", np.zeros(len(memory) + 1)),
+        Array("seed", "int", np.array([seed])),
+        Array("failure", "int", np.zeros(3, dtype=np.int64)),
+        Array("failure_residual", "mixed", np.zeros(1)),
+        Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
+        Array("kept", "mixed", np.zeros(3 * particles)),
+        Array("looked", "mixed", np.zeros(6)),
+    ]
+
+
+# -- operations ---------------------------------------------------------------------------------------
+
+
+class Op(NamedTuple):
+    """An operation as plain data.
+
+    Attributes
+    ----------
+    verb : str
+        As `kcons.steppers.operations` has them; 'note' is for the kinetic energy that a State tells.
+    share : float
+        The fraction of the step that it is over.
+    group : str
+        Whose forces.
+    flights : tuple of float
+        Of a drift the RATTLE drifts, of a chain the parts that it consists of, as fractions of the step.
+    ends : tuple of float
+        At which fractions of the step they end; of others, when they are.
+    begun : int
+        0 in the step that is being made, -1 in the one before.
+    use : int
+        Number of its noise within the step.
+    """
+
+    verb: str
+    share: float = 0.0
+    group: str = ""
+    flights: tuple[float, ...] = ()
+    ends: tuple[float, ...] = ()
+    begun: int = 0
+    use: int = 0
+
+
+#: What kernels can do.
+VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note", "rescale", "restore")
+
+
+def divided(operations: Sequence[Op], noisy: bool) -> tuple[list[Op], list[Op], list[Op]]:
+    """Head, middle and tail of a step: up to its last evaluation of forces, joined with the next step, and its end."""
+    uses = iter(range(len(operations)))
+    ops = [op._replace(use=next(uses)) if op.verb == "exchange" else op for op in operations]
+    last = max((k for k, op in enumerate(ops) if op.verb == "evaluate"), default=-1) + 1
+    if not last:
+        raise UnsupportedError("a step on the device evaluates forces at its end; the leapfrog does not")
+    head, tail = ops[:last], [op._replace(begun=-1) for op in ops[last:]]
+    noted = [Op("note"), *tail] if noisy else tail
+    return joined(head), joined([*tail, *head]), joined(noted)
+
+
+def joined(operations: Sequence[Op]) -> list[Op]:
+    """The same with fewer operations, where nobody sees what is between them."""
+    done: list[Op] = []
+    for k, op in enumerate(operations):
+        after = next((later.verb for later in operations[k + 1 :] if later.verb != "kick"), "")
+        if op.verb == "project" and after == "fly":
+            continue  # the drift absorbs what v has across the rows
+        if op.verb == "project" and done and done[-1].verb == "turn":
+            continue  # turned velocities are tangent
+        if done and done[-1][0:3:2] == op[0:3:2] and op.verb in ("kick", "turn"):
+            done[-1] = done[-1]._replace(share=done[-1].share + op.share)
+        elif done and done[-1].verb == op.verb == "chain":
+            done[-1] = done[-1]._replace(flights=(*done[-1].flights, *op.flights))
+        else:
+            done.append(op)
+    return done
+
+
+# -- kernels ------------------------------------------------------------------------------------------
+
+_REDUCE = """ shared[LOCAL_ID] = acc0; shared[LOCAL_ID+WG] = acc1; shared[LOCAL_ID+2*WG] = acc2;
+ shared[LOCAL_ID+3*WG] = acc3;
+ SYNC_THREADS;
+ for (int span = WG/2; span > 0; span /= 2) {
+  if (LOCAL_ID < span) for (int k = 0; k < 4*WG; k += WG) shared[LOCAL_ID+k] += shared[LOCAL_ID+k+span];
+  SYNC_THREADS;
+ }
+"""
+_TAKE_SUMS = (
+    """ mixed sum0, sum1, sum2;
+ {mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;
+ for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {
+  acc0 += partial[k+BANK*MOST_GROUPS]; acc1 += partial[k+(BANK+1)*MOST_GROUPS]; acc2 += partial[k+(BANK+2)*MOST_GROUPS];
+ }
+"""
+    + _REDUCE
+    + """ sum0 = shared[0]; sum1 = shared[WG]; sum2 = shared[2*WG];
+ SYNC_THREADS;}
+"""
+)
+#: The closed form of `kcons.thermostats.isokinetic.kick`, everything divided by exp(z).
+_CLOSED_FORM = """ mixed z = max((mixed) sqrt(QQ/TWICE), TINY), decay = exp(-z);
+ mixed aim = WQ/sqrt(max((mixed) (WW*QQ), TINY));
+ aim = min(max(aim, (mixed) -1), (mixed) 1);
+ mixed sinhc = -expm1(-2*z)/(2*z), root = -expm1(-z)/z, scale = max((mixed) (aim*z*sinhc+(1+decay*decay)/2), TINY);
+ mixed keep = sqrt(TWICE/WW)*decay/scale, push = (aim*z*root*root/2+sinhc)/scale;
+"""
+#: Half a push of all links, the first of which then scales velocities, and half a push; see `kcons.openmm.NoseHoover`.
+_CHAIN = """ if (LOCAL_ID == 0) {
+  mixed link[LINKS], factor = 1, place = memory_before[M_chain_place], inertia = P_kT/(P_frequency*P_frequency);
+  const mixed parts[PARTS] = {SHARES};
+  for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
+  for (int part = 0; part < PARTS; part++) {
+   mixed h = parts[part]*dt;
+   for (int turn = 0; turn < 2*LINKS; turn++) {
+    int k = turn < LINKS ? LINKS-1-turn : turn-LINKS;
+    if (turn == LINKS) {
+     factor *= exp(-h*link[0]); place += h*P_momenta*link[0];
+     for (int j = 1; j < LINKS; j++) place += h*link[j];
+    }
+    mixed damp = k+1 < LINKS ? exp(-h*link[k+1]/4) : (mixed) 1, push;
+    if (k == 0) push = (sum0*factor*factor-P_momenta*P_kT)/(P_momenta*inertia);
+    else push = ((k == 1 ? P_momenta : (mixed) 1)*inertia*link[k-1]*link[k-1]-P_kT)/inertia;
+    link[k] = (link[k]*damp+h*push/2)*damp;
+   }
+  }
+  if (GROUP_ID == 0) {
+   for (int k = 0; k < LINKS; k++) memory[M_link1+k] = link[k];
+   memory[M_chain_place] = place;
+  }
+  shared[0] = factor;
+ }
+ SYNC_THREADS;
+ mixed factor = shared[0];
+ SYNC_THREADS;
+"""
+#: What the last call did: whether velocities are finite, the kinetic energy that is told, a failure.
+_LOOK = (
+    """ mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;
+ if (GROUP_ID != 0) return;
+ for (int p = LOCAL_ID; p < PARTICLES; p += LOCAL_SIZE) {
+  mixed v[3], w[1];
+  GET_V(0, p)
+  acc0 += v[0]*v[0]+v[1]*v[1]+v[2]*v[2];
+ }
+ for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
+"""
+    + _REDUCE
+    + """ if (LOCAL_ID == 0) {
+  looked[0] = shared[0]; looked[1] = shared[WG]; looked[5] = failure_residual[0];
+  for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
+ }
+"""
+)
+
+
+#: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
+#: its part of the center of mass, which is on sphere OF[c], and the rest on OF[3]; -1 for none. KEEP and PUSH are what
+#: v and d are multiplied by, OWN what auxiliary variables are.
+_SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
+ GLOBAL mixed* own = auxiliary+PLACE;
+ mixed cv[3] = {0, 0, 0}, cd[3] = {0, 0, 0}, vv[COUNT] = {0}, vd[COUNT] = {0}, dd[COUNT] = {0}, mass = 0;
+ mixed keep[COUNT], push[COUNT], kept_own[COUNT];
+ SYNC
+ if (of[0] >= 0) {
+  EVERY if (w[a] != 0) {mass += 1/w[a]; for (int c = 0; c < 3; c++) {cv[c] += v[3*a+c]/w[a]; cd[c] += D/w[a];}}
+  for (int c = 0; c < 3; c++) {
+   cv[c] /= mass; cd[c] /= mass;
+   vv[of[c]] += mass*cv[c]*cv[c]; vd[of[c]] += mass*cv[c]*cd[c]; dd[of[c]] += mass*cd[c]*cd[c];
+  }
+ }
+ if (of[3] >= 0) EVERY if (w[a] != 0) for (int c = 0; c < 3; c++) {
+  mixed m = 1/w[a], p = v[3*a+c]-cv[c], q = D-cd[c];
+  vv[of[3]] += m*p*p; vd[of[3]] += m*p*q; dd[of[3]] += m*q*q;
+ }
+ for (int s = 0; s < COUNT; s++) {
+  mixed R = squares[s]*P_kT, o = 0;
+  for (int k = 0; k < AUXILIARY; k++) o += own[s*AUXILIARY+k]*own[s*AUXILIARY+k];
+  keep[s] = kept_own[s] = 1; push[s] = 0;
+  RULE
+ }
+ SYNC
+ EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {
+  mixed r = v[3*a+c]-cv[c];
+  if (of[3] >= 0) r = keep[of[3]]*r+push[of[3]]*(D-cd[c]);
+  if (of[c] >= 0) r += keep[of[c]]*cv[c]+push[of[c]]*cd[c];
+  v[3*a+c] = r;
+ }
+ if (FIRST) for (int s = 0; s < COUNT; s++) for (int k = 0; k < AUXILIARY; k++) own[s*AUXILIARY+k] *= kept_own[s];
+ SYNC
+ }
+"""
+_RULES = {
+    "turn": """if (dd[s] > 0) {
+   mixed z = sqrt(dd[s]/R), cosine = min(max((mixed) (vd[s]/sqrt(dd[s]*R)), (mixed) -1), (mixed) 1);
+   mixed once = expm1(-z), twice = expm1(-2*z), scale = 1+(1-cosine)*twice/2;
+   if (scale > 0) {keep[s] = kept_own[s] = (1+once)/scale; push[s] = (cosine*once*once-twice)/(2*z*scale);}
+  }""",
+    "restore": "if (vv[s]+o > 0) keep[s] = kept_own[s] = sqrt(R/(vv[s]+o));",
+    "rescale": "if (vv[s] > 0) keep[s] = sqrt(max((mixed) (R-o), (mixed) 0)/vv[s]);",
+}
+
+
+class Spheres(NamedTuple):
+    """Spheres of clusters: of which kind, and how many auxiliary variables each has; see `IsokineticSpheres`."""
+
+    kind: str
+    auxiliary: int
+
+    def of(self, shape: Shape, moving: Any, placed: bool) -> tuple[tuple[int, ...], list[int]]:
+        """Spheres of the center of mass along x, y, z and of the rest, -1 for none; degrees of freedom on each."""
+        free = 3 * int(moving.sum()) - shape.n_rows
+        if self.kind == "cluster" or placed or not moving.all():
+            return (-1, -1, -1, 0 if free else -1), [free] if free else []
+        centers, parts = ((0, 1, 2), [1, 1, 1]) if self.kind == "axes" else ((0, 0, 0), [3])
+        return (*centers, len(parts) if free > 3 else -1), [*parts, *([free - 3] if free > 3 else [])]
+
+
+class Action(NamedTuple):
+    """What the plugin does: launch a kernel, let a solver of OpenMM act on positions or velocities, evaluate forces."""
+
+    verb: int
+    kernel: str = ""
+    groups: int = -1
+    slot: int = 0
+
+
+LAUNCH, POSITIONS, VELOCITIES, EVALUATE = range(4)
+
+
+class _Place(NamedTuple):
+    """Where the clusters of a shape are: among the items of a kernel or its groups, in `atoms` and in `work`."""
+
+    shape: Shape
+    begin: int
+    atoms: int
+    work: int
+
+
+class Kernels:
+    """The kernels of a step.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        All atoms, each in one cluster.
+    groups : mapping of str to int
+        Bit masks of the groups of forces, by the name that operations have.
+    own : bool
+        Whether kernels hold the rows themselves; else OpenMM's solvers do.
+    tidy : bool
+        Whether noise is made tangent, so that multipliers are those of forces.
+    spheres : Spheres, optional
+        Velocities of clusters stay on spheres.
+    moving : ndarray of bool, optional
+        Particles that move, where there are spheres.
+    fixed : ndarray of int
+        Particles with a mass that rest.
+    placed : ndarray of int
+        Particles whose rows have a place in space: what cells OpenMM has moved them by is taken back for them.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        groups: Mapping[str, int],
+        own: bool,
+        *,
+        tidy: bool = False,
+        fixed: IntArray = _NONE,
+        placed: IntArray = _NONE,
+        spheres: Spheres | None = None,
+        moving: Any = None,
+    ) -> None:
+        self.groups, self.own, self.tidy, self.resting = dict(groups), own, tidy, len(fixed) > 0
+        self.placed, self.spheres, self.sphere_of, self.auxiliary = placed, spheres, list[Any](), 0
+        self.places: list[_Place] = []
+        self.order: list[IntArray] = []
+        counts, at, work = {True: 0, False: 0}, 0, 0
+        for shape in shapes:
+            clusters = len(shape.atoms)
+            self.places.append(_Place(shape, counts[shape.together], at, work))
+            atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()
+            self.order.append(np.where(np.isin(atoms, fixed), -1 - atoms, atoms))
+            counts[shape.together] += clusters
+            at += shape.atoms.size
+            work += 10 * shape.atoms.size * shape.together
+            if spheres is not None:
+                found = spheres.of(shape, moving[shape.atoms[0]], bool(np.isin(shape.atoms, placed).any()))
+                self.sphere_of.append((*found, self.auxiliary))
+                self.auxiliary += clusters * len(found[1]) * spheres.auxiliary
+        self.items, self.crowds, self.work = counts[False], counts[True], work
+        self.particles = at
+        self.source: list[str] = []
+        self._reset()
+        self._bank = 0
+
+    def _reset(self) -> None:
+        self._code = ["" for _ in self.places]
+        self._before, self._moves, self._sums, self._noted, self._used = "", False, False, False, False
+
+    def _add(self, code: str, rows: str | None = None) -> None:
+        """Code for each cluster; another where rows are held in it."""
+        self._used = self._used or any(code if rows is None or not place.shape.name else rows for place in self.places)
+        for k, place in enumerate(self.places):
+            self._code[k] += code if rows is None or not place.shape.name else rows
+
+    def write(self, name: str, operations: Sequence[Op]) -> list[Action]:
+        """Kernels for some operations; returns what is to be done with them."""
+        self._name, self._actions = name, list[Action]()
+        for op in operations:
+            if op.verb not in VERBS:
+                raise UnsupportedError(f"a step on the device has no operation {op.verb!r}")
+            getattr(self, f"_{op.verb}")(op)
+        self._close()
+        return self._actions
+
+    # -- one operation each --
+
+    def _kick(self, op: Op) -> None:
+        self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
+
+    def _fly(self, op: Op) -> None:
+        for length, end in zip(op.flights, op.ends, strict=True):
+            h = _of_dt(length)
+            free = f" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
+            start = f" {{ROOM mixed h = {h};\n"
+            aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
+            moved = (
+                " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]/h;}\n }\n"
+            )
+            if self.own:
+                solve = (
+                    f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {_time(op, end)}, x, d, w);\n if (failure[0] == 0)\n"
+                )
+                self._add(free, start + aim + solve + moved)
+            else:
+                self._add(f"{start}{aim} EACH PUT_D(a, AT)\n }}\n")
+                self._close(Action(POSITIONS))
+                self._add(f"{start} EACH GET_D(a, AT)\n{moved}")
+            self._moves = True
+
+    def _project(self, op: Op) -> None:
+        if self.own:
+            self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")
+        else:
+            self._close(Action(VELOCITIES))
+
+    def _exchange(self, op: Op) -> None:
+        if self.spheres is not None:
+            self._stir(op)
+            return
+        noise = (
+            f" {{mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);\n"
+            f" EACH if (w[a] != 0) {{\n  mixed g[4], s = size*sqrt(w[a]);\n"
+            f"  gaussians(g, ORDER(AT), step+({op.begun}), {op.use}, seed[0]);\n"
+            "  for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+s*g[c];\n }}\n"
+        )
+        # What the drift before has left across the rows is an impulse of theirs; what noise adds is none.
+        along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, {}, time, x, v, w);\n"
+        self._add("", along.format(1) * self.tidy)
+        self._add(noise)
+        self._add("", along.format(0) * self.tidy)
+
+    def _stir(self, op: Op) -> None:
+        """Friction and noise on spheres, the noise along the rows; auxiliary variables have noise of their own."""
+        assert self.spheres is not None
+        size = f"mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);"
+        draw = f"gaussians(g, ORDER(AT), step+({op.begun}), {{}}, seed[0]);"
+        start = (
+            f" {{ROOM {size}\n EACH {{mixed g[4], s = sqrt(w[a]); {draw.format(op.use)}\n"
+            "  for (int c = 0; c < 3; c++) d[3*a+c] = s*g[c];}\n"
+        )
+        ends = " EACH for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+size*d[3*a+c];\n"
+        self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
+        self._add(ends)
+        for k, (_, freedom, first) in enumerate(self.sphere_of):
+            number = len(freedom) * self.spheres.auxiliary
+            own = f"auxiliary[{first}+(ITEM)*{number}+j]"
+            self._code[k] += (
+                f" if (FIRST) for (int j = 0; j < {number}; j++) {{int a = 0; mixed g[4]; "
+                f"{draw.format(f'{op.use}+1024*(j+1)')} {own} = damp*{own}+size*g[0];}}\n }}\n"
+            )
+        self._rescale(Op("restore"))
+
+    def _turn(self, op: Op) -> None:
+        if self.spheres is not None:
+            start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
+            self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
+            self._rescale(op)
+            self._add(" }\n")
+            return
+        push = f"{_of_dt(op.share)}*{self._force(op)}*w[a]"
+        sums = (
+            " EACH {if (w[a] != 0) for (int c = 0; c < 3; c++) {mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a];"
+            " acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;}\n PUT_U(a, AT)}\n }\n"
+        )
+        if self.own:
+            start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {push};\n"
+            self._add(start + sums, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{sums}")
+        else:  # OpenMM's solver takes velocities only
+            self._add(f" EACH {{mixed* d = v; PUT_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] += {push};}}\n")
+            self._close(Action(VELOCITIES))
+            split = "{mixed s = d[3*a+c]; d[3*a+c] = v[3*a+c]-s; v[3*a+c] = s;}"
+            self._add(f" {{ROOM EACH {{GET_U(a, AT) for (int c = 0; c < 3; c++) {split}}}\n{sums}")
+        self._gather()
+        named = _CLOSED_FORM.replace("WQ", "sum0").replace("QQ", "sum1").replace("WW", "sum2")
+        self._before += named.replace("TWICE", "P_two_k") + (
+            " if (GLOBAL_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}\n"
+        )
+        self._add(
+            " {ROOM EACH {GET_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n"
+        )
+
+    def _chain(self, op: Op) -> None:
+        self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc0 += v[3*a+c]*v[3*a+c]/w[a];\n")
+        self._before += (
+            " if (GLOBAL_ID == 0) for (int k = 0; k <= LINKS; k++) memory_before[M_link1+k] = memory[M_link1+k];\n"
+        )
+        self._gather()
+        shares = ", ".join(f"(mixed) {share!r}" for share in op.flights)
+        self._before += _CHAIN.replace("SHARES", shares).replace("PARTS", str(len(op.flights)))
+        self._add(" EACH for (int c = 0; c < 3; c++) v[3*a+c] *= factor;\n")
+
+    def _rescale(self, op: Op) -> None:
+        """Velocities back to their spheres; `restore` and `turn` move auxiliary variables, too."""
+        assert self.spheres is not None
+        self._used = True
+        for k, (of, freedom, start) in enumerate(self.sphere_of):
+            if freedom:
+                number = self.spheres.auxiliary
+                squares = ", ".join(f"(mixed) {g + number - 1}" for g in freedom)
+                text = _SPHERES.replace("RULE", _RULES[op.verb]).replace("OF}", f"{', '.join(map(str, of))}}}")
+                text = text.replace("D-", "d[3*a+c]-" if op.verb == "turn" else "0-")
+                text = text.replace("+= D/", "+= d[3*a+c]/" if op.verb == "turn" else "+= 0/")
+                text = text.replace("SQUARES", squares).replace("COUNT", str(len(freedom)))
+                place = f"{start}+(ITEM)*{len(freedom) * number}"
+                self._code[k] += text.replace("PLACE", place).replace("AUXILIARY", str(number))
+
+    _restore = _rescale
+
+    def _evaluate(self, op: Op) -> None:
+        self._close(Action(EVALUATE, "", self.groups[op.group], list(self.groups).index(op.group)))
+
+    def _note(self, op: Op) -> None:
+        self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
+        self._noted = True
+
+    def _force(self, op: Op) -> str:
+        return f"FORCE(force{list(self.groups).index(op.group)}, AT, c)"
+
+    def _gather(self) -> None:
+        """What follows needs the sums that each cluster has added to."""
+        self._sums, bank = True, self._bank
+        self._close()
+        self._before = _TAKE_SUMS.replace("BANK", str(bank))
+
+    # -- text --
+
+    def _close(self, action: Action | None = None) -> None:
+        """A kernel of what was written since the last; `action` comes after it."""
+        if self._used or self._before:
+            name = f"{self._name}{sum(a.verb == LAUNCH for a in self._actions)}"
+            self._actions.append(Action(LAUNCH, name))
+            ends = ""
+            if self._sums or self._noted:
+                kept = [(self._bank + k, f"shared[{k}*WG]") for k in range(3) if self._sums]
+                kept += [(6, "shared[3*WG]")] * self._noted
+                stores = " ".join(f"partial[GROUP_ID+{place}*MOST_GROUPS] = {value};" for place, value in kept)
+                ends = f"{_REDUCE} if (LOCAL_ID == 0) {{{stores}}}\n"
+                self._bank = 3 - self._bank if self._sums else self._bank
+            accumulators = " mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;\n" if ends else ""
+            self.source.append(self._header(name) + self._before + accumulators + self._clusters() + ends + "}\n")
+        if action is not None:
+            self._actions.append(action)
+        self._reset()
+
+    def _header(self, name: str) -> str:
+        return (
+            f"KERNEL void {name}(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];SCRATCH\n"
+            " if (failure[0] != 0 && failure[0] != launch+1) return;\n"
+        )
+
+    def _clusters(self) -> str:
+        """Loops over the clusters that a group has and those that an item has."""
+        crowds = [(place, code) for place, code in zip(self.places, self._code, strict=True) if place.shape.together]
+        items = [(place, code) for place, code in zip(self.places, self._code, strict=True) if not place.shape.together]
+        text = ""
+        for loop, kinds in (
+            (" {\n", crowds),
+            (f" for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE) {{\n", items),
+        ):
+            if any(code for _, code in kinds):
+                text += loop + "".join(self._cluster(place, code) for place, code in kinds if code) + " }\n"
+        return text
+
+    def _cluster(self, place: _Place, code: str) -> str:
+        shape = place.shape
+        clusters, n = shape.atoms.shape
+        cluster = f"item-{place.begin}"
+        if shape.together:
+            room = f" GLOBAL mixed *x = work+{place.work}+({cluster})*{10 * n}, "
+            room += f"*v = x+{3 * n}, *d = v+{3 * n}, *w = d+{3 * n};\n"
+            words = {"EACH": f"for (int a = LOCAL_ID; a < {n}; a += LOCAL_SIZE)", "ROOM": "", "SYNC": "SYNC_THREADS;"}
+            atom = f"atoms[{place.atoms}+({cluster})*{n}+a]"
+            words["AT"] = f"RESTS({atom})" if self.resting else atom
+            load = " SYNC\n"
+        else:
+            room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n"
+            words = {"EACH": f"for (int a = 0; a < {n}; a++)", "ROOM": f"mixed d[{3 * n}];", "SYNC": "", "AT": "at[a]"}
+            atom = f"atoms[{place.atoms}+a*{clusters}+{cluster}]"
+            load = f" EACH at[a] = {f'RESTS({atom})' if self.resting else atom};\n"
+        away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
+        load += (
+            f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')}"
+            + f" if ({atom} < 0) w[a] = 0;" * self.resting
+            + "}\n"
+        )
+        store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
+        text = load + code + store
+        words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}", "ITEM": cluster}
+        words |= {"EVERY": f"for (int a = 0; a < {n}; a++)", "FIRST": "LOCAL_ID == 0" if shape.together else "1"}
+        for word, meaning in words.items():
+            text = text.replace(word, meaning)
+        end = place.begin + clusters
+        if shape.together:  # barriers are inside, which no condition may be about
+            loop = f"for (int item = {place.begin}+GROUP_ID; item < {end}; item += NUM_GROUPS)"
+        else:
+            loop = f"if (item >= {place.begin} && item < {end})"
+        return f" {loop} {{\n{room}{text} }}\n"
+
+
+class Plan(NamedTuple):
+    """What the plugin needs for a Context.
+
+    Attributes
+    ----------
+    source : str
+    arrays : list of Array
+    parts : tuple of three lists of Action
+        Head, middle and tail of a step.
+    order : ndarray of int
+        Of atoms in the array `atoms`; -1-k for those that rest.
+    items, work_group, slots : int
+        Work-items that there is work for, their number in a group, and how many groups of forces are kept.
+    """
+
+    source: str
+    arrays: list[Array]
+    parts: tuple[list[Action], list[Action], list[Action]]
+    order: IntArray
+    items: int
+    work_group: int
+    slots: int
+
+
+class NoRows:
+    """What kernels hold where nothing is held, and what they need to know of rows; see `kcons.openmm.device.rows`."""
+
+    block = 10**9
+    looks = False
+    shapes: Sequence[Shape] = ()
+    arrays: Sequence[Array] = ()
+    source = ""
+    scratch = 0
+    work_group = 64
+    fixed = placed = _NONE
+
+    def renew(self, *state: Any) -> dict[str, FloatArray]:
+        """Nothing changes with time."""
+        return {}
+
+
+def plan(
+    operations: Sequence[Op],
+    platform: str,
+    particles: int,
+    groups: Mapping[str, int],
+    rows: Any,
+    *,
+    parameters: Mapping[str, float],
+    memory: Mapping[str, float],
+    seed: int = 0,
+    noisy: bool = False,
+    tidy: bool = False,
+    spheres: Spheres | None = None,
+    moving: Any = None,
+) -> Plan:
+    """Everything that the plugin needs.
+
+    Parameters
+    ----------
+    operations : sequence of Op
+        Of a step.
+    platform : str
+        Its name.
+    particles : int
+        How many the System has.
+    groups : mapping of str to int
+        Bit masks of the groups of forces, by the name that operations have.
+    rows : DeviceRows, NoRows or None
+        None where constraints stay with OpenMM.
+    parameters : mapping of str to float
+        Settings, which kernels know as P_name.
+    memory : mapping of str to float
+        What belongs to a state besides x and v, M_name: the place in the array.
+    seed : int
+    noisy : bool
+        Whether the kinetic energy that is told is that before the end of a step.
+    tidy, spheres
+        See `Kernels`.
+    moving : ndarray of bool
+        Which particles have a mass.
+    """
+    held = NoRows() if rows is None else rows
+    loose = np.setdiff1d(np.arange(particles), np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
+    shapes = [*held.shapes, *([Shape("", loose[:, None])] if len(loose) else [])]
+    if moving is not None:
+        moving = moving & ~np.isin(np.arange(particles), held.fixed)
+    made = {"tidy": tidy, "fixed": held.fixed, "placed": held.placed, "spheres": spheres, "moving": moving}
+    kernels = Kernels(shapes, groups, rows is not None, **made)
+    parts = divided(operations, noisy)
+    actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
+    order = np.concatenate(kernels.order)
+    arrays = standard_arrays([*parameters.values()], [*memory.values()], seed, particles)
+    arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
+    if spheres is not None:
+        if any(g + spheres.auxiliary < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
+            raise InputError("a sphere of one degree of freedom has the radius 0; give auxiliary=1", item="auxiliary")
+        first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
+        arrays.append(Array("auxiliary", "mixed", first, saved=True))
+    arrays += [Array("cells", "int", np.zeros(3 * particles))] * (len(held.placed) > 0)
+    work_group = 1 if platform in PLAIN else held.work_group
+    names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
+    names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
+    names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(particles)}
+    look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
+    source = preamble(platform, arrays, held.scratch, held.work_group, len(groups))
+    source += "".join(f"#define {name} {text}\n" for name, text in names.items())
+    source += "".join([held.source, *kernels.source, look])
+    items = kernels.items + kernels.crowds * work_group
+    return Plan(source, arrays, actions, order, items, work_group, len(groups))  # type: ignore[arg-type]
+
+
+def _of_dt(share: float) -> str:
+    return f"((mixed) {share!r}*dt)"
+
+
+def _time(op: Op, end: float) -> str:
+    """The time at a fraction of the step, of which the kernel knows when it began."""
+    return f"time+{_of_dt(end + op.begun)}"

@@ -1,0 +1,233 @@
+"""Large clusters: tables for a work-group, with an order of elimination by levels (see `clusters.c`).
+
+In each level rows of about the lowest degree are eliminated that share no entry, so that all of them can go at once;
+rows that depend on others come last.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kcons.constraints.constraint import IntArray
+from kcons.openmm.device.held_rows import IN_CELLS, HeldRows, Pattern
+from kcons.openmm.device.kernels import Array
+
+#: Rows of one level have at most this many times the lowest degree, or this many neighbors more.
+_ABOUT, _MORE = 1.5, 2
+#: Numbers of a row in `rows_row`.
+_ROW = 9
+
+
+class Order(NamedTuple):
+    """Rows in the order of elimination, where levels begin in it, and the later rows that each is coupled to."""
+
+    rows: list[int]
+    levels: list[int]
+    later: list[list[int]]
+
+
+def elimination(neighbors: list[set[int]], last: set[int]) -> Order:
+    """Order of elimination of rows by levels.
+
+    Parameters
+    ----------
+    neighbors : list of set of int
+        Rows that share a moving atom with each.
+    last : set of int
+        Rows that come after all others.
+    """
+    left, coupled = set(range(len(neighbors))), [set(each) for each in neighbors]
+    order: list[int] = []
+    levels = [0]
+    found: dict[int, set[int]] = {}
+    while left:
+        candidates = sorted(left - last or left, key=lambda row: (len(coupled[row]), row))
+        limit = max(_ABOUT * len(coupled[candidates[0]]), len(coupled[candidates[0]]) + _MORE)
+        blocked: set[int] = set()
+        chosen = []
+        for row in candidates:
+            if len(coupled[row]) > limit:
+                break
+            if row not in blocked:
+                chosen.append(row)
+                blocked |= coupled[row]
+        for row in chosen:
+            found[row] = around = coupled[row]
+            for other in around:
+                coupled[other] |= around
+                coupled[other] -= {other, row}
+        left -= set(chosen)
+        order += chosen
+        levels.append(len(order))
+    place = {row: k for k, row in enumerate(order)}
+    return Order(order, levels, [sorted(place[other] for other in found[row]) for row in order])
+
+
+class _Tables(NamedTuple):
+    """Tables of one cluster, whose numbers count from its own beginning, without what ends them."""
+
+    row: IntArray
+    slot: IntArray
+    level: IntArray
+    entry: IntArray
+    product: IntArray
+    update: IntArray
+    earlier: IntArray
+    atom: IntArray
+    touch: IntArray
+
+
+def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, list[int]]:
+    """Tables of a pattern, and its rows in the order of elimination."""
+    count, n_atoms = len(pattern.rows), pattern.atoms.shape[1]
+    users: list[set[int]] = [set() for _ in range(n_atoms)]
+    for k, row in enumerate(pattern.rows):
+        for atom in row.atoms:
+            users[atom].add(k)
+    coupled = [set().union(*(users[a] for a in row.atoms)) - {k} for k, row in enumerate(pattern.rows)]
+    order = elimination(coupled, {k for k, row in enumerate(pattern.rows) if row.depends})
+    rows = [pattern.rows[k] for k in order.rows]
+    slots = np.concatenate([[0], np.cumsum([len(row.atoms) for row in rows])])
+    place = [{a: slots[k] + i for i, a in enumerate(row.atoms)} for k, row in enumerate(rows)]
+    entry: list[list[int]] = []
+    product: list[list[int]] = []
+    numbers: dict[tuple[int, int], int] = {}
+    for i in range(count):
+        for j in [i, *order.later[i]]:
+            numbers[i, j] = len(entry)
+            entry.append([i, j, len(product), 0])
+            product += [[place[i][a], place[j][a]] for a in rows[i].atoms if a in place[j]]
+    updates: list[list[list[int]]] = [[] for _ in entry]
+    earlier: list[list[int]] = [[] for _ in rows]
+    for m in range(count):
+        for first, i in enumerate(order.later[m]):
+            earlier[i].append(numbers[m, i])
+            for j in order.later[m][first:]:
+                updates[numbers[i, j]].append([numbers[m, i], numbers[m, j], m])
+    begins = np.concatenate([[0], np.cumsum([len(each) for each in updates])])
+    places = np.concatenate([[0], np.cumsum([len(each) for each in earlier])])
+    table = []
+    parameter = cells = 0
+    for k, row in enumerate(rows):
+        flags = row.rolls + 2 * row.depends + 4 * row.summed
+        table.append([row.function, slots[k], parameter, row.how, numbers[k, k], places[k], flags, -1, cells])
+        parameter += len(held.parameters[pattern.clusters[0, order.rows[k]]])
+        cells += 3 * len(row.atoms) if row.how == IN_CELLS else 0
+    touch = [[place[k][a] for k in range(count) if a in place[k]] for a in range(n_atoms)]
+    found = (
+        table,
+        [[a, k] for k, row in enumerate(rows) for a in row.atoms],
+        [[level] for level in order.levels[:-1]],
+        [[*e[:3], begins[number]] for number, e in enumerate(entry)],
+        product,
+        [each for some in updates for each in some],
+        [[e] for some in earlier for e in some],
+        [[begin] for begin in np.concatenate([[0], np.cumsum([len(t) for t in touch])])[:-1]],
+        [[slot] for some in touch for slot in some],
+    )
+    widths = _ROW, 2, 1, 4, 2, 3, 1, 1, 1
+    arrays = [np.array(each, dtype=np.int64).reshape(-1, w) for each, w in zip(found, widths, strict=True)]
+    return _Tables(*arrays), order.rows
+
+
+class LargeClusters:
+    """The clusters of all large patterns in one set of tables.
+
+    Attributes
+    ----------
+    arrays : list of Array
+    rows : ndarray of int
+        Rows of the set in the order of the tables.
+    source : str
+        The functions ``positions_large`` and ``velocities_large``.
+    firsts : list of int
+        Number of the first cluster of each pattern.
+    """
+
+    def __init__(self, patterns: list[Pattern], held: HeldRows, first_row: int) -> None:
+        parts: dict[str, list[IntArray]] = {name: [] for name in _Tables._fields}
+        used = dict.fromkeys([*_Tables._fields, "parameter", "cells"], 0)
+        clusters: list[IntArray] = []
+        rows: list[IntArray] = []
+        self.firsts: list[int] = []
+        place = {row: k for k, row in enumerate(held.moving)}
+        cells_begin = 3 * sum(len(held.set.row_atoms(row)) for row in held.in_cells)
+        for pattern in patterns:
+            tables, order = _tables(pattern, held)
+            n = len(pattern.clusters)
+            mine = pattern.clusters[:, order]
+            self.firsts.append(sum(map(len, clusters)))
+            rows.append(mine.ravel())
+            sizes = {name: len(table) for name, table in zip(_Tables._fields, tables, strict=True)}
+            sizes["parameter"] = sum(len(held.parameters[row]) for row in mine[0])
+            some = [k for k, row in enumerate(order) if pattern.rows[row].how == IN_CELLS]
+            sizes["cells"] = 3 * sum(len(pattern.rows[order[k]].atoms) for k in some)
+            held.in_cells += mine[:, some].ravel().tolist()
+            #: What the numbers in each column of a table count.
+            counted = {
+                "row": ("", "slot", "parameter", "", "entry", "earlier", "", "", "cells"),
+                "slot": ("", "row"),
+                "level": ("row",),
+                "entry": ("row", "row", "product", "update"),
+                "product": ("slot", "slot"),
+                "update": ("entry", "entry", "row"),
+                "earlier": ("entry",),
+                "atom": ("touch",),
+                "touch": ("slot",),
+            }
+            for name, table in zip(_Tables._fields, tables, strict=True):
+                step = np.array([sizes.get(what, 0) for what in counted[name]])
+                base = np.array([used.get(what, 0) for what in counted[name]])
+                parts[name].append((table + base + step * np.arange(n)[:, None, None]).reshape(-1, table.shape[1]))
+            moving = np.array([[place.get(int(row), -1) for row in each] for each in mine])
+            parts["row"][-1][:, 7] = moving.ravel()
+            steps = np.array([sizes["row"], sizes["atom"], sizes["level"]])
+            clusters.append(np.array([used["row"], used["atom"], used["level"]]) + steps * np.arange(n)[:, None])
+            for name in used:
+                used[name] += n * sizes[name]
+        ends = {
+            "row": [0, used["slot"], used["parameter"], 0, used["entry"], used["earlier"], 0, 0, 0],
+            "level": [used["row"]],
+            "entry": [0, 0, used["product"], used["update"]],
+            "atom": [used["touch"]],
+        }
+        self.rows: IntArray = np.concatenate(rows)
+        final = np.array([[used["row"], used["atom"], used["level"]]])
+        self.arrays = [Array("rows_cluster", "int", np.concatenate([*clusters, final]).ravel())]
+        for name, tables_of in parts.items():
+            end = [np.array([ends[name]])] if name in ends else []
+            flat = np.concatenate([*tables_of, *end]).ravel()
+            self.arrays.append(Array(f"rows_{name}", "int", flat if len(flat) else np.zeros(1, dtype=np.int64)))
+        periods = np.array([held.set.locate(int(row))[0].period or 0.0 for row in self.rows])
+        numbers = np.stack([held.target[self.rows], held.scale[self.rows], periods], axis=1)
+        parameters = np.concatenate([held.parameters[row] for row in self.rows] + [np.zeros(1)])
+        self.arrays += [Array("rows_number", "mixed", numbers.ravel()), Array("rows_parameter", "mixed", parameters)]
+        count, slots, entries = used["row"], used["slot"], used["entry"]
+        rooms = {"place": 9 * slots, "now": 3 * slots + count, "there": 3 * slots + count}
+        rooms |= {"upper": entries, "lower": entries} | dict.fromkeys(("pivot", "off", "answer", "sum"), count)
+        self.arrays += [Array(f"rows_{name}", "mixed", np.zeros(size)) for name, size in rooms.items()]
+        self.source = self._source(patterns, held, first_row, cells_begin)
+
+    @staticmethod
+    def _source(patterns: list[Pattern], held: HeldRows, first_row: int, first_cell: int) -> str:
+        used = sorted({row.function for pattern in patterns for row in pattern.rows})
+        functions = "".join(held.functions[f].text(f"rows_g{f}", "GLOBAL ") for f in used)
+        cases = "".join(f" case {f}: rows_g{f}(r, p, t, out); break;\n" for f in used)
+        timed = [f for f in used if held.functions[f].second is not None]
+        rates = "".join(f" if (f == {f}) return rows_g{f}_rate(r, p, t);\n" for f in timed)
+        return (
+            f"{functions}DEVICE void rows_function(int f, GLOBAL const mixed* r, GLOBAL const mixed* p, mixed t, "
+            f"GLOBAL mixed* out) {{\n switch (f) {{\n{cases} }}\n}}\n"
+            f"DEVICE mixed rows_drift(int f, GLOBAL const mixed* r, GLOBAL const mixed* p, mixed t) {{\n{rates}"
+            f" return 0;\n}}\n#define ROWS_FIRST_LARGE {first_row}\n#define ROWS_FIRST_CELL {first_cell}\n"
+            f"{Path(__file__).with_name('clusters.c').read_text()}"
+        )
+
+
+def group_size(patterns: list[Pattern]) -> int:
+    """Work-items that a work-group wants for the largest cluster: a warp, or many."""
+    largest = max((len(pattern.rows) for pattern in patterns), default=0)
+    return 64 if not largest else 32 if largest <= 64 else 256

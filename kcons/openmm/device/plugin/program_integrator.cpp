@@ -1,0 +1,277 @@
+#include "program_integrator.h"
+#include "openmm/Context.h"
+#include "openmm/Platform.h"
+#include "openmm/System.h"
+#include "openmm/serialization/SerializationNode.h"
+#include "openmm/serialization/SerializationProxy.h"
+#include <cmath>
+#include <cstring>
+#include <sstream>
+using namespace OpenMM;
+using namespace std;
+
+namespace kcons {
+
+static Planner planner = nullptr;
+static thread_local string failure;   // what Python or a C function has to say
+
+// -- the integrator, as OpenMM wants it -----------------------------------------------------------------
+
+void ProgramIntegrator::initialize(ContextImpl& c) {
+    if (owner != nullptr && &c.getOwner() != owner)
+        throw OpenMMException("This Integrator is already bound to a context");
+    if (planner == nullptr)
+        throw OpenMMException("kcons: this integrator is made for its Context by Python; import kcons.openmm");
+    // The base class tells the Context when the integrator goes first.
+    owner = &c.getOwner();
+    context = &c;
+    Plan first = planned(false);
+    handle = c.getPlatform().createKernel(StepKernel::Name(), c);
+    handle.getAs<StepKernel>().begin(c, first.clusters);
+    middleKinetic = -1;
+}
+Plan ProgramIntegrator::planned(bool whole) const {
+    const System& system = context->getSystem();
+    const Platform& platform = context->getPlatform();
+    vector<double> masses, lengths;
+    vector<int> pairs;
+    for (int k = 0; k < system.getNumParticles(); k++) masses.push_back(system.getParticleMass(k));
+    for (int k = 0; k < system.getNumConstraints(); k++) {
+        int i, j; double length;
+        system.getConstraintParameters(k, i, j, length);
+        pairs.insert(pairs.end(), {i, j});
+        lengths.push_back(length);
+    }
+    string precision = "double";
+    for (auto& name : platform.getPropertyNames())
+        if (name == "Precision") precision = platform.getPropertyValue(context->getOwner(), name);
+    vector<Vec3> positions, box(3);
+    if (whole) {
+        context->getPositions(positions);
+        context->getPeriodicBoxVectors(box[0], box[1], box[2]);
+        if (!system.usesPeriodicBoundaryConditions()) box.assign(3, Vec3());
+    }
+    Plan plan;
+    Given given = {description.c_str(), platform.getName().c_str(), precision.c_str(), getIntegrationForceGroups(),
+                   (int) masses.size(), (int) lengths.size(), masses.data(), pairs.data(), lengths.data(),
+                   whole ? &positions[0][0] : nullptr, &box[0][0], whole ? context->getTime() : 0};
+    if (!planner(&plan, &given)) throw OpenMMException(failure);
+    return plan;
+}
+void ProgramIntegrator::cleanup() { handle = Kernel(); }
+vector<string> ProgramIntegrator::getKernelNames() { return {StepKernel::Name()}; }
+StepKernel& ProgramIntegrator::kernel() const {
+    if (context == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
+    StepKernel& k = handle.getAs<StepKernel>();
+    if (!k.built) k.build(*context, planned(true));
+    return k;
+}
+void ProgramIntegrator::step(int steps) {
+    StepKernel& k = kernel();
+    look = Look();
+    try {
+        k.execute(*context, *this, steps);
+    } catch (...) {
+        middleKinetic = -1;
+        k.valid = false;
+        if (k.read("failure")[0] == 0) throw;
+        k.lookBack();                              // it came of a failure, which is told
+    }
+    vector<double> told = k.read("looked");    // the only wait of a call
+    look = {told[0], told[5], (int) told[2], (int) told[3], (int) told[4]};
+    if (look.failed) {
+        k.write("failure", {0, 0, 0});
+        k.valid = false;
+        ostringstream text;
+        text << "kcons: row " << look.row << " could not be solved at step " << look.step << ", residual " << look.residual;
+        throw OpenMMException(text.str());
+    }
+    middleKinetic = noisy && steps > 0 ? told[1]/2 : -1;
+}
+void ProgramIntegrator::stateChanged(State::DataType changed) {
+    if (context == nullptr) return;
+    if (changed == State::Velocities) {
+        middleKinetic = restoredKinetic;       // OpenMM says so of a checkpoint, too, once it is loaded
+        restoredKinetic = -1;
+    }
+    else handle.getAs<StepKernel>().valid = false;
+}
+double ProgramIntegrator::computeKineticEnergy() {
+    return middleKinetic >= 0 ? middleKinetic : handle.getAs<StepKernel>().kineticEnergy();
+}
+vector<double> ProgramIntegrator::read(const string& name) const { return kernel().read(name); }
+void ProgramIntegrator::write(const string& name, const vector<double>& values) { kernel().write(name, values); }
+
+// -- what belongs to a state ------------------------------------------------------------------------------
+
+vector<string> ProgramIntegrator::savedNames() const {
+    vector<string> names;
+    for (auto& array : kernel().plan.arrays) if (array.saved) names.push_back(array.name);
+    return names;
+}
+void ProgramIntegrator::createCheckpoint(ostream& out) const {
+    out.write((const char*) &middleKinetic, sizeof(double));
+    for (auto& name : savedNames()) {
+        vector<double> values = read(name);
+        out.write((const char*) values.data(), values.size()*sizeof(double));
+    }
+}
+void ProgramIntegrator::loadCheckpoint(istream& in) {
+    double kinetic;
+    in.read((char*) &kinetic, sizeof(double));
+    for (auto& name : savedNames()) {
+        vector<double> values = read(name);
+        in.read((char*) values.data(), values.size()*sizeof(double));
+        write(name, values);
+    }
+    middleKinetic = restoredKinetic = kinetic;
+    kernel().valid = false;
+}
+static string text(const vector<double>& values) {
+    ostringstream out;
+    out.precision(17);
+    for (double v : values) out << v << ' ';
+    return out.str();
+}
+static vector<double> parsed(const string& text) {
+    istringstream in(text);
+    vector<double> values;
+    for (double v; in >> v;) values.push_back(v);
+    return values;
+}
+void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
+    node.setIntProperty("version", 1).setDoubleProperty("middleKinetic", middleKinetic);
+    for (auto& name : savedNames()) node.setStringProperty(name, text(read(name)));
+}
+void ProgramIntegrator::deserializeParameters(const SerializationNode& node) {
+    for (auto& name : savedNames()) if (node.hasProperty(name)) write(name, parsed(node.getStringProperty(name)));
+    middleKinetic = node.getDoubleProperty("middleKinetic", -1);
+}
+
+class Proxy : public SerializationProxy {
+public:
+    Proxy() : SerializationProxy("KconsProgram") {}
+    void serialize(const void* object, SerializationNode& node) const override {
+        auto& i = *static_cast<const ProgramIntegrator*>(static_cast<const Integrator*>(object));
+        node.setIntProperty("version", 1).setDoubleProperty("stepSize", i.getStepSize());
+        node.setDoubleProperty("constraintTolerance", i.getConstraintTolerance());
+        node.setIntProperty("forceGroups", i.getIntegrationForceGroups()).setBoolProperty("noisy", i.noisy);
+        node.setStringProperty("description", i.description);
+    }
+    void* deserialize(const SerializationNode& node) const override {
+        ProgramIntegrator* i = new ProgramIntegrator();
+        i->setStepSize(node.getDoubleProperty("stepSize"));
+        i->setConstraintTolerance(node.getDoubleProperty("constraintTolerance"));
+        i->setIntegrationForceGroups(node.getIntProperty("forceGroups", -1));
+        i->noisy = node.getBoolProperty("noisy", false);
+        i->description = node.getStringProperty("description");
+        return static_cast<Integrator*>(i);
+    }
+};
+
+// -- steps on all platforms -------------------------------------------------------------------------------
+
+void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int steps) {
+    numbers.dt = integrator.getStepSize();
+    numbers.tolerance = integrator.getConstraintTolerance();
+    c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
+    for (int k = 0; k < steps; k++) {
+        if (c.updateContextState()) {          // barostats have moved positions
+            valid = false;
+            c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
+        }
+        if (!valid || (plan.slots == 1 && c.getLastForceGroups() != plan.parts[0].back().groups)) {
+            positionsMoved();
+            vector<bool> known(plan.slots);
+            for (auto& action : plan.parts[0])
+                if (action.verb == Verb::Evaluate && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
+            for (auto& action : plan.parts[1])
+                if (action.verb == Verb::Evaluate && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
+        }
+        run(c, k == 0 || integrator.whole ? 0 : 1);
+        c.setTime(numbers.time+numbers.dt);
+        c.setStepCount(c.getStepCount()+1);
+        if (k == steps-1 || integrator.whole) run(c, 2);
+    }
+    lookBack();
+}
+void StepKernel::run(ContextImpl& c, int part) {
+    numbers.time = c.getTime();
+    numbers.step = (int) c.getStepCount();
+    bool moved = false;
+    for (auto& action : plan.parts[part]) {
+        if (action.verb == Verb::Launch) { launch(action.kernel); moved = true; }
+        else if (action.verb == Verb::ConstrainPositions) constrainPositions(c);
+        else if (action.verb == Verb::ConstrainVelocities) constrainVelocities(c);
+        else {
+            // Atoms may take new places only where no forces are kept that are still needed.
+            if (moved) { c.computeVirtualSites(); positionsMoved(); }
+            moved = false;
+            evaluate(c, action);
+        }
+    }
+}
+void StepKernel::evaluate(ContextImpl& c, const Action& action) {
+    c.calcForcesAndEnergy(true, false, action.groups);
+    if (plan.slots > 1) keepForces(action.slot);
+    valid = true;
+}
+const Array& StepKernel::declared(const string& name, size_t size) const {
+    for (auto& array : plan.arrays) if (array.name == name) {
+        if (size != array.values.size())
+            throw OpenMMException("kcons: '"+name+"' has "+to_string(array.values.size())+" values, not "+to_string(size));
+        return array;
+    }
+    throw OpenMMException("kcons: no array is called '"+name+"'");
+}
+
+static struct Registered {
+    Registered() { SerializationProxy::registerProxy(typeid(ProgramIntegrator), new Proxy()); }
+} registered;
+
+}
+
+// -- what Python calls; `integrator` is int(proxy.this) of the SWIG proxy, an OpenMM::Integrator* -----------
+
+using namespace kcons;
+
+static ProgramIntegrator& own(void* integrator) {
+    return dynamic_cast<ProgramIntegrator&>(*static_cast<Integrator*>(integrator));
+}
+extern "C" {
+const char* kcons_error() { return failure.c_str(); }
+void kcons_set_error(const char* text) { failure = text; }
+void kcons_set_planner(Planner p) { planner = p; }
+void kcons_describe(void* integrator, const char* description, int noisy) {
+    own(integrator).description = description;
+    own(integrator).noisy = noisy;
+}
+void kcons_set_whole(void* integrator, int whole) { own(integrator).whole = whole; }
+int kcons_is_bound(void* integrator) { return own(integrator).bound(); }
+int kcons_read(void* integrator, const char* name, double* out, int room) try {
+    auto values = own(integrator).read(name);
+    memcpy(out, values.data(), min<size_t>(room, values.size())*sizeof(double));
+    return values.size();
+} catch (exception& e) { failure = e.what(); return -1; }
+int kcons_write(void* integrator, const char* name, const double* values, int n) try {
+    own(integrator).write(name, vector<double>(values, values+n));
+    return n;
+} catch (exception& e) { failure = e.what(); return -1; }
+void kcons_look(void* integrator, double* out) {
+    const Look& l = own(integrator).look;
+    double told[] = {l.squares, (double) l.failed, (double) l.step, (double) l.row, l.residual};
+    memcpy(out, told, sizeof(told));
+}
+void kcons_plan_source(Plan* plan, const char* source, const char* library, int items, int workGroup, int slots) {
+    plan->source = source; plan->library = library;
+    plan->items = items; plan->workGroup = workGroup; plan->slots = slots;
+}
+void kcons_plan_array(Plan* plan, const char* name, int whole, int saved, const double* values, int n) {
+    plan->arrays.push_back({name, whole != 0, saved != 0, vector<double>(values, values+n)});
+}
+void kcons_plan_action(Plan* plan, int part, int verb, const char* kernel, int groups, int slot) {
+    plan->parts[part].push_back({(Verb) verb, kernel, groups, slot});
+}
+void kcons_plan_cluster(Plan* plan, const int* atoms, int n) { plan->clusters.emplace_back(atoms, atoms+n); }
+void kcons_plan_order(Plan* plan, const int* atoms, int n) { plan->order.assign(atoms, atoms+n); }
+}

@@ -1,0 +1,119 @@
+// A time step as a list of actions, as an OpenMM::Integrator. What a GPU needs is in common_platform.cpp.
+#pragma once
+#include "openmm/Integrator.h"
+#include "openmm/Kernel.h"
+#include "openmm/KernelImpl.h"
+#include "openmm/OpenMMException.h"
+#include "openmm/internal/ContextImpl.h"
+#include <map>
+#include <string>
+#include <vector>
+
+namespace kcons {
+
+// An array that kernels know by its name; `saved` if it belongs to a state.
+struct Array {
+    std::string name;
+    bool whole, saved;             // whole numbers
+    std::vector<double> values;    // that it begins with
+};
+
+enum class Verb { Launch, ConstrainPositions, ConstrainVelocities, Evaluate };
+
+struct Action {
+    Verb verb;
+    std::string kernel;
+    int groups;                    // of forces, a bit mask
+    int slot;                      // where these forces are, among those of all groups
+};
+
+// What Python makes of an integrator for one Context: kernels, their arrays, and in which order they run. n steps are
+// the head, n-1 times the middle, which is the end of a step and the head of the next, and the tail.
+struct Plan {
+    std::string source, library;   // of the kernels; for plain C++ the file that they were compiled to
+    std::vector<Array> arrays;
+    std::vector<Action> parts[3];
+    std::vector<std::vector<int>> clusters;   // atoms that stay together
+    std::vector<int> order;        // of atoms in the array `atoms`, which follows them where OpenMM moves them; -1-k
+                                   // for those that rest
+    int items = 0, workGroup = 64, slots = 1;
+};
+
+// Python's part in the making: fills the plan, or returns 0. Without positions only the clusters are asked for.
+struct Given {
+    const char *description, *platform, *precision;
+    int groups, particles, constraints;
+    const double* masses;
+    const int* pairs;
+    const double *lengths, *positions, *box;
+    double time;
+};
+typedef int (*Planner)(Plan* plan, const Given* given);
+
+// Of a step that failed: what the kernels have told.
+struct Look {
+    double squares = 0, residual = 0;
+    int failed = 0, step = 0, row = 0;
+};
+
+class StepKernel;
+
+class ProgramIntegrator : public OpenMM::Integrator {
+public:
+    std::string description;       // what Python makes the plan of
+    bool whole = true;             // whether others look at velocities between steps, which must then end
+    bool noisy = false;            // whether the kinetic energy is that of the middle of the last step
+    void step(int steps) override;
+    std::vector<double> read(const std::string& name) const;
+    void write(const std::string& name, const std::vector<double>& values);
+    bool bound() const { return context != nullptr; }
+    Look look;
+protected:
+    void initialize(OpenMM::ContextImpl& c) override;
+    void cleanup() override;
+    std::vector<std::string> getKernelNames() override;
+    void stateChanged(OpenMM::State::DataType changed) override;
+    double computeKineticEnergy() override;
+    bool kineticEnergyRequiresForce() const override { return false; }
+    void createCheckpoint(std::ostream& out) const override;
+    void loadCheckpoint(std::istream& in) override;
+    void serializeParameters(OpenMM::SerializationNode& node) const override;
+    void deserializeParameters(const OpenMM::SerializationNode& node) override;
+private:
+    StepKernel& kernel() const;    // with all that it needs, which is made when it is used first
+    Plan planned(bool whole) const;
+    std::vector<std::string> savedNames() const;
+    mutable OpenMM::Kernel handle;
+    double middleKinetic = -1, restoredKinetic = -1;   // -1: none is known
+};
+
+// What platforms have in common; each says how a kernel is launched and where arrays are.
+class StepKernel : public OpenMM::KernelImpl {
+public:
+    static std::string Name() { return "KconsStep"; }
+    StepKernel(const std::string& name, const OpenMM::Platform& platform) : KernelImpl(name, platform) {}
+    virtual void begin(OpenMM::ContextImpl& c, const std::vector<std::vector<int>>& clusters) {}
+    void build(OpenMM::ContextImpl& c, const Plan& made) { plan = made; prepare(c); built = true; }
+    virtual void execute(OpenMM::ContextImpl& c, ProgramIntegrator& integrator, int steps);
+    virtual double kineticEnergy() = 0;
+    virtual std::vector<double> read(const std::string& name) = 0;
+    virtual void write(const std::string& name, const std::vector<double>& values) = 0;
+    virtual void lookBack() { launch("look"); }   // sums and failures to the array `looked`
+    bool built = false, valid = false;   // valid: forces are those at the present positions
+    Plan plan;
+protected:
+    struct Numbers { int step, launch; double dt, time, tolerance; OpenMM::Vec3 box[3]; };
+    Numbers numbers = {};
+    const Array& declared(const std::string& name, size_t size) const;
+    virtual void prepare(OpenMM::ContextImpl& c) = 0;
+    virtual void launch(const std::string& kernel) = 0;
+    virtual void constrainPositions(OpenMM::ContextImpl& c) = 0;
+    virtual void constrainVelocities(OpenMM::ContextImpl& c) = 0;
+    virtual void positionsMoved() {}           // before the first evaluation at new positions
+    virtual void keepForces(int slot) = 0;     // where there are several groups
+private:
+    void run(OpenMM::ContextImpl& c, int part);
+    void evaluate(OpenMM::ContextImpl& c, const Action& action);
+};
+
+}

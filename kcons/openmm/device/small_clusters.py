@@ -1,0 +1,264 @@
+"""Small clusters: straight code for a work-item, which has the cluster in registers.
+
+Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is written out: what stays zero has no code. A distance
+is written as (u.u - t^2)/2t with the gradient u/t, which needs neither root nor division.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.openmm.device.c_writer import literal
+from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, HeldRows, Pattern, Row
+
+#: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
+FEW = 4
+
+
+class Record:
+    """Numbers of each cluster of a pattern, one after another; targets of the System that all share are in the code.
+
+    Attributes
+    ----------
+    start, size : int
+        Place of those of the first cluster, and how many a cluster has.
+    targets, scales : list of str
+        Of each row, as C.
+    parameters, cells : list of int
+        Where those of each row begin; cells count from `first_cell`, and there are `cell_size` a cluster.
+    table : ndarray, shape (n_clusters, size)
+    """
+
+    def __init__(self, pattern: Pattern, held: HeldRows, start: int, first_cell: int) -> None:
+        self.start, self.first_cell, self.cell_size, self.size = start, first_cell, 0, 0
+        self.targets: list[str] = []
+        self.scales: list[str] = []
+        self.parameters: list[int] = []
+        self.cells: list[int] = []
+        columns = [np.zeros((len(pattern.clusters), 0))]
+        place = {row: k for k, row in enumerate(held.moving)}
+        for k, row in enumerate(pattern.rows):
+            mine = pattern.clusters[:, k]
+            goals = np.array([place[i] for i in mine], dtype=float) if row.moves else held.target[mine]
+            for values, texts in ((goals, self.targets), (held.scale[mine], self.scales)):
+                if not row.summed and np.all(values == values[0]):
+                    texts.append(literal(values[0]))
+                else:
+                    texts.append(f"n[{self.size}]")
+                    columns.append(values[:, None])
+                    self.size += 1
+            self.parameters.append(self.size)
+            columns.append(np.array([held.parameters[i] for i in mine]))
+            self.size += columns[-1].shape[1]
+            self.cells.append(self.cell_size)
+            self.cell_size += 3 * len(row.atoms) if row.how == IN_CELLS else 0
+        self.table: FloatArray = np.hstack(columns)
+
+
+class ItemWriter:
+    """The two functions of a pattern for a work-item; numbers of cluster c begin at ``n``."""
+
+    def __init__(self, name: str, pattern: Pattern, record: Record, first_row: int, held: HeldRows) -> None:
+        self.name, self.record, self.held = name, record, held
+        self.rows, self.count = pattern.rows, len(pattern.rows)
+        self.row_number = f"{first_row}+cluster*{self.count}"
+        #: Whether the matrix is in the precision of forces.
+        self.coarse = self.count >= FEW and not any(row.depends for row in self.rows)
+        self.filled: list[set[int]] = []
+
+    def text(self) -> str:
+        return self.positions() + self.velocities()
+
+    def _plain(self, row: Row) -> bool:
+        """Whether a row is a distance that is held at one length."""
+        return self.held.functions[row.function].is_distance and not row.moves
+
+    def _each(self, write: Callable[[int, Row], str]) -> str:
+        return "".join(write(k, row) for k, row in enumerate(self.rows))
+
+    def _begin(self, what: str, first: str, changed: str) -> str:
+        def room(k: int, row: Row) -> str:
+            size = 3 * len(row.atoms)
+            kept = f", b{k}[{size}]" if row.how == NEAREST else ""
+            return f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}]{kept};\n"
+
+        lengths = self._each(lambda k, r: f" mixed i{k} = 1/{self.record.targets[k]};\n" if self._plain(r) else "")
+        return (
+            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
+            f"mixed* {changed}, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.record.start}+cluster*"
+            f"{self.record.size};\n{self._each(room)}{lengths} mixed off[{self.count}], sum[{self.count}];\n "
+            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
+        )
+
+    # -- rows ------------------------------------------------------------------------------------
+
+    def _gathered(self, k: int, row: Row, moved: bool) -> str:
+        """Positions of a row's atoms into r, at x or at x + d; of rows of velocities the way stands behind them."""
+        lines, first, size = [], 3 * row.atoms[0], 3 * len(row.atoms)
+        for i, atom in enumerate(row.atoms):
+            for c in range(3):
+                a, s, own = 3 * atom + c, first + c, f"r{k}[{3 * i + c}]"
+                place, way = f"x[{a}]", f"d[{a}]"
+                if row.how != STORED:
+                    place, way = (f"x[{a}]-x[{s}]", f"(d[{a}]-d[{s}])") if i else ("0", "0")
+                    if row.how == NEAREST:
+                        place = f"b{k}[{3 * i + c}]"
+                if row.how == IN_CELLS and i:
+                    cells = f"{self.record.first_cell + self.record.cells[k] + 3 * i}+cluster*{self.record.cell_size}"
+                    shift = [f"rows_cells[{cells}+{m}]*box{m}.{'xyz'[c]}" for m in range(c, 3)]
+                    place = "+".join([place, *shift])
+                half_way = "(mixed) 0.5*" if row.rolls else ""
+                lines.append(f" {own} = {place}{f'+{half_way}{way}' if moved else ''};")
+                if row.rolls:
+                    lines.append(f" r{k}[{size + 3 * i + c}] = {f'd[{a}]' if moved else '0'};")
+        return "".join(lines) + "\n"
+
+    def _images(self, k: int, row: Row) -> str:
+        """Shortest images along the list, once: atoms move by less than half the cell."""
+        if row.how != NEAREST:
+            return ""
+        lines = [f" b{k}[{c}] = 0;" for c in range(3)]
+        for i in range(1, len(row.atoms)):
+            a, s = 3 * row.atoms[i], 3 * row.atoms[i - 1]
+            lines.append(f" {{mixed ux = x[{a}]-x[{s}], uy = x[{a + 1}]-x[{s + 1}], uz = x[{a + 2}]-x[{s + 2}];")
+            lines.append(" ROWS_NEAR(ux, uy, uz)")
+            lines += [f" b{k}[{3 * i + c}] = b{k}[{3 * i - 3 + c}]+{u};" for c, u in enumerate(("ux", "uy", "uz"))]
+            lines.append("}")
+        return "".join(lines) + "\n"
+
+    def _value(self, k: int, row: Row, time: str, moved: bool, out: str) -> str:
+        """Value less target, or value alone, and gradient of a row."""
+        text = self._gathered(k, row, moved)
+        if not self._plain(row):
+            return f"{text} rows_f{row.function}(r{k}, n+{self.record.parameters[k]}, {time}, {out});\n"
+        u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.record.targets[k]
+        square = "+".join(f"{each}*{each}" for each in u)
+        lines = [f" {out}[{1 + c}] = -i{k}*{u[c]}; {out}[{4 + c}] = i{k}*{u[c]};" for c in range(3)]
+        return f"{text} {out}[0] = ({square}-{t}*{t})*((mixed) 0.5*i{k});{''.join(lines)}\n"
+
+    def _reference(self, time: str) -> str:
+        def one(k: int, row: Row) -> str:
+            kept = "".join(f" g{k}[{c}] = o{k}[{1 + c}];" for c in range(3 * len(row.atoms)))
+            return f"{self._images(k, row)}{self._value(k, row, time, False, f'o{k}')}{kept} sum[{k}] = 0;\n"
+
+        return self._each(one)
+
+    def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
+        """Target of a row at a time, or its rate; of rows of velocities there is no rate."""
+        if row.moves:
+            return f"rows_moving(rows_knots, (int) {self.record.targets[k]}, {time}, {rate})"
+        return "0" if rate else self.record.targets[k]
+
+    # -- algebra ---------------------------------------------------------------------------------
+
+    def _product(self, k: int, j: int, left: str) -> str:
+        """Entry of J: the gradient of row k in `left` times M^-1 that of row j at the start; '' where it is zero."""
+        terms = [
+            f"w[{a}]*({'+'.join(f'{left.format(k, 3 * p + c)}*g{j}[{3 * q + c}]' for c in range(3))})"
+            for p, a in enumerate(self.rows[k].atoms)
+            for q, b in enumerate(self.rows[j].atoms)
+            if a == b
+        ]
+        return "+".join(terms)
+
+    def _factored(self, symmetric: bool) -> str:
+        """J, and its L and U in place, without pivoting: it is nearly symmetric and positive."""
+        n, left = self.count, "g{}[{}]" if symmetric else "o{}[1+{}]"
+        lines = [" mixed whole;\n"] if any(row.depends for row in self.rows) else []
+        filled = self.filled = [set[int]() for _ in self.rows]
+        for k in range(n):
+            for j in range(n):
+                text = self._product(k, j, left)
+                if text:
+                    filled[k].add(j)
+                    lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if symmetric and j < k else text};\n")
+        for k, row in enumerate(self.rows):
+            pivot = f"J[{k * n + k}]"
+            if row.depends:
+                lines.append(f" whole = fabs((mixed) {pivot});\n")
+            for m in range(k):
+                if m not in filled[k]:  # which grows
+                    continue
+                lines.append(f" J[{k * n + m}] *= J[{m * n + m}];\n")
+                for j in sorted(each for each in filled[m] if each > m):
+                    old = f"J[{k * n + j}]" if j in filled[k] else "0"
+                    filled[k].add(j)
+                    lines.append(f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n")
+            none = f"fabs((mixed) {pivot}) <= ROWS_PIVOT*whole ? 0 : " if row.depends else ""
+            lines.append(f" {pivot} = {none}1/{pivot};\n")
+        return "".join(lines)
+
+    def _solved(self) -> str:
+        """J y = off, y, and what it takes from d or v, which is called `d`."""
+        n, lines = self.count, []
+        for k in range(n):
+            taken = "".join(f"-J[{k * n + m}]*y[{m}]" for m in sorted(self.filled[k]) if m < k)
+            lines.append(f" y[{k}] = off[{k}]{taken};\n")
+        for k in range(n - 1, -1, -1):
+            taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(self.filled[k]) if j > k)
+            lines.append(f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n")
+        for k, row in enumerate(self.rows):
+            each = [(3 * a + c, a, 3 * p + c) for p, a in enumerate(row.atoms) for c in range(3)]
+            lines += [f" d[{place}] -= w[{a}]*g{k}[{slot}]*y[{k}];" for place, a, slot in each] + ["\n"]
+        return "".join(lines)
+
+    def _sums(self, by: str) -> str:
+        return self._each(lambda k, r: f" rows_sums[{self.row_number}+{k}] -= sum[{k}]{by};\n" if r.summed else "")
+
+    # -- functions -------------------------------------------------------------------------------
+
+    def positions(self) -> str:
+        """x + d on the rows."""
+
+        def start(k: int, row: Row) -> str:
+            goal = self._wanted(k, row, "time-h/2" if row.rolls else "time", 0)
+            rounded = ""
+            if row.how == STORED:
+                size = "+".join(f"fabs(o{k}[{1 + c}]*r{k}[{c}])" for c in range(3 * len(row.atoms)))
+                rounded = f"\n#ifdef SINGLE\n a{k} += (mixed) 5e-7*({size});\n#endif\n"
+            return (
+                f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, "
+                f"a{k} = tolerance*{self.record.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
+            )
+
+        def turn(k: int, row: Row) -> str:
+            text = self._value(k, row, "time-h/2" if row.rolls else "time", True, f"o{k}")
+            text += f" off[{k}] = o{k}[0]{'' if self._plain(row) else f'-t{k}'};"
+            if row.period:
+                text += f" off[{k}] -= {literal(row.period)}*rint(off[{k}]/{literal(row.period)});"
+            return f"{text} there = there && fabs(off[{k}]) <= a{k};\n"  # so that NaN fails
+
+        def turned(k: int, row: Row) -> str:
+            along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(row.atoms)))
+            return f" if (!({along} > 0)) bad = {k};\n"
+
+        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
+        fail = f"{{FAIL({self.row_number}+bad, off[bad]); return;}}\n"
+        return (
+            f"{self._begin('positions', 'h', 'd')}{self._reference('time-h')}{self._each(start)} int bad = -1;\n"
+            f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if (there) break;\n"
+            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
+            f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
+        )
+
+    def velocities(self) -> str:
+        """v, which is called d, along the rows."""
+
+        def demanded(k: int, row: Row) -> str:
+            rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
+            if self.held.functions[row.function].second is not None:
+                rate += f"-rows_f{row.function}_rate(r{k}, n+{self.record.parameters[k]}, time)"
+            return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
+
+        def speed(k: int, row: Row) -> str:
+            parts = [f"g{k}[{3 * p + c}]*d[{3 * a + c}]" for p, a in enumerate(row.atoms) for c in range(3)]
+            return f" off[{k}] = {'+'.join(parts)}-c{k};\n"
+
+        return (
+            f"{self._begin('velocities', 'rate', 'd')}{self._reference('time')}{self._each(demanded)}"
+            f"{self._factored(True)} for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n"
+            f"{self._each(speed)}{self._solved()} }}\n if (rate != 0) {{{self._sums('')} }}\n}}\n"
+        )

@@ -1,0 +1,65 @@
+"""The plugin as a wheel: ``python -m kcons.openmm.device.wheel [folder]``.
+
+It has the libraries for Reference, CPU, OpenCL, CUDA and HIP, linked with empty libraries of the names of OpenMM's, so
+that neither CUDA nor a GPU need be where it is made. It serves the version of OpenMM that is installed here, and the
+sources of this kcons; where others are installed, the plugin is compiled as without it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import platform
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import openmm
+
+from kcons import __version__
+from kcons.constraints.arguments import refuse_other
+from kcons.errors import UnsupportedError
+from kcons.openmm.device import build
+
+
+def make_wheel(folder: str | Path = ".") -> Path:
+    """Write the wheel into a folder, and return its path.
+
+    Raises
+    ------
+    UnsupportedError
+        There is no compiler, or no headers of OpenMM.
+    """
+    refuse_other(folder, (str, Path), "folder", "the path of a folder")
+    if not build.compiler() or build.headers() is None:
+        raise UnsupportedError(f"a wheel cannot be made: {build.refusal() or 'there is no C++ compiler'}")
+    libc = "_".join(platform.libc_ver()[1].split(".")[:2])
+    tag = f"py3-none-manylinux_{libc}_{platform.machine()}"
+    needed = openmm.version.version.split(".dev")[0]
+    number = f"{__version__}+openmm{needed}"
+    info = f"{build.PACKAGE}-{number}.dist-info"
+    files: dict[str, bytes] = {f"{build.PACKAGE}/__init__.py": b'"""Libraries of kcons for OpenMM."""\n'}
+    with tempfile.TemporaryDirectory() as made:
+        build.build(Path(made), build.ACCELERATED, stubs=True)
+        for path in sorted(Path(made).glob("*.so")):
+            files[f"{build.PACKAGE}/{build.digest()}/{path.name}"] = path.read_bytes()
+    needs = f"Requires-Dist: openmm=={needed}\nRequires-Dist: kcons=={__version__}\n"
+    about = f"Metadata-Version: 2.1\nName: {build.PACKAGE}\nVersion: {number}\n{needs}"
+    files[f"{info}/METADATA"] = about.encode()
+    files[f"{info}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: kcons\nRoot-Is-Purelib: false\nTag: {tag}\n".encode()
+    record = ""
+    for name, content in files.items():
+        known = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+        record += f"{name},sha256={known},{len(content)}\n"
+    files[f"{info}/RECORD"] = f"{record}{info}/RECORD,,\n".encode()
+    target = Path(folder) / f"{build.PACKAGE}-{number}-{tag}.whl"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return target
+
+
+if __name__ == "__main__":
+    print(make_wheel(*sys.argv[1:2]))

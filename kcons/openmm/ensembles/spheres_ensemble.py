@@ -1,0 +1,135 @@
+"""Isokinetic spheres in OpenMM: velocities of each molecule on spheres of their own, for long time steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import openmm
+from openmm import unit
+
+from kcons.constraints.arguments import positive
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step, refuse_leapfrog
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
+from kcons.steppers.operations import Operation
+from kcons.steppers.splitting import Splitting
+from kcons.thermostats import IsokineticSpheres as OnArrays
+
+
+class IsokineticSpheres(Ensemble):
+    """Canonical configurations at long steps, for ``ProjectedIntegrator(timestep, ensemble=..., device=True)``.
+
+    The bath of `kcons.thermostats.IsokineticSpheres`: velocities of each cluster of atoms that constraints join stay on
+    spheres, together with auxiliary variables, so that no resonance of slow forces heats it. Dynamics are lost:
+    transport and relaxation times mean nothing.
+
+    Parameters
+    ----------
+    temperature : Quantity or float
+        In K if a float.
+    friction : Quantity or float
+        In 1/ps if a float, above 0: the rate at which the bath forgets.
+    steps : mapping of int to int, optional
+        Steps of each force group in a step of the integrator, as for `LangevinRespa`.
+    spheres : {'split', 'axes', 'cluster'}
+        'split': one sphere for the center of mass of each cluster and one for the motion about it; 'axes': one for each
+        of x, y and z of the center of mass; 'cluster': one for each cluster.
+    auxiliary : int
+        Auxiliary variables on each sphere.
+    order, substeps, slow_kicks
+        As for `kcons.thermostats.IsokineticSpheres`.
+
+    Raises
+    ------
+    InputError
+        Temperature or friction not positive, unknown words, a sphere of radius 0.
+    UnsupportedError
+        Without ``device=True``: no program of a CustomIntegrator has sums over molecules.
+
+    Notes
+    -----
+    The kinetic energy says nothing of the temperature; `computeSystemTemperature` takes that into account.
+
+    References
+    ----------
+    Leimkuhler, Margul and Tuckerman, Mol. Phys. 111, 3579 (2013).
+    """
+
+    temperature: float
+    friction: float
+    spheres: Literal["split", "axes", "cluster"]
+    auxiliary: int
+
+    def __init__(
+        self,
+        temperature: unit.Quantity | float,
+        friction: unit.Quantity | float,
+        steps: Mapping[int, int] | None = None,
+        *,
+        spheres: Literal["split", "axes", "cluster"] = "split",
+        auxiliary: int = 1,
+        order: int = 2,
+        substeps: int = 3,
+        slow_kicks: Literal["ends", "middle"] = "ends",
+    ) -> None:
+        kelvin = positive(kelvins(temperature), "temperature")
+        gamma = number(friction, unit.picosecond**-1, "friction")
+        if spheres == "global":
+            raise UnsupportedError(
+                "spheres='global' needs sums over all particles; choose 'split', 'axes' or 'cluster'"
+            )
+        levels = None if steps is None else {str(group): count for group, count in steps.items()}
+        made = {"spheres": spheres, "auxiliary": auxiliary, "order": order, "substeps": substeps}
+        bath = OnArrays(1.0, gamma, 0, steps=levels, slow_kicks=slow_kicks, **made)
+        given = None if steps is None else tuple(steps.items())
+        self._keep(temperature=kelvin, friction=gamma, steps=given, slow_kicks=slow_kicks, **made)
+        self._keep(_operations=bath.operations())
+
+    def __repr__(self) -> str:
+        return f"IsokineticSpheres({self.temperature:g} K, {self.friction:g}/ps, spheres={self.spheres!r})"
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for all schemes but 'rattle': the bath has its own."""
+        if scheme is None:
+            refuse_leapfrog(self)
+        elif scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
+            raise UnsupportedError(f"{self!r} has a scheme of its own, see order=; leave out {scheme!r}")
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        found: tuple[Operation, ...] = vars(self)["_operations"]
+        return found
+
+    def declare(self, program: Program) -> None:
+        kT, friction = self.settings().values()
+        program.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
+        program.setting("friction", "1/ps", friction)
+
+    def write(self, step: Step) -> bool:
+        """No program: kernels have the spheres."""
+        if not step.program.on_device:
+            raise UnsupportedError(f"{self!r} is made by kernels: give device=True, or take LangevinRespa")
+        return True
+
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Refuse targets that move."""
+        if any(part.driven for part in integrator.parts):
+            raise UnsupportedError(f"{self!r} needs constant targets; use Langevin")
+
+    def settings(self) -> dict[str, float]:
+        return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}
+
+    def at(self, temperature: float) -> IsokineticSpheres:
+        return self.replaced(temperature=positive(temperature, "temperature"))
+
+    def with_friction(self, friction: float) -> IsokineticSpheres:
+        if not friction > 0:
+            raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
+        return self.replaced(friction=friction)
+
+    def replaced(self, **changes: object) -> IsokineticSpheres:
+        """The same with other arguments."""
+        kept = {name: value for name, value in vars(self).items() if name != "_operations"}
+        kept["steps"] = None if kept["steps"] is None else dict(kept["steps"])
+        return type(self)(**{**kept, **changes})  # type: ignore[arg-type]

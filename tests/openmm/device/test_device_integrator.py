@@ -1,0 +1,355 @@
+"""Steps on the device beside those of the CustomIntegrator, and what OpenMM asks of an integrator."""
+
+import copy
+import pickle
+import threading
+
+import numpy as np
+import openmm
+import pytest
+from device_systems import waters
+from openmm_systems import GPUS, LONG, dumbbell, masses_of, residuals, started, state_of
+
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.openmm import (
+    DeviceIntegrator,
+    HamiltonianMonteCarlo,
+    Isokinetic,
+    Langevin,
+    LangevinRespa,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+)
+from kcons.openmm.device import build
+from kcons.openmm.device.kernels import Op, divided, joined
+
+pytestmark = pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
+PLAIN = ["Reference", "CPU"]
+PLATFORMS = [*PLAIN, *GPUS]
+#: Schemes and ensembles without noise.
+STEPS = {
+    "rattle": ("rattle", None),
+    "geodesic": ("geodesic", None),
+    "suzuki4": ("suzuki4", None),
+    "blanes-moan4": ("blanes-moan4", None),
+    "kahan-li6": ("kahan-li6", None),
+    "blanes-moan6": ("blanes-moan6", None),
+    "Isokinetic": ("rattle", Isokinetic()),
+    "isokinetic4": ("isokinetic4", Isokinetic(300.0)),
+    "NoseHoover": ("rattle", NoseHoover(300.0, 10.0, length=4, repeats=2)),
+    "NoseHooverMiddle": ("rattle", NoseHooverMiddle(300.0, 10.0)),
+    "friction": ("rattle", Langevin(0.0, 5.0)),
+    "several steps": ("rattle", LangevinRespa(0.0, 2.0, {0: 1, 1: 4})),
+}
+
+
+def run(integrator, system, x, v, platform="Reference", calls=(50, 50)):
+    context = started(system, integrator, x, v, platform)
+    for steps in calls:
+        integrator.step(steps)
+    return context
+
+
+def difference(one, other):
+    return max(np.abs(a - b).max() for a, b in zip(state_of(one), state_of(other), strict=True))
+
+
+# -- trajectories -------------------------------------------------------------------------------------
+
+
+def cases():
+    """All on platforms that all have; on others what goes through each kind of kernel, the rest in long runs."""
+    for name in STEPS:
+        yield from (pytest.param(name, platform, id=f"{name}-{platform}") for platform in PLAIN)
+        for given in GPUS:
+            usual = name in ("rattle", "Isokinetic", "NoseHoover") and given.id.endswith(("mixed", "none"))
+            if usual or given.id.endswith("double") or name in ("rattle", "Isokinetic"):
+                marks = [*given.marks, *([] if usual else [LONG])]
+                yield pytest.param(name, *given.values, id=f"{name}-{given.id}", marks=marks)
+
+
+@pytest.mark.parametrize(("name", "platform"), list(cases()))
+def test_trajectories_are_those_of_the_custom_integrator(name, platform):
+    scheme, ensemble = STEPS[name]
+    precision = platform.partition(" ")[2] or "double"
+    system, x, v = waters(groups=name == "several steps")
+    # With a cutoff below the size of atoms, what differs grows fast.
+    calls = (60, 40) if precision == "double" and not (name == "several steps" and platform not in PLAIN) else (6, 4)
+    tolerance = {"double": 1e-13, "mixed": 1e-9, "single": 3e-6}[precision]
+    made = {"scheme": scheme, "ensemble": ensemble, "tolerance": tolerance}
+    contexts = [run(ProjectedIntegrator(0.001, device=d, **made), system, x, v, platform, calls) for d in (True, False)]
+    assert type(contexts[0].getIntegrator()) is DeviceIntegrator
+    (x1, v1), (x2, v2) = (state_of(context) for context in contexts)
+    # OpenMM's solvers leave 1e-8 of the lengths on GPUs, whatever is asked for; chaos multiplies what differs.
+    allowed = 1e-9 if platform in PLAIN[:1] else {"double": 1e-7, "mixed": 1e-6, "single": 1e-4}[precision]
+    assert np.abs(x1 - x2).max() < allowed and np.abs(v1 - v2).max() < 1e3 * allowed
+    assert np.abs(x1 - x).max() > 1e-3 * sum(calls) / 10
+    energies = [context.getState(energy=True).getKineticEnergy()._value for context in contexts]
+    assert energies[0] == pytest.approx(energies[1], rel=1e3 * allowed)
+    assert residuals(system, contexts[0])[0] < 10 * tolerance + (1e-6 if precision == "single" else 1e-11)
+    assert contexts[0].getStepCount() == sum(calls)
+    assert contexts[0].getTime()._value == pytest.approx(sum(calls) * 0.001)
+
+
+def test_what_thermostats_keep():
+    system, x, v = waters()
+    for ensemble in (NoseHoover(300.0, 10.0), Isokinetic(300.0)):
+        made = [ProjectedIntegrator(0.0005, ensemble=ensemble, device=d) for d in (True, False)]
+        contexts = [run(integrator, system, x, v, calls=(20,)) for integrator in made]
+        before = [ensemble.conserved_energy(integrator) for integrator in made]
+        for integrator in made:
+            integrator.step(80)
+        after = [ensemble.conserved_energy(integrator) for integrator in made]
+        assert before[0] == pytest.approx(before[1], abs=1e-4) and after[0] == pytest.approx(after[1], abs=1e-4)
+        assert made[0].listing().split("variables")[0].splitlines()[:4] == made[1].listing().splitlines()[:4]
+        del contexts
+
+
+@pytest.mark.parametrize("platform", PLAIN)
+def test_langevin_has_the_temperature_of_its_bath(platform):
+    """Also in a strong field at high friction, from a start that is in equilibrium."""
+    system = openmm.System()
+    n = 300
+    field = openmm.CustomExternalForce("2000*(x*x+y*y+z*z)")
+    rng = np.random.default_rng(0)
+    x = np.zeros((2 * n, 3))
+    for k in range(n):
+        for mass in (12.0, 1.0):
+            field.addParticle(system.addParticle(mass))
+        system.addConstraint(2 * k, 2 * k + 1, 0.1)
+        u = rng.normal(size=3)
+        x[2 * k + 1] = 0.1 * u / np.linalg.norm(u)
+    system.addForce(field)
+    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 100.0), device=True)
+    integrator.setRandomNumberSeed(5)
+    context = started(system, integrator, x, platform=platform)
+    integrator.setVelocitiesToTemperature(context, 300.0, 3)
+    integrator.step(500)
+    kinetic, centers = [], []
+    for _ in range(200):
+        integrator.step(10)
+        kinetic.append(integrator.computeSystemTemperature()._value)
+        # x^2 summed over atoms: U/2000; of a bond, 2 k (2 R^2 + d^2/2) about its middle R.
+        x = state_of(context)[0]
+        centers.append(4000 * np.square((x[::2] + x[1::2]) / 2).sum() * 2 / (3 * n * 8.314462618e-3))
+    for values, error in ((kinetic, 1.5), (centers, 4.0)):
+        assert np.mean(values) == pytest.approx(300.0, abs=error)
+
+
+def test_noise_belongs_to_particle_and_step():
+    """Other seeds give other runs; the same seed the same, however steps are divided into calls."""
+    system, x, v = dumbbell()
+    runs = []
+    for seed, calls, platform in ((1, (9,), "Reference"), (1, (4, 5), "Reference"), (1, (9,), "CPU"), (2, (9,), "CPU")):
+        integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 20.0), device=True)
+        integrator.setRandomNumberSeed(seed)
+        runs.append(state_of(run(integrator, system, x, v, platform, calls))[0])
+    assert np.abs(runs[0] - runs[1]).max() < 1e-12
+    assert np.abs(runs[0] - runs[2]).max() < 1e-6
+    assert np.abs(runs[2] - runs[3]).max() > 1e-4
+
+
+# -- operations -----------------------------------------------------------------------------------------
+
+
+def test_operations_are_joined_where_nobody_looks():
+    kick, fly = Op("kick", 0.5), Op("fly", 1.0, "", (1.0,), (1.0,))
+    verlet = [kick, fly, Op("evaluate"), kick, Op("project", ends=(1.0,))]
+    head, middle, tail = divided(verlet, noisy=False)
+    assert [(op.verb, op.share) for op in middle] == [("kick", 1.0), ("fly", 1.0), ("evaluate", 0.0)]
+    assert [op.verb for op in head] == ["kick", "fly", "evaluate"] and [op.verb for op in tail] == ["kick", "project"]
+    assert tail[0].begun == -1 and divided(verlet, noisy=True)[2][0].verb == "note"
+    apart = joined([Op("kick", 0.5, "0"), Op("kick", 0.5, "1")])
+    assert [op.group for op in apart] == ["0", "1"]
+    turns = [Op("turn", 0.5), Op("project"), Op("turn", 0.5)]
+    assert [(op.verb, op.share) for op in joined(turns)] == [("turn", 1.0)]
+    with pytest.raises(UnsupportedError, match="leapfrog"):
+        divided([kick, fly], noisy=False)
+
+
+# -- OpenMM's bookkeeping ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", PLAIN)
+@pytest.mark.parametrize("ensemble", [Langevin(300.0, 5.0), NoseHoover(300.0, 10.0)], ids=["noise", "chain"])
+def test_checkpoints_and_states_continue_bit_for_bit(ensemble, platform):
+    system, x, v = waters()
+    integrator = ProjectedIntegrator(0.001, ensemble=ensemble, device=True)
+    integrator.setRandomNumberSeed(3)
+    context = run(integrator, system, x, v, platform, (7,))
+    checkpoint = context.createCheckpoint()
+    state = context.getState(positions=True, velocities=True, parameters=True, integratorParameters=True)
+    kinetic = context.getState(energy=True).getKineticEnergy()
+    integrator.step(7)
+    ahead = state_of(context)
+    context.loadCheckpoint(checkpoint)
+    assert context.getState(energy=True).getKineticEnergy() == kinetic
+    integrator.step(7)
+    # The CPU platform adds up forces in the order of its neighbor list, which a checkpoint does not have.
+    allowed = 0 if platform == "Reference" else 1e-5
+    assert max(np.abs(a - b).max() for a, b in zip(ahead, state_of(context), strict=True)) <= allowed
+    other = copy.copy(integrator)
+    second = started(system, other, x, platform=platform)
+    second.setState(openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(state)))
+    other.step(7)
+    assert max(np.abs(a - b).max() for a, b in zip(ahead, state_of(second), strict=True)) <= allowed + 1e-13
+
+
+def test_settings_change_what_is_done():
+    system, x, v = waters()
+    made = [ProjectedIntegrator(0.001, ensemble=NoseHoover(300.0, 10.0), device=d) for d in (True, False)]
+    contexts = [run(integrator, system, x, v, calls=(5,)) for integrator in made]
+    for integrator in made:
+        integrator.setTemperature(900.0)
+        integrator.setStepSize(0.0005)
+        integrator.step(20)
+        assert integrator.getTemperature()._value == 900.0 and integrator.getGlobalVariableByName("link1") != 0
+    assert difference(*contexts) < 1e-8
+    assert contexts[0].getTime()._value == pytest.approx(0.015)
+    with pytest.raises(UnsupportedError, match="setTemperature"):
+        made[0].setGlobalVariableByName("kT", 1.0)
+    made[0].setGlobalVariableByName("link1", 0.25)
+    assert made[0].getGlobalVariableByName("link1") == 0.25
+    with pytest.raises(UnsupportedError, match="force groups"):
+        made[0].setIntegrationForceGroups({0})
+
+
+def test_others_move_positions_and_velocities():
+    system, x, v = waters()
+    made = [ProjectedIntegrator(0.001, device=d) for d in (True, False)]
+    contexts = [run(integrator, system, x, v, calls=(5,)) for integrator in made]
+    for context, integrator in zip(contexts, made, strict=True):
+        context.setPositions(state_of(context)[0] + 0.05)
+        context.setVelocities(-v)
+        context.getState(energy=True, forces=True, groups={0})
+        integrator.step(5)
+    assert difference(*contexts) < 1e-8
+
+
+@pytest.mark.parametrize("platform", PLAIN)
+def test_barostats_and_removers_act_on_whole_velocities(platform):
+    system, x, v = waters(27)
+    system.addForce(openmm.MonteCarloBarostat(2000.0, 300.0, 2))
+    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 5.0), device=True)
+    context = run(integrator, system, x, v, platform, (60,))
+    assert abs(context.getState().getPeriodicBoxVolume()._value / 0.93**3 - 1) > 1e-4
+    assert residuals(system, context)[0] < 1e-9
+    system, x, v = waters()
+    system.addForce(openmm.CMMotionRemover(1))
+    integrator = ProjectedIntegrator(0.001, device=True)
+    context = run(integrator, system, x, v + 0.3, platform, (3,))
+    masses = masses_of(system)
+    assert np.abs(masses @ state_of(context)[1]).max() / masses.sum() < 1e-8  # forces of single numbers on the CPU
+
+
+def test_virtual_sites_follow():
+    system, x, v = dumbbell()
+    system.addParticle(0.0)
+    system.setVirtualSite(2, openmm.TwoParticleAverageSite(0, 1, 0.3, 0.7))
+    system.getForce(0).addParticle(2, [])
+    x, v = np.vstack([x, 0.3 * x[:1] + 0.7 * x[1:]]), np.vstack([v, np.zeros((1, 3))])
+    contexts = [run(ProjectedIntegrator(0.001, device=d), system, x, v, calls=(30,)) for d in (True, False)]
+    assert difference(*contexts) < 1e-10
+
+
+def test_compound_integrators_run_it():
+    system, x, v = waters()
+    compound = openmm.CompoundIntegrator()
+    member = ProjectedIntegrator(0.001, device=True)
+    compound.addIntegrator(member)
+    compound.addIntegrator(openmm.VerletIntegrator(0.001))
+    context = started(system, compound, x, v)
+    alone = run(ProjectedIntegrator(0.001, device=True), system, x, v, calls=(10,))
+    compound.step(10)
+    assert difference(context, alone) < 1e-8  # each step ends there, so that tolerances come in more often
+    compound.setCurrentIntegrator(1)
+    compound.step(2)
+    compound.setCurrentIntegrator(0)
+    compound.step(2)
+    assert residuals(system, context)[0] < 1e-9
+
+
+def test_reinitialize_and_texts_and_copies():
+    system, x, v = waters()
+    integrator = ProjectedIntegrator(0.001, ensemble=NoseHoover(300.0, 10.0), device=True)
+    context = run(integrator, system, x, v, calls=(5,))
+    link = integrator.getGlobalVariableByName("link1")
+    context.reinitialize(preserveState=True)
+    assert integrator.getGlobalVariableByName("link1") == link != 0
+    integrator.step(5)
+    expected = run(ProjectedIntegrator(0.001, ensemble=NoseHoover(300.0, 10.0), device=True), system, x, v, calls=(10,))
+    assert difference(context, expected) < 1e-11
+    text = openmm.XmlSerializer.serialize(integrator)
+    assert openmm.XmlSerializer.serialize(openmm.XmlSerializer.deserialize(text)) == text
+    again = DeviceIntegrator.from_xml(text, ensemble=NoseHoover(300.0, 10.0))
+    for other in (copy.copy(integrator), pickle.loads(pickle.dumps(integrator)), again):
+        assert type(other) is DeviceIntegrator and other.getStepSize() == integrator.getStepSize()
+        assert other.getConstraintTolerance() == integrator.getConstraintTolerance()
+        assert difference(run(other, system, x, v, calls=(10,)), expected) < 1e-11
+    plain = openmm.XmlSerializer.deserialize(text)  # without Python's checks
+    context = started(system, plain, x, v)
+    plain.step(10)
+    assert difference(context, expected) < 1e-11
+
+
+def test_several_contexts_and_threads():
+    system, x, v = waters()
+    made = [ProjectedIntegrator(0.001, ensemble=Isokinetic(), device=True) for _ in range(2)]
+    contexts = [started(system, integrator, x, v) for integrator in made]
+    threads = [threading.Thread(target=integrator.step, args=(30,)) for integrator in made]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert difference(*contexts) == 0 and contexts[0].getStepCount() == 30
+    with pytest.raises(openmm.OpenMMException, match="already bound"):
+        openmm.Context(system, made[0], openmm.Platform.getPlatformByName("Reference"))
+    del contexts
+    with pytest.raises(UnsupportedError, match="no Context"):
+        made[0].step(1)
+
+
+# -- what goes wrong --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_rows_without_solution_are_told_and_taken_back(platform):
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(0.001, device=True)
+    context = run(integrator, system, x, v, platform, (10,))
+    integrator.check()
+    before = state_of(context)
+    context.setVelocities(before[1] * np.array([[1.0], [1.0]]) + np.array([[0.0, 300.0, 0.0], [0.0, -300.0, 0.0]]))
+    with pytest.raises((ConvergenceError, InputError)) as told:
+        integrator.step(5)
+    assert told.value.row == 0 and told.value.step is not None
+    assert np.isfinite(state_of(context)[0]).all() and residuals(system, context)[0] < 1e-5
+    context.setPositions(before[0])
+    context.setVelocities(before[1])
+    integrator.step(3)  # a failure leaves nothing behind
+
+
+def test_explosions_are_told():
+    system, x, v = waters()
+    integrator = ProjectedIntegrator(0.2 * openmm.unit.picosecond, device=True, tolerance=1e-6)
+    context = started(system, integrator, x, v)
+    with pytest.raises((ConvergenceError, NonFiniteError)):
+        integrator.step(50)
+    assert np.isfinite(state_of(context)[0]).all() and context.getStepCount() == 0
+
+
+def test_what_the_device_has_not_is_refused_or_left_to_the_custom_integrator(monkeypatch):
+    for made in (
+        {"scheme": "leapfrog"},
+        {"ensemble": Isokinetic(300.0, atoms=[0, 1])},
+    ):
+        with pytest.raises(UnsupportedError, match="device"):
+            ProjectedIntegrator(0.001, device=True, **made)
+        assert type(ProjectedIntegrator(0.001, device=None, **made)) is ProjectedIntegrator
+    assert type(ProjectedIntegrator(0.001, device=False)) is ProjectedIntegrator
+    assert issubclass(HamiltonianMonteCarlo, object)
+    monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
+    with pytest.raises(UnsupportedError, match="no C\\+\\+ compiler"):
+        ProjectedIntegrator(0.001, device=True)
+    assert type(ProjectedIntegrator(0.001, device=None)) is ProjectedIntegrator

@@ -1,0 +1,153 @@
+"""Isokinetic spheres of molecules on the device, beside those on arrays."""
+
+import numpy as np
+import openmm
+import pytest
+from device_systems import waters
+from openmm_systems import masses_of, started, state_of
+
+from kcons import ConstraintSet, Motion, System, run
+from kcons.constraints import Distance
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import IsokineticSpheres, ProjectedIntegrator
+from kcons.openmm.device import build
+from kcons.openmm.device.kernels import Shape
+from kcons.openmm.quantities import GAS_CONSTANT
+from kcons.steppers import State
+from kcons.thermostats import IsokineticSpheres as OnArrays
+
+pytestmark = pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
+#: Next to none: the noise of both is another.
+NO_BATH = 1e-18
+
+
+def system_of(groups=False):
+    """Waters, a free atom and a dumbbell in a field, and the constraints as kcons has them."""
+    system, x, v = waters()
+    system.removeForce(0)
+    for mass in (40.0, 14.0, 14.0):
+        system.addParticle(mass)
+    n = system.getNumParticles()
+    system.addConstraint(n - 2, n - 1, 0.125)
+    x = np.vstack([x, [[0.9, 0.8, 0.7], [0.9, 0.2, 0.1], [0.9, 0.325, 0.1]]])
+    v = np.vstack([v, [[0.2, -0.3, 0.1], [0.4, 0.1, -0.2], [-0.3, 0.1, 0.3]]])
+    texts = ["400*(x*x+1.2*y*y+0.8*z*z)", "60*sin(20*x)*cos(17*y+11*z)"]
+    for group, text in enumerate(texts if groups else ["+".join(texts)]):
+        field = openmm.CustomExternalForce(text)
+        for k in range(n):
+            field.addParticle(k)
+        field.setForceGroup(group)
+        system.addForce(field)
+    rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    held = Distance([(i, j) for i, j, _ in rows], [d._value for *_, d in rows])
+    return system, x, v, Motion(ConstraintSet(held, x, masses_of(system)), x)
+
+
+def forces(system, groups):
+    context = started(system, openmm.VerletIntegrator(0.001), np.zeros((system.getNumParticles(), 3)))
+
+    def force(x, t):
+        context.setPositions(x.reshape(-1, 3))
+        return np.array(context.getState(forces=True, groups=groups).getForces(asNumpy=True)._value)
+
+    return force
+
+
+def in_order(auxiliary_variables, integrator, layout, auxiliary):
+    """The auxiliary variables of the device in the order of the array version, sphere by sphere.
+
+    On the device they come by kinds of clusters, the spheres of a cluster one after another; single atoms are last.
+    """
+    shapes = [*integrator.rows.shapes, Shape("", np.setdiff1d(np.arange(27), _held(integrator))[:, None])]
+    found, at = np.zeros(auxiliary_variables.size), 0
+    for shape in shapes:
+        for atoms in shape.atoms:
+            spheres = layout.spheres[layout.cluster[atoms[0]]]
+            for sphere in dict.fromkeys(spheres[spheres >= 0].tolist()):
+                here = slice(sphere * auxiliary, (sphere + 1) * auxiliary)
+                found[here] = auxiliary_variables[at : at + auxiliary]
+                at += auxiliary
+    assert at == found.size
+    return found
+
+
+def _held(integrator):
+    return np.concatenate([shape.atoms.ravel() for shape in integrator.rows.shapes])
+
+
+@pytest.mark.parametrize("auxiliary", [0, 1, 2, 4])
+@pytest.mark.parametrize("kind", ["split", "axes", "cluster"])
+def test_trajectories_are_those_on_arrays(kind, auxiliary):
+    if auxiliary == 0 and kind == "axes":
+        with pytest.raises(InputError, match="radius 0"):
+            system, x, v, _ = system_of()
+            integrator = ProjectedIntegrator(
+                0.001, ensemble=IsokineticSpheres(300.0, 1.0, spheres=kind, auxiliary=0), device=True
+            )
+            started(system, integrator, x, v)
+            integrator.step(1)
+        return
+    system, x, v, motion = system_of()
+    made = {"spheres": kind, "auxiliary": auxiliary}
+    integrator = ProjectedIntegrator(
+        0.002, ensemble=IsokineticSpheres(300.0, NO_BATH, **made), device=True, tolerance=1e-13
+    )
+    context = started(system, integrator, x, v)
+    integrator.step(1)
+    here = integrator.read("auxiliary")
+    x1, v1 = state_of(context)
+    integrator.step(20)
+    bath = OnArrays(GAS_CONSTANT * 300.0, NO_BATH, 1, **made)
+    whole = System(motion, forces(system, -1))
+    start = run(whole, whole.initial_state(x1, v1), 1e-12, 1, stepper=bath)
+    layout = bath.layout(whole, x1)
+    known = start.thermostat.copy()
+    here = here[: layout.freedom.size * auxiliary]  # there is one number where there is none
+    known[1 : 1 + here.size] = in_order(here, integrator, layout, auxiliary)
+    begun = State(x1, v1, 0.0, start.forces, 1, thermostat=known)
+    end = run(whole, begun, 0.002, 20, stepper=bath)
+    assert np.abs(state_of(context)[0] - end.positions).max() < 1e-8
+    assert np.abs(state_of(context)[1] - end.velocities).max() < 1e-5
+    assert np.abs(end.positions - x1).max() > 0.005
+
+
+def test_configurations_are_canonical_at_long_steps():
+    """Of dumbbells in a harmonic field, with fast and slow forces apart and a bath."""
+    n, stiffness = 200, 800.0
+    system, x = openmm.System(), np.zeros((2 * n, 3))
+    rng = np.random.default_rng(1)
+    fields = [openmm.CustomExternalForce(f"{share * stiffness}*(x*x+y*y+z*z)") for share in (0.2, 0.8)]
+    for k in range(n):
+        for j in range(2):
+            system.addParticle(12.0)
+            for group, field in enumerate(fields):
+                field.addParticle(2 * k + j)
+                field.setForceGroup(group)
+        system.addConstraint(2 * k, 2 * k + 1, 0.1)
+        u = rng.normal(size=3)
+        x[2 * k + 1] = 0.1 * u / np.linalg.norm(u)
+    for field in fields:
+        system.addForce(field)
+    for kind, auxiliary in (("split", 1), ("axes", 4), ("cluster", 2)):
+        bath = IsokineticSpheres(300.0, 10.0, {0: 1, 1: 2}, spheres=kind, auxiliary=auxiliary)
+        integrator = ProjectedIntegrator(0.006, ensemble=bath, device=True)
+        context = started(system, integrator, x, platform="CPU")
+        integrator.setVelocitiesToTemperature(context, 300.0, 3)
+        integrator.step(300)
+        found = []
+        for _ in range(150):
+            integrator.step(10)
+            now = state_of(context)[0]
+            found.append(4 * stiffness * np.square((now[::2] + now[1::2]) / 2).sum() / (3 * n * GAS_CONSTANT))
+        assert np.mean(found) == pytest.approx(300.0, abs=8.0)
+
+
+def test_what_is_refused():
+    with pytest.raises(UnsupportedError, match="device=True"):
+        ProjectedIntegrator(0.001, ensemble=IsokineticSpheres(300.0, 1.0), device=False)
+    with pytest.raises(UnsupportedError, match="global"):
+        IsokineticSpheres(300.0, 1.0, spheres="global")
+    with pytest.raises(InputError, match="friction"):
+        IsokineticSpheres(300.0, 0.0)
+    with pytest.raises(UnsupportedError, match="scheme of its own"):
+        ProjectedIntegrator(0.001, "suzuki4", ensemble=IsokineticSpheres(300.0, 1.0), device=True)
