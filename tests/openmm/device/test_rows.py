@@ -61,7 +61,7 @@ def test_families_are_held_as_the_engine_holds_them():
     plain, start, w = held(items, x, masses)
     assert sum(len(shape.atoms) for shape in plain.rows.shapes) > 35
     assert {shape.together for shape in plain.rows.shapes} == {False, True}
-    compare(plain, start, w, None, TIME, 0.005)
+    compare(plain, start, w, None, TIME, 0.002)
 
 
 @pytest.mark.parametrize("name", sorted(PYTHON))
