@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+import sys
+from pathlib import Path
 
 from docutils import nodes
 from docutils.parsers.rst import Directive
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import notebooks
 
 from kcons import __version__
 from kcons.cli.main import parser_of_all
@@ -27,8 +33,9 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["results"]
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+exclude_patterns = ["results", "paper", "_notebooks"]
+templates_path = ["_templates"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 suppress_warnings = ["myst.header", "config.cache", "ref.python"]
 # Of one name in several classes the nearest is linked. Docstrings write code between single backquotes.
@@ -69,6 +76,21 @@ def keep_bars(app: object, what: str, name: str, thing: object, options: object,
         lines[k] = "".join(part if part.startswith("`") else part.replace("|", r"\|") for part in parts)
 
 
+def write_notebooks(app: object) -> None:
+    """Tutorials as notebooks, run where KCONS_RUN_NOTEBOOKS is set."""
+    notebooks.write(Path(__file__).parent / "_notebooks", executed=bool(os.environ.get("KCONS_RUN_NOTEBOOKS")))
+
+
+def offer_notebook(app: object, docname: str, source: list[str]) -> None:
+    """Below the title of a tutorial, where it can be had as a notebook."""
+    folder, _, name = docname.rpartition("/")
+    if folder == "tutorials" and name in {page.stem for page in notebooks.pages()}:
+        title, _, rest = source[0].partition("\n")
+        source[0] = f"{title}\n\n{{download}}`This page as a notebook <../_notebooks/{name}.ipynb>`\n{rest}"
+
+
 def setup(app: object) -> None:
     app.connect("autodoc-process-docstring", keep_bars, priority=900)  # type: ignore[attr-defined]
+    app.connect("builder-inited", write_notebooks)  # type: ignore[attr-defined]
+    app.connect("source-read", offer_notebook)  # type: ignore[attr-defined]
     app.add_directive("command-help", CommandHelp)  # type: ignore[attr-defined]

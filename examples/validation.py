@@ -7,7 +7,7 @@ import numpy as np
 import openmm.app
 
 from kcons import ConstraintSet, Motion, State, System, constraints, run, steppers
-from kcons.openmm import ProjectedIntegrator, RattleIntegrator, hold, positions_of, take_constraints, velocities_of
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator, hold, move_constraints, positions_of, velocities_of
 
 
 def check(what, error, bound):
@@ -55,6 +55,6 @@ before = after(RattleIntegrator(0.001), -v, steps=1)
 verlet = after(openmm.VerletIntegrator(0.001), (x - before) / 0.001)  # has velocities half a step behind
 for each in RattleIntegrator(0.001), ProjectedIntegrator(0.001):
     check(f"rigid water, {type(each).__name__}: nm off OpenMM's own", abs(after(each, v) - verlet).max(), 1e-12)
-rows = hold(system, take_constraints(system, keep_water=False), x)  # OpenMM rounds lengths of water to floats
+rows = hold(system, move_constraints(system, keep_water=False), x)  # OpenMM rounds lengths of water to floats
 own = after(ProjectedIntegrator(0.001, parts=[rows]), v)
 check("rigid water, kcons' own solver: nm off OpenMM's own", abs(own - verlet).max(), 1e-7)

@@ -11,6 +11,28 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from typing import Any
 
+__all__ = [
+    "BudgetError",
+    "CalculatorError",
+    "CertificateError",
+    "ConstraintError",
+    "ContradictionError",
+    "ConvergenceError",
+    "ImageError",
+    "InfeasibleError",
+    "InputError",
+    "KconsError",
+    "MissingPackageError",
+    "MissingSettingError",
+    "NonFiniteError",
+    "OccupiedError",
+    "OverdeterminedError",
+    "ReversibilityError",
+    "SingularGeometryError",
+    "UnreadableError",
+    "UnsupportedError",
+]
+
 
 class KconsError(Exception):
     """Root of all errors raised by kcons."""

@@ -54,6 +54,11 @@ def pytest_configure(config: pytest.Config) -> None:
         config.addinivalue_line("filterwarnings", rf"error::{kind}:({'|'.join(OWN)})(\.|$)")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes seconds comes first: workers that take over what others have left then end together."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
     """What was collected stays to the end: no search through all objects has to see it, and searches are few."""
     gc.enable()

@@ -1,7 +1,7 @@
 """Our dynamics class beside ASE's: accuracy, cost, pressure, temperature.
 
 python ase_dynamics.py --quick --out DIR   a few seconds
-python ase_dynamics.py --out DIR           what docs/ase.md shows, minutes
+python ase_dynamics.py --out DIR           what docs/evidence/ase.md shows, minutes
 """
 
 from __future__ import annotations

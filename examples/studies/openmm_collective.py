@@ -1,7 +1,7 @@
 """Collective variables held in OpenMM: what a row costs in water, and what it reaches on a peptide.
 
     python openmm_collective.py --quick --out DIR   a short run
-    python openmm_collective.py --out DIR           2700 atoms, as in docs/openmm_collective.md
+    python openmm_collective.py --out DIR           2700 atoms, as in docs/openmm_constraints.md
 
 Times are processor times of one thread, in runs that take turns; only their ratios mean something.
 """

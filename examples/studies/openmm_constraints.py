@@ -37,8 +37,8 @@ from kcons.openmm import (
     ProjectedIntegrator,
     hold,
     masses_of,
+    move_constraints,
     positions_of,
-    take_constraints,
     velocities_of,
 )
 
@@ -98,7 +98,7 @@ def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, re
     context = context_of(bare, openmm.VerletIntegrator(0.002))
     setup_ccma = time.process_time() - start
     start = time.process_time()
-    rows = take_constraints(openmm.XmlSerializer.clone(bare), keep_water=False)
+    rows = move_constraints(openmm.XmlSerializer.clone(bare), keep_water=False)
     held = ConstraintSet(rows, x, masses)
     motion = Motion(held, x)
     setup = time.process_time() - start
@@ -171,7 +171,7 @@ def setup(name: str, make: Callable[[], tuple[openmm.System, np.ndarray]]) -> di
         context_of(system, ProjectedIntegrator(0.001, parts=[part]))
         moved.append(time.process_time() - start)
         system, x = make()
-        distances = take_constraints(system, keep_water=False)
+        distances = move_constraints(system, keep_water=False)
         start = time.process_time()
         part = CarriedConstraints(system, distances, x)
         part.add_to(system)

@@ -1,7 +1,7 @@
 """Heavy hydrogens at 4 fs in OpenMM: what the integrators sample, what temperature they report, how energy drifts.
 
     python openmm_heavy_hydrogens.py --quick --out DIR   short runs
-    python openmm_heavy_hydrogens.py --out DIR           what docs/openmm_models.md shows, some five minutes
+    python openmm_heavy_hydrogens.py --out DIR           what docs/evidence/openmm.md shows, some five minutes
 
 Alanine dipeptide (amber14, no cutoff) with hydrogens of 3 dalton, each atom in a weak well, so that no momentum is
 conserved; Reference platform, 300 K. Energies of bonds and angles are configurational averages. The reported

@@ -1,7 +1,7 @@
 """OpenMM's platforms and precisions: what kcons costs there, how closely it holds, and how the energy drifts.
 
     python openmm_platforms.py --quick --out DIR         short runs on the CPU
-    python openmm_platforms.py --platform "CUDA mixed" --out DIR   what docs/openmm_platforms.md shows
+    python openmm_platforms.py --platform "CUDA mixed" --out DIR   what docs/evidence/openmm.md shows
     python openmm_platforms.py --platform "OpenCL mixed" --drift 10 --starts 3 --out DIR   of villin in water
 
 Speeds are medians of runs that take turns, relative to openmm.VerletIntegrator at the same tolerance of the

@@ -1,7 +1,7 @@
 """OpenMM with kcons' integrators: what they cost, and what they reach for it.
 
     python openmm_speed.py --quick --out DIR   short runs, a minute
-    python openmm_speed.py --out DIR           what docs/openmm.md shows
+    python openmm_speed.py --out DIR           what docs/evidence/openmm.md shows
 
 Times are medians of processor times, one thread, of runs that take turns, so that a busy machine slows all of them
 alike: only their ratios mean something. Errors are those of positions against a converged trajectory.

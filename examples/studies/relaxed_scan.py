@@ -1,7 +1,7 @@
 """Relaxed torsion scans: the profile of a molecule, and what it costs beside geomeTRIC and Sella.
 
     python relaxed_scan.py --quick --out DIR   seconds: H2O2 by EMT, both ways
-    python relaxed_scan.py --out DIR           minutes: 20 molecules by GFN2-xTB, what docs/scans.md shows
+    python relaxed_scan.py --out DIR           minutes: 20 molecules by GFN2-xTB, for docs/evidence/free_energy.md
 
 In full (needs tblite, geometric and sella, from the package index) every torsion is scanned at 24 values. Each of
 the three programs relaxes each point from the same structure, that of the neighboring point with the group beyond the

@@ -33,16 +33,15 @@ from hard_cases.programs import Core, PlainAse, PlainOpenMM  # noqa: E402
 from hard_cases.small_systems import SYSTEMS  # noqa: E402
 
 from kcons import ConstraintSet, Motion, State, System, steppers  # noqa: E402
+from kcons.comparison.projected_equation import ProjectedEquation  # noqa: E402
 from kcons.constraints import Constraint, Distance, FixedAtoms  # noqa: E402
 from kcons.steppers import Stepper  # noqa: E402
 
-_NAMES = (
-    *("Rattle", "Geodesic", "Suzuki4", "Yoshida4", "BlanesMoan4", "KahanLi6", "BlanesMoan6", "BlanesMoan6a"),
-    *("ProjectedVerlet", "ProjectedRungeKutta4"),
-)
+_NAMES = ("Rattle", "Geodesic", "Suzuki4", "Yoshida4", "BlanesMoan4", "KahanLi6", "BlanesMoan6", "BlanesMoan6a")
 STEPPERS: Mapping[str, Callable[[], Stepper]] = {
-    name: partial(getattr(steppers, name), **({"project": True} if name.startswith("Projected") else {}))
-    for name in _NAMES
+    **{name: getattr(steppers, name) for name in _NAMES},
+    "ProjectedVerlet": partial(ProjectedEquation, 2, project=True),
+    "ProjectedRungeKutta4": partial(ProjectedEquation, 4, project=True),
 }
 PEERS: dict[str, Callable[[], Program]] = {"ASE": PlainAse, "OpenMM": PlainOpenMM}
 METHODS = (*STEPPERS, *PEERS)

@@ -1,7 +1,7 @@
 """What a step at constant kinetic energy costs in ASE, beside one at constant energy.
 
     python thermostat_cost.py --quick --out DIR   a few seconds
-    python thermostat_cost.py --out DIR           a minute, what docs/thermostats.md shows
+    python thermostat_cost.py --out DIR           a minute, what docs/evidence/ase.md shows
 
 Small fluids with forces from compiled code and nothing else in the calculator, so that what the
 dynamics takes is not hidden. CPU time of this thread, in blocks of steps taken in turn in one process; medians.

@@ -17,7 +17,7 @@ from ase import Atoms
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -84,7 +84,7 @@ class Binding:
             self.motion.set_cell(cell, atoms.pbc, atoms.arrays["positions"])
             self.cell = content
 
-    def taken(self, values: NDArray[Any], what: str) -> FloatArray:
+    def kernel_array(self, values: NDArray[Any], what: str) -> FloatArray:
         """The array itself where kernels can write to it, else a copy; refused where the engine would not see it.
 
         That are integers, and numbers of atoms that no row holds and that are not finite.
@@ -265,7 +265,7 @@ def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def applied_forces(atoms: Atoms) -> FloatArray:
     """Forces of the calculator and of ASE objects that only add forces; a copy."""
-    forces = np.array(numbers(atoms.get_forces(apply_constraint=False), "forces of the calculator"))
+    forces = np.array(as_float_array(atoms.get_forces(apply_constraint=False), "forces of the calculator"))
     if forces.shape == (len(atoms), 3):  # otherwise whoever asked complains
         for item in atoms.constraints:
             if isinstance(item, FORCES_ONLY):

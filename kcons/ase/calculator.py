@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.respect import VOIGT, refuse_taken_along
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import as_float_array
 from kcons.thermostats.pressure import constraint_virial
 
 #: Residual, in units of what double precision can reach, up to which positions are taken as they are.
@@ -121,11 +121,11 @@ class ConstrainedCalculator(Calculator):
             if name not in results and name in known and not self.inner.calculation_required(work, [name]):
                 results[name] = known[name]
         if "forces" in results:
-            forces = np.array(numbers(results["forces"], "forces of the calculator"))
+            forces = np.array(as_float_array(results["forces"], "forces of the calculator"))
             results["forces"] = forces.copy()
             self.constraints.adjust_forces(work, results["forces"])
             if "stress" in results:
-                stress = np.array(numbers(results["stress"], "stress of the calculator"))
+                stress = np.array(as_float_array(results["stress"], "stress of the calculator"))
                 if stress.shape == (3, 3):
                     stress = stress[VOIGT]
                 virial = constraint_virial(motion, x, np.zeros_like(x), forces)

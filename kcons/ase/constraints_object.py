@@ -29,7 +29,7 @@ from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions,
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import as_float_array, checked
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
@@ -77,6 +77,7 @@ class Constraints(FixConstraint):
     velocities from the difference of positions, which loses accuracy far from the origin.
     """
 
+    @checked
     def __init__(
         self,
         constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = (),
@@ -85,8 +86,6 @@ class Constraints(FixConstraint):
         repeated: tuple[Sequence[int], int] | None = None,
     ) -> None:
         self.constraints = listed(constraints)
-        if degenerate not in ("convert", "raise"):
-            raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         self.degenerate = degenerate
         self._repeated: tuple[tuple[int, int, int], int] | None = None
         if repeated is not None:
@@ -175,7 +174,7 @@ class Constraints(FixConstraint):
             They were moved along with the cell, where a row holds them in space.
         """
         bound, accepted = self._bound(atoms), self._accepted
-        x = bound.taken(new, "position")
+        x = bound.kernel_array(new, "position")
         motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
         if accepted.in_another(cell):
             accepted.refuse_taken_along(motion, old, cell)
@@ -239,7 +238,7 @@ class Constraints(FixConstraint):
             They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
         """
         bound, accepted = self._bound(atoms), self._accepted
-        p = bound.taken(momenta, "momentum")
+        p = bound.kernel_array(momenta, "momentum")
         accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
         accepted.note_momenta()
         due = self._momenta_due <= 0
@@ -264,13 +263,13 @@ class Constraints(FixConstraint):
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
         bound = self._binding
         if bound is not None and bound.fits(atoms):
-            new = numbers(cell, "cell")
+            new = as_float_array(cell, "cell")
             (bound if bound.serves(self, new) else self._bind(atoms, bind)).follow_cell(atoms, new)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
         bound, accepted = self._bound(atoms), self._accepted
-        f = bound.taken(forces, "force")
+        f = bound.kernel_array(forces, "force")
         _project(bound, atoms.arrays["positions"], f, "force")
         if f is not forces:
             np.copyto(forces, f, casting="unsafe")
@@ -449,13 +448,7 @@ def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
-    """Constraints, those that are given as plain data made anew.
-
-    Raises
-    ------
-    InputError
-        What is no constraint of kcons.
-    """
+    """Constraints, those that are given as plain data made anew."""
     given: Iterable[Any] = (constraints,)
     if isinstance(constraints, Iterable) and not isinstance(constraints, str):
         given = constraints
@@ -562,6 +555,7 @@ def constrain(
     return held
 
 
+@checked
 def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] = "raise") -> list[FixConstraint]:
     """Objects of ASE that hold what the constraints of kcons on `atoms` hold, for programs that know ASE's alone.
 
@@ -586,8 +580,6 @@ def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] =
         Such rows, named.
     """
     require_atoms(atoms)
-    if missing not in ("raise", "leave out"):
-        raise InputError(f"missing must be 'raise' or 'leave out', not {missing!r}", item="missing")
     result: list[FixConstraint] = []
     for item in atoms.constraints:
         if not isinstance(item, Constraints):

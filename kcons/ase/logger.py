@@ -43,11 +43,6 @@ class ConstraintLogger(MDLogger):
     **kwargs
         As for `ase.md.MDLogger`: header, stress, peratom, mode.
 
-    Raises
-    ------
-    InputError
-        A coordinate that is not held; no constraints of kcons.
-
     Examples
     --------
     ``dynamics.attach(ConstraintLogger(dynamics, atoms, "md.log", {"torsion": torsion}), interval=10)``

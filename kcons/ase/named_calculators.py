@@ -28,12 +28,7 @@ LISTED = ("gfn2", "gfn1", *_FULLY_LISTED, "eam", "tip3p", "tip4p")
 
 
 def refuse_unlisted(name: str, modules: Collection[str]) -> None:
-    """Refuse a calculator that a file names, unless it is listed or of one of these modules; nothing is imported.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a calculator that a file names, unless it is listed or of one of these modules; nothing is imported."""
     if name in LISTED:
         return
     module, _, attribute = name.partition(":") if ":" in name else (f"ase.calculators.{name}", "", name)

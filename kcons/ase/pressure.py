@@ -23,13 +23,7 @@ _BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, wh
 
 
 class AtomsSystem(CellSystem):
-    """Constraints, forces and energy of a dynamics object, whose atoms have the cell that changes.
-
-    Raises
-    ------
-    InputError
-        The cell is not periodic.
-    """
+    """Constraints, forces and energy of a dynamics object, whose atoms have the cell that changes."""
 
     def __init__(self, dynamics: ConstrainedDynamics, motion: Motion) -> None:
         self.atoms = dynamics.atoms

@@ -256,10 +256,6 @@ def refuse_taken_along(
 
     So do the cell filters of ASE, while the row puts the atoms back: forces of the filter would not be the derivative
     of its energy.
-
-    Raises
-    ------
-    UnsupportedError
     """
     held = motion.constraint_set
     if all(item.translation_invariant for item in held.constraints) or before.shape != x.shape:

@@ -20,7 +20,7 @@ from kcons.ase.dynamics import ConstrainedDynamics, in_step
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import generator_of, numbers, positive, seed_from
+from kcons.constraints.arguments import Rng, as_float_array, checked, generator_of, positive, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -126,7 +126,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         """Write the state, all it takes to continue to the last bit with `restart=file` (see `State.save`).
 
         A trajectory holds positions and momenta only: the isokinetic thermostat continues from it as well, Langevin
-        with another seed, a Nose-Hoover chain from rest.
+        with another `rng`, a Nose-Hoover chain from rest.
         """
         self.state.save(file)
 
@@ -200,7 +200,7 @@ class IsokineticDynamics(ThermostattedDynamics):
         timestep: float,
         temperature_K: float | None = None,
         *,
-        order: int = 2,
+        order: Literal[2, 4, 6] = 2,
         convention: Convention = "exact",
         indices: ArrayLike | None = None,
         momentum: Momentum = "auto",
@@ -234,18 +234,13 @@ class ConstrainedLangevin(ThermostattedDynamics):
         As for `ConstrainedDynamics`, and `restart` and `barostat`, see `ThermostattedDynamics`.
     friction : float
         In inverse units of ASE's time, for example 0.01/units.fs.
-    rng : int or numpy.random.Generator, optional
-        A seed, or a generator from which one is drawn; None takes one from the operating system. It can be read as
-        `seed`. A run continued from a trajectory needs another seed; with `restart` the noise goes on.
+    rng : int, numpy.random.Generator or None
+        A seed, or what one is drawn from, which `seed` then tells; None takes it from the operating system. A run
+        continued from a trajectory needs another; with `restart` the noise goes on.
     fixcm : bool
         Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
-
-    Raises
-    ------
-    InputError
-        Temperature not positive, friction negative, a negative time step.
     """
 
     def __init__(
@@ -255,14 +250,14 @@ class ConstrainedLangevin(ThermostattedDynamics):
         temperature_K: float,
         friction: float,
         *,
-        rng: int | np.random.Generator | None = None,
+        rng: Rng = None,
         fixcm: bool = False,
         substeps: int = 3,
         **kwargs: Any,
     ) -> None:
         #: Seed of the noise.
         self.seed = seed_from(rng)
-        make = partial(Langevin, friction=friction, seed=self.seed, substeps=substeps, conserve_momentum=fixcm)
+        make = partial(Langevin, friction=friction, rng=self.seed, substeps=substeps, conserve_momentum=fixcm)
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
 
@@ -349,7 +344,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         *,
         stepper: Stepper | None = None,
         keep: float = 0.0,
-        rng: int | np.random.Generator | None = None,
+        rng: Rng = None,
         fixcm: bool = False,
         tolerance: float = 1e-9,
         **kwargs: Any,
@@ -359,7 +354,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         make = partial(
             HamiltonianMonteCarlo,
             steps=steps,
-            seed=self.seed,
+            rng=self.seed,
             stepper=stepper,
             keep=keep,
             conserve_momentum=fixcm,
@@ -447,6 +442,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         Spheres with constraints that move or that hold velocities.
     """
 
+    @checked
     def __init__(
         self,
         atoms: Atoms,
@@ -458,13 +454,11 @@ class MultipleTimeSteps(ThermostattedDynamics):
         friction: float,
         fast_steps: int,
         bath: Literal["langevin", "spheres"] = "langevin",
-        rng: int | np.random.Generator | None = None,
+        rng: Rng = None,
         difference: bool = False,
         **kwargs: Any,
     ) -> None:
         kinds: dict[str, Callable[..., Any]] = {"langevin": LangevinRespa, "spheres": IsokineticSpheres}
-        if bath not in kinds:
-            raise InputError(f"bath is {bath!r}; choose 'langevin' or 'spheres'", item="bath")
         kind = kinds.pop(bath)
         options = {name: kwargs.pop(name) for name in signature(kind).parameters if name in kwargs}
         for name in set(signature(*kinds.values()).parameters) & set(kwargs):
@@ -472,7 +466,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         #: Seed of the noise.
         self.seed = seed_from(rng)
         steps = {"slow": 1, "fast": fast_steps}
-        make = partial(kind, friction=friction, seed=self.seed, steps=steps, **options)
+        make = partial(kind, friction=friction, rng=self.seed, steps=steps, **options)
         make(_thermal(temperature_K))  # what it refuses comes before calculators are called
         self._parts = fast_steps
         if fast is slow:
@@ -504,7 +498,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         def force(x: FloatArray, time: float) -> FloatArray:
             atoms = self.atoms
             atoms.arrays["positions"][...] = x
-            found = np.array(numbers(calculator.get_forces(atoms), "forces of the calculator"))
+            found = np.array(as_float_array(calculator.get_forces(atoms), "forces of the calculator"))
             if others and found.shape == (len(atoms), 3):
                 for item in atoms.constraints:
                     if isinstance(item, FORCES_ONLY):
@@ -568,7 +562,7 @@ def _check_calculator(name: str, calculator: Any, atoms: Atoms) -> None:
     """Refuse what is no calculator of these atoms; it is called once where they are."""
     if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
         raise InputError(f"{name} is {calculator!r}; give an ASE calculator", item=name)
-    forces = numbers(calculator.get_forces(atoms), f"forces of {name}")
+    forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
     known = getattr(calculator, "atoms", None)
     other = isinstance(known, Atoms) and not np.array_equal(known.numbers, atoms.numbers)
     if forces.shape != (len(atoms), 3) or other:
@@ -583,7 +577,7 @@ def _check_calculator(name: str, calculator: Any, atoms: Atoms) -> None:
 def draw_velocities(
     atoms: Atoms,
     temperature_K: float,
-    rng: np.random.Generator | int | None = None,
+    rng: Rng = None,
     *,
     exact: bool = False,
     zero_momentum: bool = False,
@@ -599,8 +593,7 @@ def draw_velocities(
     atoms : ase.Atoms
         On their constraints.
     temperature_K : float
-    rng : numpy.random.Generator or int, optional
-        A generator, or a seed for one; None takes a seed from the operating system.
+    rng : int, numpy.random.Generator or None
     exact : bool
         Scale to 2K = g kT exactly.
     zero_momentum : bool

@@ -140,12 +140,7 @@ def named_rows(atoms: Atoms, name: str) -> HeldRows:
 
 
 def require_atoms(atoms: object) -> None:
-    """Refuse anything else, such as the list that ``ase.io.read`` gives of several frames.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse anything else, such as the list that ``ase.io.read`` gives of several frames."""
     require_kind(atoms, Atoms, "atoms", "an ase.Atoms object, as ase.io.read(file) gives it")
 
 
@@ -165,11 +160,6 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
 
     Atoms with names and residues get the element that the name says, since ASE reads PDB files without a column of
     elements as if 'HG' were mercury; `repair_elements` corrects the atoms themselves.
-
-    Raises
-    ------
-    InputError
-        No `Atoms`; bonds that name atoms which do not exist.
     """
     require_atoms(atoms)
     n = len(atoms)

@@ -66,13 +66,7 @@ def run(chosen: argparse.Namespace) -> int:
 
 
 def _asks_for_averages(chosen: argparse.Namespace) -> bool:
-    """Whether averages are compared, and not trajectories.
-
-    Raises
-    ------
-    InputError
-        Options that are wrong or do not go together.
-    """
+    """Whether averages are compared, and not trajectories."""
     from kcons.comparison import methods
 
     target, forces = chosen.target_error, (chosen.slow, chosen.fast)
@@ -139,7 +133,7 @@ def _averages(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[Any,
     with options["watcher"].piece("building the test system", 1):
         both = [argparse.Namespace(**{**vars(chosen), "forces": name}) for name in (chosen.slow, chosen.fast) if name]
         system, *cheap = [test_system(each, quick=chosen.quick) for each in both or [chosen]]
-    given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt, "seed": chosen.seed}
+    given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt, "rng": chosen.seed}
     table = averages.compare_averages(system, chosen.methods, **given, **options)
     found = ranking.rank(table, "temperature")
     code = ""
@@ -198,7 +192,7 @@ def _expression(chosen: argparse.Namespace) -> str:
     """Python that makes the test system, after `from kcons.comparison import test_systems`."""
     from kcons.comparison import test_systems
 
-    said: dict[str, Any] = {"seed": chosen.seed} if chosen.seed != 1 else {}
+    said: dict[str, Any] = {"rng": chosen.seed} if chosen.seed != 1 else {}
     said |= {"quick": True} if chosen.quick else {}
     said |= molecules(chosen)
     words = [f"{name}={_literal(value)}" for name, value in said.items()]

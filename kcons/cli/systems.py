@@ -74,7 +74,7 @@ def check_name(chosen: argparse.Namespace) -> None:
             item="system",
         )
     if chosen.seed < 0:
-        raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
+        raise InputError(f"--seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 - `machine`, `progress`: where something was measured, and how far it is
 - `test_systems`: the test systems
+- `projected_equation`: the equation of motion without multipliers, to be compared with
 - `runs`, `methods`: everything that runs them
 - `measure`: a test system through methods, a row a method and setting
 - `ranking`, `report`: what follows from the table, and what is shown of it

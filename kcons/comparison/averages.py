@@ -20,7 +20,7 @@ from kcons.comparison.measure import COLUMNS, described, first_line, processor_c
 from kcons.comparison.methods import lines_on_arrays
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import Positive, Rng, checked, positive, seed_from
 from kcons.errors import InputError, did_you_mean
 from kcons.steppers import BlanesMoan4, State, Stepper, System
 from kcons.thermostats import (
@@ -76,7 +76,7 @@ class Setting:
     thermal_energy, step, friction : float
     inner : float
         Longest step of the cheap forces.
-    seed : int
+    rng : int, numpy.random.Generator or None
     """
 
     thermal_energy: float
@@ -182,13 +182,7 @@ USUAL_WITH_CHEAP = ("langevin", "langevin-respa", "langevin-halfway", "spheres",
 
 
 def choose_samplers(names: Iterable[str] | None, cheap: bool = False) -> list[Sampler]:
-    """Samplers by name; the usual ones by default, all of them for 'all'.
-
-    Raises
-    ------
-    InputError
-        Unknown name, or none; one that needs cheap forces where there are none.
-    """
+    """Samplers by name; the usual ones by default, all of them for 'all'."""
     wanted = list((USUAL_WITH_CHEAP if cheap else USUAL) if names is None else names)
     if wanted == ["all"]:
         wanted = [name for name, sampler in SAMPLERS.items() if cheap or not sampler.several]
@@ -210,6 +204,7 @@ def inner_step(system: TestSystem) -> float:
     return sorted(system.time_steps, reverse=True)[:2][-1]
 
 
+@checked
 def compare_averages(
     system: TestSystem,
     methods: Iterable[str] | None = None,
@@ -217,8 +212,8 @@ def compare_averages(
     cheap: TestSystem | None = None,
     steps: Sequence[float] | None = None,
     frictions: Sequence[float] | None = None,
-    budget: float = 20.0,
-    seed: int = 1,
+    budget: Positive = 20.0,
+    rng: Rng = 1,
     done: pd.DataFrame | None = None,
     keep: Callable[[pd.DataFrame], None] | None = None,
     watcher: Watcher | None = None,
@@ -240,7 +235,7 @@ def compare_averages(
         Internal units; 1 in 12.5 and 1 in 50 steps of the cheap forces by default.
     budget : float
         Seconds of processor time for each sampler over all its runs.
-    seed : int
+    rng : int, numpy.random.Generator or None
     done, keep, watcher
         As for `kcons.comparison.compare`.
 
@@ -257,11 +252,9 @@ def compare_averages(
         Unknown sampler; a system without a temperature; other atoms or constraints with the cheap forces; steps,
         frictions or a budget that are not positive.
     """
-    if not budget > 0:
-        raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
     if not system.thermal_energy:
         raise InputError(f"{system.name} has no temperature: compare its trajectories instead", item="criterion")
-    chosen, watching = choose_samplers(methods, cheap is not None), watcher or Watcher()
+    chosen, watching, seed = choose_samplers(methods, cheap is not None), watcher or Watcher(), seed_from(rng)
     if cheap is not None:
         _same_atoms(system, cheap)
     unit, inner = system.units.time_unit, inner_step(system)
@@ -288,7 +281,7 @@ def compare_averages(
     }
 
     def runs(sampler: Sampler) -> list[dict[str, Any]]:
-        options: dict[str, Any] = {"cheap": cheap, "budget": budget / len(planned[sampler.name]), "seed": seed}
+        options: dict[str, Any] = {"cheap": cheap, "budget": budget / len(planned[sampler.name]), "rng": seed}
         found = []
         for step, rate in planned[sampler.name]:
             with watching.piece(f"{sampler.title}, {step / unit:.3g} {system.units.time}", 1):
@@ -315,6 +308,7 @@ def _refuse(system: TestSystem, step: float, friction: float) -> None:
         raise InputError(f"a step of {shown} is too long", item="dt")
 
 
+@checked
 def sample(
     system: TestSystem,
     sampler: Sampler,
@@ -322,9 +316,9 @@ def sample(
     friction: float,
     *,
     cheap: TestSystem | None = None,
-    length: float | None = None,
-    budget: float | None = None,
-    seed: int = 1,
+    length: Positive | None = None,
+    budget: Positive | None = None,
+    rng: Rng = 1,
     watcher: Watcher | None = None,
 ) -> dict[str, Any]:
     """The row of one sampler at one step.
@@ -340,19 +334,11 @@ def sample(
         Time to sample, besides a tenth of it that is left out at the start.
     budget : float, optional
         Instead: seconds of processor time.
-    seed : int
+    rng : int, numpy.random.Generator or None
     watcher : Watcher, optional
-
-    Raises
-    ------
-    InputError
-        Neither or both of `length` and `budget`; a step or friction that is not positive.
     """
-    given = {name: value for name, value in {"length": length, "budget": budget}.items() if value is not None}
-    if len(given) != 1:
+    if (length is None) == (budget is None):
         raise InputError("give either length or budget", item="length")
-    for name, value in given.items():
-        positive(value, name)
     _refuse(system, step, friction)
     row: dict[str, Any] = {
         "method": sampler.name,
@@ -364,7 +350,9 @@ def sample(
         "note": "",
         "rounds": 0,
     }
-    run = _Sampling(system, cheap, sampler, Setting(system.thermal_energy, step, friction, inner_step(system), seed))
+    run = _Sampling(
+        system, cheap, sampler, Setting(system.thermal_energy, step, friction, inner_step(system), seed_from(rng))
+    )
     begun, warm = run.clock(), True
     try:
         while True:
@@ -407,7 +395,7 @@ class _Sampling:
         self.every = 1 if flight else max(1, round(INTERVAL * setting.inner / self.step))
         # Looked at with forces of its own, which count for nobody.
         watched = System(system.motion, lambda x, t: system.potential.watched(x)[1])
-        self.split, self.energies = TemperatureSplit(watched, seed=setting.seed), list[float]()
+        self.split, self.energies = TemperatureSplit(watched, rng=setting.seed), list[float]()
         self.clock = processor_clock(system)
         self.steps, self.seconds, self.before = 0, 0.0, (0, 0)
 

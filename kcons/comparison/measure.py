@@ -25,8 +25,9 @@ from kcons.comparison.progress import Watcher
 from kcons.comparison.runs import Run
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import Potential
+from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.compilation import announcer, clock
-from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.errors import KconsError, UnsupportedError
 from kcons.thermostats.correlated_series import slope
 
 #: A run is observed about so many times.
@@ -73,11 +74,12 @@ class OverBudgetError(Exception):
     """The time is up."""
 
 
+@checked
 def compare(
     system: TestSystem,
     methods: Iterable[str] | None = None,
     *,
-    budget: float = 20.0,
+    budget: Positive = 20.0,
     rounds: int = ROUNDS,
     reference: Reference | None = None,
     done: pd.DataFrame | None = None,
@@ -117,8 +119,6 @@ def compare(
     KconsError
         The reference solution cannot be computed.
     """
-    if not budget > 0:
-        raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
     chosen, watching = choose(methods, system), watcher or Watcher()
     if system.openmm is not None:
         system.openmm.patience = budget

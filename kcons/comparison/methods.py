@@ -17,8 +17,10 @@ import numpy as np
 from scipy.linalg import qr
 
 from kcons import steppers
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.comparison.runs import InAse, InOpenMM, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
+from kcons.constraints.arguments import Count, checked
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, did_you_mean
@@ -36,7 +38,8 @@ Refuses = Callable[[TestSystem], str | None]
 Code = str | Callable[[TestSystem], str]
 
 Kind = Literal["trajectory", "baseline", "thermostat"]
-ENGINES = ("arrays", "ASE", "OpenMM")
+Engine = Literal["arrays", "ASE", "OpenMM"]
+ENGINES = get_args(Engine)
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,14 @@ class Method:
 METHODS: dict[str, Method] = {}
 
 
+@checked
 def add_method(
     name: str,
     start: Start,
     *,
     title: str = "",
-    engine: str = "arrays",
-    force_evaluations: int = 1,
+    engine: Engine = "arrays",
+    force_evaluations: Count = 1,
     adaptive: bool = False,
     kind: Kind = "trajectory",
     usual: bool = True,
@@ -124,18 +128,7 @@ def add_method(
     code : str or callable, optional
         Lines of Python that run it, with $made_by (an expression that makes the test system), $step (or the tolerance),
         $steps and $ps (the step in ps); or a test system to them.
-
-    Raises
-    ------
-    InputError
-        An unknown engine or kind; force evaluations below 1.
     """
-    if engine not in ENGINES:
-        raise InputError(f"engine is {engine!r}; there are {', '.join(ENGINES)}", item="engine")
-    if kind not in get_args(Kind):
-        raise InputError(f"kind is {kind!r}; there are {', '.join(get_args(Kind))}", item="kind")
-    if not (isinstance(force_evaluations, int) and force_evaluations >= 1):
-        raise InputError(f"force_evaluations is {force_evaluations!r}; give 1 or more", item="force_evaluations")
     METHODS[name] = made = Method(
         name, title or name, start, engine, force_evaluations, adaptive, kind, usual, refuses, code
     )
@@ -147,11 +140,6 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
 
     By default the usual ones that can run the test system: of OpenMM alone where its forces are OpenMM's, else all of
     arrays and ASE and the plainest of OpenMM.
-
-    Raises
-    ------
-    InputError
-        Unknown name, or none.
     """
     if names is None:
         usual = [method for method in METHODS.values() if method.usual]
@@ -202,8 +190,6 @@ STEPPERS: dict[str, type[steppers.Stepper]] = {
     "blanes-moan4": steppers.BlanesMoan4,
     "blanes-moan6": steppers.BlanesMoan6,
     "blanes-moan6a": steppers.BlanesMoan6a,
-    "projected-verlet": steppers.ProjectedVerlet,
-    "projected-rk4": steppers.ProjectedRungeKutta4,
 }
 #: Those that run unless methods are named: the plain one, and of each order a composition and a splitting.
 USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
@@ -272,31 +258,31 @@ def _code_of_stepper(stepper: str, system: TestSystem) -> str:
     return lines_on_arrays(f"from kcons.steppers import {stepper}", last)
 
 
-def _without_step(kind: type[steppers.Stepper]) -> Callable[[float], steppers.Stepper]:
-    return lambda dt: kind()
+def _without_step(stepper: steppers.Stepper, dt: float) -> steppers.Stepper:
+    return stepper
 
-
-#: Rate of the feedback of Baumgarte's stepper, in inverse time steps: fast, and well within what is stable.
-FEEDBACK = 0.1
 
 for _name, _kind in STEPPERS.items():
     add_method(
         _name,
-        partial(on_arrays, _without_step(_kind)),
+        partial(on_arrays, partial(_without_step, _kind())),
         title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
         force_evaluations=_kind().force_evaluations,
         usual=_name in USUAL,
         code=partial(_code_of_stepper, _kind.__name__),
     )
-
-
-add_method(
-    "baumgarte",
-    partial(on_arrays, lambda dt: steppers.Baumgarte(rate=FEEDBACK / dt)),
-    title="kcons Baumgarte",
-    force_evaluations=steppers.Baumgarte(rate=1.0).force_evaluations,
-    usual=False,
-)
+for _name, _title, _stepper in (
+    ("projected-verlet", "Verlet", ProjectedEquation(2)),
+    ("projected-rk4", "Runge-Kutta", ProjectedEquation(4)),
+):
+    _run = partial(on_arrays, partial(_without_step, _stepper))
+    add_method(
+        _name,
+        _run,
+        title=f"projected equation, {_title}",
+        force_evaluations=_stepper.force_evaluations,
+        usual=False,
+    )
 
 
 def _extrapolated(system: TestSystem, tolerance: float) -> Run:
@@ -491,10 +477,10 @@ def _engine(system: TestSystem) -> OpenMMEngine:
 
 def only_water(system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.callback_rows.hold import take_constraints
+    from kcons.openmm.callback_rows.hold import move_constraints
 
     engine = _engine(system)
-    return not engine.surfaces and not take_constraints(engine.copy())
+    return not engine.surfaces and not move_constraints(engine.copy())
 
 
 def _in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem, dt: float) -> Run:

@@ -265,11 +265,6 @@ def find_steps(
     -------
     list of dict
         New rows for the table.
-
-    Raises
-    ------
-    InputError
-        A target that is not positive.
     """
     if not (math.isfinite(target) and target > 0):
         raise InputError(f"the target error is {target}; give a positive number", item="target_error")

@@ -16,7 +16,20 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, TypeAlias, get_args, get_type_hints
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +39,9 @@ from kcons.errors import InputError
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 _FLOAT = np.dtype(np.float64)
 #: Kinds of dtype whose values are real numbers: boolean, integers, floating point.
 _REAL = "biuf"
@@ -33,7 +49,7 @@ _REAL = "biuf"
 LARGEST = 1e150
 
 
-def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
+def as_float_array(values: ArrayLike | Any, item: str) -> FloatArray:
     """`values` themselves if they are an array of float64, or a float64 copy of real numbers.
 
     Complex numbers are refused, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities,
@@ -63,7 +79,7 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
     """`values` themselves if the kernels can take them, or a float64 copy of that shape."""
     if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.carray:
         return values
-    array = numbers(values, item)
+    array = as_float_array(values, item)
     if array.shape != shape:
         raise InputError(f"{item} must have shape {shape}, not {array.shape}", item=item)
     # Kernels are compiled for arrays that may be written to; for others Numba would compile them once more.
@@ -72,7 +88,7 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
 
 def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
     """A copy of values for each atom, shape (n_atoms, 3); `InputError` where they are not finite."""
-    array: FloatArray = np.array(numbers(values, item), order="C")
+    array: FloatArray = np.array(as_float_array(values, item), order="C")
     if array.shape != (n_atoms, 3):
         raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
     bad = ~np.isfinite(array).all(axis=1)
@@ -230,7 +246,7 @@ def positive(value: float, item: str) -> float:
 
 def all_positive(values: ArrayLike, item: str) -> FloatArray:
     """Numbers above zero, infinite ones included, as an array of any shape."""
-    array = numbers(values, item)
+    array = as_float_array(values, item)
     if not np.all(array > 0):
         raise InputError(
             f"{item} {array[~(array > 0)].flat[0]:g} is not positive; give numbers above zero",
@@ -241,7 +257,7 @@ def all_positive(values: ArrayLike, item: str) -> FloatArray:
 
 def unit(vectors: ArrayLike, item: str) -> FloatArray:
     """Vectors of length 1 along the given ones, shape (..., 3)."""
-    array, name = numbers(vectors, item), item.rpartition(": ")[2]
+    array, name = as_float_array(vectors, item), item.rpartition(": ")[2]
     if array.ndim == 0 or array.shape[-1] != 3:
         raise InputError(f"{item} must be vectors of three numbers; its shape is {array.shape}", item=name)
     length = np.sqrt(np.einsum("...i,...i->...", array, array))
@@ -263,26 +279,57 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
     return found
 
 
-def seed_number(seed: Any) -> int:
-    """A seed as an int; `InputError` for no whole number from 0 to 2^64 - 1."""
-    return whole_number(seed, "seed", 0, 2**64 - 1)
+def not_negative(value: Any, item: str) -> float:
+    """`value` as a float, which has to be finite and not below zero."""
+    found = finite_number(value, item)
+    if found < 0:
+        raise InputError(f"{item} is {_value_text(value)}; give a number of 0 or more", item=item)
+    return found
 
 
-def seed_from(rng: Any, item: str = "rng") -> int:
-    """A seed: a whole number itself, or one drawn from a generator; from the operating system for None."""
-    if isinstance(rng, int | np.integer):
-        return seed_number(rng)
-    return int(generator_of(rng, item).integers(2**63))
+def share(value: Any, item: str) -> float:
+    """`value` as a float, a part of one: from 0 to less than 1."""
+    found = finite_number(value, item)
+    if not 0 <= found < 1:
+        raise InputError(f"{item} is {_value_text(value)}; give a number from 0 to less than 1", item=item)
+    return found
 
 
-def generator_of(rng: Any, item: str = "rng") -> np.random.Generator:
-    """A generator itself, or one made from a seed; `InputError` for what is neither."""
+def one_of(value: Any, item: str, words: tuple[Any, ...]) -> Any:
+    """`value`, which has to be one of `words`."""
+    if not isinstance(value, str | int | np.integer) or value not in words:
+        *others, last = map(repr, words)
+        raise InputError(f"{item} is {_value_text(value)}; choose {', '.join(others)} or {last}", item=item)
+    return value
+
+
+#: For `checked`.
+Positive: TypeAlias = Annotated[float, positive]
+NotNegative: TypeAlias = Annotated[float, not_negative]
+Finite: TypeAlias = Annotated[float, finite_number]
+Count: TypeAlias = Annotated[int, whole_number]
+FromZero: TypeAlias = Annotated[int, functools.partial(whole_number, least=0)]
+Share: TypeAlias = Annotated[float, share]
+#: What random numbers are drawn from, as in NumPy: a seed, a generator, or the operating system for None.
+Rng: TypeAlias = int | np.random.Generator | None
+
+
+def seed_from(rng: Rng, bits: int = 64) -> int:
+    """A seed: a whole number of so many bits itself, or one drawn from a generator."""
+    if isinstance(rng, int | np.integer) and not 0 <= rng < 2**bits:
+        raise InputError(f"rng is {_value_text(rng)}; give a whole number from 0 to {2**bits - 1}", item="rng")
+    drawn = generator_of(rng)
+    return int(rng if isinstance(rng, int | np.integer) else drawn.integers(2 ** (bits - 1)))
+
+
+def generator_of(rng: Rng) -> np.random.Generator:
+    """A generator itself, or one made from a seed."""
     try:
         return np.random.default_rng(rng)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError):
         raise InputError(
-            f"{item} is {rng!r}; give a whole number from 0 on, a numpy.random.Generator, or None", item=item
-        ) from error
+            f"rng is {_value_text(rng)}; give a whole number from 0 on, a numpy.random.Generator, or None", item="rng"
+        ) from None
 
 
 # -- numbers with units -----------------------------------------------------------------------------
@@ -415,42 +462,62 @@ def plain_target(target: Any, item: str, kind: Kind) -> tuple[Any, bool]:
 # -- arguments looked at by what their annotations say ----------------------------------------------
 
 
+Rule: TypeAlias = Callable[[Any, str], Any]
+
+
+class Rules(NamedTuple):
+    """What an annotation says of an argument: its units, or `NUMBER`; whether None may pass, unseen; rules."""
+
+    kind: Kind
+    optional: bool
+    rules: tuple[Rule, ...]
+
+
 @functools.cache
-def rules_of(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
-    """What ``Annotated`` says of each argument but the first: its `Kind`, `NUMBER` if not said, then its rules."""
-    hints = get_type_hints(function, include_extras=True)
-    found = {}
-    for name in list(inspect.signature(function).parameters)[1:]:
+def rules_of(function: Callable[..., Any]) -> dict[str, Rules]:
+    """What ``Annotated`` and ``Literal`` say of each argument."""
+    hints, found = get_type_hints(function, include_extras=True), {}
+    for name in inspect.signature(function).parameters:
         hint = hints.get(name)
-        said = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)  # or None
-        told: tuple[Any, ...] = getattr(said, "__metadata__", ())
-        found[name] = told if told and isinstance(told[0], Kind) else (NUMBER, *told)
+        kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        given = [kind for kind in kinds if kind is not NoneType]
+        said = next((kind for kind in given if hasattr(kind, "__metadata__")), None)
+        optional = len(given) < len(kinds) or (said is not None and NoneType in get_args(said.__origin__))
+        told: tuple[Any, ...] = () if said is None else said.__metadata__
+        if len(given) == 1 and get_origin(given[0]) is Literal:
+            told = (functools.partial(one_of, words=get_args(given[0])),)
+        kind = next((part for part in told if isinstance(part, Kind)), NUMBER)
+        found[name] = Rules(kind, optional, tuple(part for part in told if callable(part)))
     return found
 
 
-def checked(init: Callable[..., None]) -> Callable[..., None]:
-    """Let the annotations of an ``__init__`` look at its arguments.
+def checked(function: Callable[P, R], *, units: bool = False) -> Callable[P, R]:
+    """Let the annotations of a function look at its arguments.
 
-    Of ``Annotated[type, kind, rule, ...]`` the `Kind` says what units Quantities may have: they become plain numbers,
-    and the object remembers that in its `units`. A rule ``rule(value, item)`` gives what is taken in place of the
-    value, or raises `InputError`; for None it is not asked.
+    A rule ``rule(value, item)`` of ``Annotated[type, kind, rule, ...]`` gives what is taken in place of the value, or
+    raises `InputError`; what is no word of a ``Literal`` is refused.
+
+    With `units`, for an ``__init__``, the `Kind` says what units Quantities may have: they become plain numbers, and
+    the object remembers that in its `units`.
     """
-    signature = inspect.signature(init)
+    signature = inspect.signature(function)
 
-    @functools.wraps(init)
-    def checked_init(self: Any, *args: Any, **kwargs: Any) -> None:
-        bound, remembered = signature.bind(self, *args, **kwargs), False
-        rules = rules_of(init)
-        for name, value in list(bound.arguments.items())[1:]:
-            kind, *asked = rules[name]
-            item = f"{type(self).__name__}: {name}"
-            value, matters = plain_target(value, item, self.held if kind is HELD else kind)
-            remembered |= matters
-            for rule in asked if value is not None else ():
+    @functools.wraps(function)
+    def checked_function(*args: P.args, **kwargs: P.kwargs) -> R:
+        bound, rules, remembered = signature.bind(*args, **kwargs), rules_of(function), False
+        self: Any = args[0] if units else None
+        for name, value in list(bound.arguments.items())[units:]:
+            kind, optional, asked = rules[name]
+            item = f"{type(self).__name__}: {name}" if units else name
+            if units:
+                value, matters = plain_target(value, item, self.held if kind is HELD else kind)
+                remembered |= matters
+            for rule in () if optional and value is None else asked:
                 value = rule(value, item)
             bound.arguments[name] = value
-        init(*bound.args, **bound.kwargs)
+        result = function(*bound.args, **bound.kwargs)
         if remembered:
             self.units = MD_UNITS
+        return result
 
-    return checked_init
+    return checked_function

@@ -27,9 +27,9 @@ from kcons.constraints.arguments import (
     LENGTH,
     MD_UNITS,
     Kind,
+    as_float_array,
     atom_array,
     checked,
-    numbers,
     out_of_range,
     plain_target,
     read_only,
@@ -143,7 +143,7 @@ class Constraint:
         if cls.row is not None and cls.kind is RowKind.INTERPRETED:
             cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
         if "__init__" in cls.__dict__ or cls.__init__ is Constraint.__init__:
-            cls.__init__ = checked(cls.__init__)  # type: ignore[method-assign]
+            cls.__init__ = checked(cls.__init__, units=True)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = read_only(_atom_table(atoms, type(self).__name__, self.row_width))
@@ -156,7 +156,7 @@ class Constraint:
         for name, value in data.items():
             shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
             try:
-                array = np.broadcast_to(numbers(value, f"{self.family}: {name}"), shape)
+                array = np.broadcast_to(as_float_array(value, f"{self.family}: {name}"), shape)
             except InputError:
                 raise
             except ValueError:

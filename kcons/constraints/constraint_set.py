@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import finite_number, numbers, read_only, refuse_other
+from kcons.constraints.arguments import as_float_array, finite_number, read_only, refuse_other
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import Images, find_images, image_error
@@ -31,13 +31,15 @@ class Residuals(NamedTuple):
     """How far positions and velocities are off the rows, and what counts as held, each shape (n_rows,).
 
     `allowed` is for |sigma|: 1e-10 of the scale, or what rounding leaves of far atoms. `rates` is A v - c, `speeds`
-    the sum of what it is made of; both None without velocities. `sizes` is the sum of the gradients' norms.
+    the sum of what it is made of; both None without velocities. `norms` are those of the rows of A, and `sizes` the
+    sums of the gradients' norms over the atoms.
     """
 
     sigma: FloatArray
     allowed: FloatArray
     rates: FloatArray | None
     speeds: FloatArray | None
+    norms: FloatArray
     sizes: FloatArray
 
 
@@ -292,11 +294,13 @@ class ConstraintSet:
         time = finite_number(time, "time")
         x, v = self._positions(x), v if v is None else self._positions(v, "velocities")
         y = self.whole(x)
-        sigma, reach, rates, speeds, sizes = [], [], [], [], []
+        sigma, reach, rates, speeds, norms, sizes = [], [], [], [], [], []
         for c in self.constraints:
             r = self._gather(c, x, y)
             value, gradient = c.value_and_gradient(r, time)
-            size = np.sqrt(np.einsum("kai,kai->ka", gradient, gradient))
+            square = np.einsum("kai,kai->ka", gradient, gradient)
+            size = np.sqrt(square)
+            norms.append(np.sqrt(square.sum(axis=1)))
             sizes.append(size.sum(axis=1))
             sigma.append(nearest_image(value - c.target_at(time), c.period) if c.holonomic else np.zeros(c.n_rows))
             reach.append(np.sum(size * np.linalg.norm(x[c.atoms], axis=2), axis=1))
@@ -306,9 +310,8 @@ class ConstraintSet:
                 rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
                 speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
         allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * joined(reach))
-        if v is None:
-            return Residuals(joined(sigma), allowed, None, None, joined(sizes))
-        return Residuals(joined(sigma), allowed, joined(rates), joined(speeds), joined(sizes))
+        found = [None if v is None else joined(parts) for parts in (rates, speeds)]
+        return Residuals(joined(sigma), allowed, found[0], found[1], joined(norms), joined(sizes))
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -375,7 +378,7 @@ class ConstraintSet:
         return self._rows(lambda c: function(c, self._gather(c, positions, whole), time))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
-        array = numbers(x, item)
+        array = as_float_array(x, item)
         if array.shape != (self.n_atoms, 3):
             raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
         return array
@@ -617,7 +620,7 @@ def joined(pieces: Sequence[FloatArray]) -> FloatArray:
 
 
 def contiguous(values: ArrayLike, item: str) -> FloatArray:
-    return np.ascontiguousarray(numbers(values, item))
+    return np.ascontiguousarray(as_float_array(values, item))
 
 
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy import arctan2, sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANGLE, numbers, read_only
+from kcons.constraints.arguments import ANGLE, as_float_array, read_only
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
@@ -117,7 +117,10 @@ class DistanceDifference(Constraint):
                     f"DistanceDifference: rows 0 and {k} share atoms in different ways; use one object for each",
                     item="pairs",
                 )
-        self.slots, self.weights = found[0][1], tuple(np.atleast_1d(numbers(weights, "weights")).ravel().tolist())
+        self.slots, self.weights = (
+            found[0][1],
+            tuple(np.atleast_1d(as_float_array(weights, "weights")).ravel().tolist()),
+        )
         super().__init__([atoms for atoms, _ in found], target)
 
     def _settle(self) -> None:

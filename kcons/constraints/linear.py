@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import FloatArray, atom_array, atom_column, numbers
+from kcons.constraints.arguments import FloatArray, as_float_array, atom_array, atom_column
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import MovingTarget, Target
 from kcons.errors import InputError
@@ -107,7 +107,7 @@ class LinearRelation(LinearRows):
         base = np.atleast_2d(atom_array(bases, self.family))
         try:
             base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
-            w = np.broadcast_to(numbers(weights, "weights"), base.shape)
+            w = np.broadcast_to(as_float_array(weights, "weights"), base.shape)
         except InputError:
             raise
         except ValueError:
@@ -146,7 +146,7 @@ class FixedAtoms(LinearRows):
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
         column = atom_column(atoms, self.family)
         if not callable(target) and not isinstance(target, MovingTarget | None):
-            place = numbers(target, "target")
+            place = as_float_array(target, "target")
             target = np.tile(place, len(column)) if place.shape == (3,) else place
         super().__init__(
             np.repeat(column, 3, axis=0), target, coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :]

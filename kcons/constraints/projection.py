@@ -12,7 +12,7 @@ B = A L^-T. Written with B+ in place of an inverse, every formula holds
 for dependent rows as well: z, the acceleration and M_par+ are unique, and lambda is the one of least norm.
 
 Equation numbers are those of the notes (G. R. Kneller, Systemes dynamiques); 'corrected' marks the
-lines where their misprints were put right, see docs/notation.md.
+lines where their misprints were put right, see docs/equations.md.
 
 References
 ----------

@@ -19,8 +19,8 @@ from kcons.constraints.arguments import (
     FloatArray,
     Lengths,
     PositiveLengths,
+    as_float_array,
     atom_column,
-    numbers,
     out_of_range,
     read_only,
     unit,
@@ -326,7 +326,7 @@ class Line(LinearRows):
 
 
 def _for_each(vectors: ArrayLike, count: int, name: str) -> FloatArray:
-    array = numbers(vectors, name)
+    array = as_float_array(vectors, name)
     if array.shape not in ((3,), (count, 3)):
         raise InputError(f"{name} has shape {array.shape}; give (3,) or ({count}, 3)", item=name)
     return np.broadcast_to(array, (count, 3))

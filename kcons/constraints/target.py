@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import HELD, check_call, has_units, numbers, out_of_range, positive, read_only
+from kcons.constraints.arguments import HELD, as_float_array, check_call, has_units, out_of_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
 from kcons.errors import InputError
 
@@ -113,7 +113,7 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
 
 
 def _per_row(target: Any, rows: int, when: str = "") -> FloatArray:
-    array = numbers(target, "target")
+    array = as_float_array(target, "target")
     if array.ndim > 1 and array.size == rows:
         array = array.ravel()  # for example (n, 3) for three rows an atom
     if array.ndim > 1 or array.size not in (1, rows):

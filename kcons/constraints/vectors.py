@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from kcons.constraints.arguments import FloatArray
@@ -14,6 +15,12 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def norm(a: FloatArray) -> FloatArray:
     return np.sqrt(dot(a, a))
+
+
+def row_norms(a: sp.csr_array) -> FloatArray:
+    """Lengths of the rows of a matrix, shape (n_rows,)."""
+    lines = np.repeat(np.arange(a.shape[0]), np.diff(a.indptr))
+    return np.sqrt(np.bincount(lines, a.data**2, minlength=a.shape[0]))
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ _NAMES = {
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
-    "profiles.plots": ("plot_profile", "plot_surface", "plot_works"),
+    "profiles.plots": ("plot_profile",),
     "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
     "scans.relaxed_scan": ("scan",),
     "scans.scan_result": ("Scan",),

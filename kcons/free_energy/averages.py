@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from kcons.constraints.arguments import FloatArray, numbers
+from kcons.constraints.arguments import FloatArray, as_float_array
 from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, spread
 
 #: Fewest values that an error is taken from.
-FEWEST = 16
+MIN_SAMPLES = 16
 #: Places from which on a run is tried as equilibrated.
 _ORIGINS = 50
 
@@ -85,7 +85,7 @@ def pymbar() -> ModuleType:
 
 def finite(values: ArrayLike, item: str, row: str = "sample") -> FloatArray:
     """Values as an array; `InputError` naming the first row that is not finite."""
-    array = numbers(values, item)
+    array = as_float_array(values, item)
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         raise InputError(f"{item} of {row} {bad[0, 0] if array.ndim else 0} is not finite; leave it out", item=item)
@@ -191,14 +191,9 @@ def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_cov
     covariance, other_covariance : array_like, shape (d, d) or ()
         Of the means. Where the sum of both is singular, only what has an error counts; a difference in what has none
         has the probability 0. Differences of rounding, 1e-9 of the largest mean, are none.
-
-    Raises
-    ------
-    InputError
-        Shapes that do not go together; a NaN or infinity.
     """
-    arrays = [numbers(values, name) for values, name in ((one, "one"), (other, "other"))]
-    spreads = [numbers(values, "covariance") for values in (covariance, other_covariance)]
+    arrays = [as_float_array(values, name) for values, name in ((one, "one"), (other, "other"))]
+    spreads = [as_float_array(values, "covariance") for values in (covariance, other_covariance)]
     d = arrays[0].size
     if any(a.size != d or a.ndim > 1 for a in arrays) or any(
         c.shape not in ((d, d), ()) or c.size != d * d for c in spreads
@@ -226,9 +221,9 @@ def _checked(
     """Values (n, d) and weights (n,) whose mean is about 1."""
     series = finite(values, "values")
     series = series[:, None] if series.ndim == 1 else series
-    if series.ndim != 2 or len(series) < FEWEST or not series.shape[1]:
+    if series.ndim != 2 or len(series) < MIN_SAMPLES or not series.shape[1]:
         raise InputError(
-            f"values of shape {series.shape} are too few for an error; give (n, d) with n of {FEWEST} or more",
+            f"values of shape {series.shape} are too few for an error; give (n, d) with n of {MIN_SAMPLES} or more",
             item="values",
         )
     if weights is not None and log_weights is not None:
@@ -264,7 +259,7 @@ def _linearized(series: FloatArray, factors: FloatArray) -> FloatArray:
 
 
 def _equilibrated(series: FloatArray) -> int:
-    """The latest place at which one of the columns is found to be equilibrated; at least `FEWEST` samples stay."""
+    """The latest place at which one of the columns is found to be equilibrated; at least `MIN_SAMPLES` samples stay."""
     detect = pymbar().timeseries.detect_equilibration
     skip = max(1, len(series) // _ORIGINS)
-    return min(max(int(detect(u, nskip=skip)[0]) for u in series.T), len(series) - FEWEST)
+    return min(max(int(detect(u, nskip=skip)[0]) for u in series.T), len(series) - MIN_SAMPLES)

@@ -69,13 +69,7 @@ class Sample(NamedTuple):
 
 
 def named(coordinates: Mapping[str, Constraint]) -> dict[str, Constraint]:
-    """Coordinates by name, checked.
-
-    Raises
-    ------
-    InputError
-        No names, or what is no constraint.
-    """
+    """Coordinates by name, checked."""
     if not isinstance(coordinates, Mapping) or not coordinates or not all(isinstance(k, str) for k in coordinates):
         raise InputError(
             "no coordinates are named; give a mapping of names to constraints, such as "

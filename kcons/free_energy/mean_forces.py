@@ -66,11 +66,6 @@ def thermal_multipliers(series: Series, kT: float) -> FloatArray:
     series : Series
     kT : float
         Temperature times Boltzmann's constant, in the energy of the series.
-
-    Raises
-    ------
-    InputError
-        `kT` that is not positive, or g = 1.
     """
     positive(kT, "kT")
     known, g = np.isfinite(series.mean_kinetic), series.isokinetic_degrees_of_freedom
@@ -105,11 +100,6 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
         Temperature times Boltzmann's constant, in the energy of the series.
     discard : int
         Samples of equilibration at the beginning.
-
-    Raises
-    ------
-    InputError
-        Too few samples; coordinates that moved.
 
     References
     ----------

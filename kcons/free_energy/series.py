@@ -231,11 +231,6 @@ class Recorder:
     Attributes
     ----------
     series : Series
-
-    Raises
-    ------
-    InputError
-        `series` is of other coordinates.
     """
 
     def __init__(self, system: System, coordinates: HeldCoordinates, series: Series | None = None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Radau, solve_ivp
 
-from kcons.constraints.arguments import FloatArray, numbers, read_only_view
+from kcons.constraints.arguments import FloatArray, as_float_array, read_only_view
 from kcons.constraints.target import WRONG
 from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 
@@ -141,7 +141,7 @@ def check_run(
         raise InputError(f"t_span is a pair of times, not {t_span!r}", item="t_span") from None
     if not (np.isfinite(t0) and np.isfinite(t1)):
         raise InputError("t_span is not finite", item="t_span")
-    times = None if t_eval is None else numbers(t_eval, "t_eval")
+    times = None if t_eval is None else as_float_array(t_eval, "t_eval")
     if times is not None:
         if times.ndim != 1 or not np.all((times >= min(t0, t1)) & (times <= max(t0, t1))):
             raise InputError("t_eval is one-dimensional and within t_span", item="t_eval")
@@ -150,7 +150,7 @@ def check_run(
     for name, least in (("rtol", LEAST_RTOL), ("atol", 0.0), ("max_step", 0.0), ("first_step", 0.0)):
         if sizes.get(name) is None:
             continue
-        given, step = numbers(sizes[name], name), name.endswith("step")
+        given, step = as_float_array(sizes[name], name), name.endswith("step")
         if given.shape not in ((), () if step else (n,)) or not np.all(given > least if step else given >= least):
             raise InputError(
                 f"{name} is {sizes[name]!r:.60}; give a "
@@ -167,7 +167,7 @@ def called(
 
     It can read arrays among its arguments and not change them.
     """
-    value = numbers(function(*(read_only_view(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
+    value = as_float_array(function(*(read_only_view(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
     if value.shape != shape and not (scalar and value.shape == ()):
         raise InputError(f"{item} returned shape {value.shape}, not {shape}", item=item)
     return np.broadcast_to(value, shape)
@@ -180,7 +180,7 @@ def jacobian_by_differences(
 
     h is `step`, times the size of a variable where that is larger than 1; or an array of one h a variable.
     """
-    X = numbers(X, "X")
+    X = as_float_array(X, "X")
     steps = step if isinstance(step, np.ndarray) else step * np.maximum(1.0, np.abs(X))
     columns = []
     for k, h in enumerate(steps):
@@ -189,7 +189,7 @@ def jacobian_by_differences(
             up, down = X.copy(), X.copy()
             up[k] += part
             down[k] -= part
-            ends = [numbers(velocity(t, read_only_view(at)), "velocity") for at in (up, down)]
+            ends = [as_float_array(velocity(t, read_only_view(at)), "velocity") for at in (up, down)]
             slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
         first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
         columns.append((16 * second - first) / 15)

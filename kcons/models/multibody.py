@@ -24,7 +24,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import lapack
 
-from kcons.constraints.arguments import TAKES_TIME, FloatArray, IntArray, check_call, numbers, positive, read_only_view
+from kcons.constraints.arguments import (
+    TAKES_TIME,
+    FloatArray,
+    IntArray,
+    as_float_array,
+    check_call,
+    positive,
+    read_only_view,
+)
 from kcons.constraints.target import WRONG, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import (
     ConstraintError,
@@ -152,7 +160,7 @@ class Multibody:
             check_call("mass", mass, ("q",))
             self.mass: FloatArray | Callable[..., ArrayLike] = mass
         else:
-            matrix = np.array(numbers(mass, "mass"))
+            matrix = np.array(as_float_array(mass, "mass"))
             self.mass = np.diag(matrix) if matrix.ndim == 1 else matrix
             _check_symmetric(self.mass)
 
@@ -366,7 +374,7 @@ class Multibody:
 
     def _called(self, name: str, shape: tuple[int, ...] | None, *arguments: Any) -> FloatArray:
         """What a function of the user returned, of that shape, by default (m,), and finite; a copy."""
-        array = np.array(numbers(getattr(self, name)(*arguments), name))
+        array = np.array(as_float_array(getattr(self, name)(*arguments), name))
         if shape is None:
             array = np.atleast_1d(array)
             shape = (array.size,) if self.m is None else (self.m,)
@@ -422,7 +430,7 @@ class Multibody:
         """A state as arrays, after all functions were seen to fit it."""
         found = []
         for item, given in (("q", q), ("v", v)):
-            array = numbers(given, item)
+            array = as_float_array(given, item)
             n = np.size(q) if callable(self.mass) else len(self.mass)
             if array.shape != (n,) or n == 0:
                 raise InputError(

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import row_norms
 from kcons.solvers.rank_revealing import independent
 
 #: Largest cluster, in rows, that goes through dense singular values.
@@ -47,12 +48,12 @@ def worst_condition(
     """
     rows = np.sort(rows)
     rows = rows[np.argsort(labels[rows], kind="stable")]
-    weighted = sp.csr_array(jacobian[rows])
-    weighted.data = weighted.data * np.repeat(np.sqrt(inverse_masses), 3)[weighted.indices]
-    norms = np.sqrt(np.asarray(weighted.multiply(weighted).sum(axis=1)).ravel())
+    unit = sp.csr_array(jacobian[rows])
+    unit.data = unit.data * np.repeat(np.sqrt(inverse_masses), 3)[unit.indices]
+    norms = row_norms(unit)
     if not np.all(np.isfinite(norms) & (norms > 0)):
         return float("nan")
-    unit = sp.csr_array(sp.diags_array(1.0 / norms) @ weighted)
+    unit.data *= np.repeat(1.0 / norms, np.diff(unit.indptr))
     first = np.flatnonzero(np.diff(labels[rows], prepend=-1))
     sizes = np.diff(first, append=len(rows))
     worst = 1.0

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_call
+from kcons.constraints.arguments import Positive, as_array, check_call, checked
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
+from kcons.errors import ConvergenceError, KconsError, NonFiniteError
 from kcons.motion.motion import Motion
 
 #: Steps that are remembered for the curvature.
@@ -47,13 +47,14 @@ class Minimum:
         return _largest(self.forces)
 
 
+@checked
 def minimize(
     motion: Motion,
     force: Callable[[FloatArray, float], ArrayLike],
     positions: ArrayLike,
     *,
-    tolerance: float,
-    longest: float,
+    tolerance: Positive,
+    longest: Positive,
     steps: int = 1000,
     time: float = 0.0,
 ) -> Minimum:
@@ -93,9 +94,6 @@ def minimize(
     Nocedal and Wright, Numerical Optimization, ch. 7.2; Absil, Mahony and Sepulchre, Optimization Algorithms on Matrix
     Manifolds, ch. 4 and 8 (retraction and transport by projection).
     """
-    for value, item in ((tolerance, "tolerance"), (longest, "longest")):
-        if not value > 0:
-            raise InputError(f"{item} is {value}; give a positive number", item=item)
     check_call("force", force, ("x", "t"))
     descent = _Descent(motion, force, time)
     x = motion.restore_positions(positions, time=time)

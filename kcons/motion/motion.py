@@ -15,14 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import (
-    as_array,
-    check_out,
-    check_pairs,
-    finite_number,
-    numbers,
-    refuse_other,
-)
+from kcons.constraints.arguments import Finite, as_array, check_out, check_pairs, checked, finite_number, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -77,18 +70,16 @@ class Motion:
     Notes, section 4.1; eqs. 94-107.
     """
 
+    @checked
     def __init__(
         self,
         constraint_set: ConstraintSet,
         positions: ArrayLike,
         *,
         degenerate: Literal["convert", "raise"] = "convert",
-        time: float = 0.0,
+        time: Finite = 0.0,
     ) -> None:
-        if degenerate not in ("convert", "raise"):
-            raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         refuse_other(constraint_set, ConstraintSet, "constraint_set", "a kcons.ConstraintSet")
-        time = finite_number(time, "time")
         self._shape = (constraint_set.n_atoms, 3)
         x = as_array(positions, self._shape, "positions")
         self._given = constraint_set
@@ -416,14 +407,9 @@ class Motion:
 
     # -- accelerations, forces ------------------------------------------------------------------
 
-    def acceleration(
-        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
-    ) -> FloatArray:
-        """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected).
-
-        `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilization).
-        """
-        return self._accelerated(x, v, f, time, feedback)[0]
+    def acceleration(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
+        """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected)."""
+        return self._accelerated(x, v, f, time)[0]
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
@@ -440,13 +426,11 @@ class Motion:
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
-    def respond(
-        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def respond(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """`acceleration` and `multipliers` of one solve."""
         time = finite_number(time, "time")
         mu = np.zeros(self._local.n_rows)
-        a, local_a, local_x, force = self._accelerated(x, v, f, time, feedback, mu)
+        a, local_a, local_x, force = self._accelerated(x, v, f, time, mu)
         lam = self.plan.least_norm(local_x, -mu, time)
         if len(self.plan.pinned):
             # What the fixed atoms' rows supply: M a - f less the other rows' forces.
@@ -464,7 +448,6 @@ class Motion:
         v: ArrayLike,
         f: ArrayLike,
         time: float,
-        feedback: FloatArray | None,
         mu: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Accelerations, those of local atoms, local positions, forces; `mu` receives the solvers' multipliers."""
@@ -479,8 +462,6 @@ class Motion:
         local_a = a if self._atoms is None else a[self._atoms]
         with np.errstate(all="ignore"):
             b = self._local.acceleration_target(local_x, local_v, time)
-            if feedback is not None:
-                b = b + numbers(feedback, "feedback")
         if not np.all(np.isfinite(b)):
             raise self._solve.failures.undefined(int(np.argmin(np.isfinite(b))), velocity=local_v, position=local_x)
         self._solve.tangents(local_x, local_a, b, time, mu, "force")

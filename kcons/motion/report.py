@@ -11,35 +11,26 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.motion.condition import worst_condition
 from kcons.plan.independent_blocks import fixed_atoms
-from kcons.plan.plan import Plan
+from kcons.plan.plan import ClusterKind, Plan
 
 #: Conversions that a printed report names.
 SHOWN = 4
 
 
 @dataclass(frozen=True)
-class KindReport:
+class KindReport(ClusterKind):
     """Clusters of one kind at given positions.
 
     Attributes
     ----------
-    solver : str
-    clusters, rows, rank : int
     condition : float
         Of the worst cluster, see `kcons.motion.condition`; NaN where it was not asked for or is out of reach.
     iterations : int
         Newton iterations of the worst cluster in the last position projection; 0 before the first.
-    example : str
-        Name of one row.
     """
 
-    solver: str
-    clusters: int
-    rows: int
-    rank: int
     condition: float
     iterations: int
-    example: str
 
 
 @dataclass(frozen=True)
@@ -106,17 +97,17 @@ def make_report(
     condition: bool = True,
 ) -> Report:
     """Evaluate the set at `x` (and `v`); `iterations` by solver of the plan."""
-    sigma = np.abs(constraint_set.value(x, time))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = constraint_set.residuals(x, v, time)
+    sigma = np.abs(found.sigma)
     worst = int(np.argmax(sigma / constraint_set.scale)) if len(sigma) else -1
     speed = float("nan")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        jacobian = constraint_set.jacobian(x, time)
-    if v is not None:
-        norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
-        miss = np.abs(jacobian @ v.ravel() - constraint_set.velocity_target(x, time))
-        speed = float(np.max(miss / np.where(norms > 0, norms, 1.0), initial=0.0))
+    if found.rates is not None:
+        speed = float(np.max(np.abs(found.rates) / np.where(found.norms > 0, found.norms, 1.0), initial=0.0))
     conditions = [float("nan")] * len(plan.kinds)
     if condition:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            jacobian = constraint_set.jacobian(x, time)
         movable = np.setdiff1d(constraint_set.touched, fixed_atoms(constraint_set))
         inverse_masses = np.zeros(constraint_set.n_atoms)
         inverse_masses[movable] = 1.0 / constraint_set.masses[movable]
@@ -125,8 +116,8 @@ def make_report(
             for solver, kind in zip(plan.solvers, plan.kinds, strict=True)
         ]
     kinds = [
-        KindReport(k.solver, k.clusters, k.rows, k.rank, found, count, k.example)
-        for k, found, count in zip(plan.kinds, conditions, iterations, strict=True)
+        KindReport(**vars(k), condition=ratio, iterations=count)
+        for k, ratio, count in zip(plan.kinds, conditions, iterations, strict=True)
     ]
     return Report(
         rows=constraint_set.n_rows,

@@ -17,16 +17,14 @@ from kcons.errors import with_extra
 
 try:
     from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-    from kcons.openmm.callback_rows.hold import hold, take_constraints
+    from kcons.openmm.callback_rows.hold import hold, move_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
-    from kcons.openmm.collective.coordinates import Row, each_term
+    from kcons.openmm.collective.coordinates import Row, forces_by_term
     from kcons.openmm.device.device_integrator import DeviceIntegrator
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-    from kcons.openmm.ensembles.langevin_ensemble import Langevin
-    from kcons.openmm.ensembles.molecular_pressure import PressureReporter, molecular_pressure
+    from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-    from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
     from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -35,7 +33,7 @@ try:
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.formulas import ExpressionSurface
+    from kcons.openmm.surfaces.landings import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
@@ -55,19 +53,17 @@ __all__ = [
     "NoseHoover",
     "NoseHooverMiddle",
     "Precision",
-    "PressureReporter",
     "ProjectedIntegrator",
     "RattleIntegrator",
     "Row",
     "SurfaceIntegrator",
     "constraints_of",
-    "each_term",
+    "forces_by_term",
     "hold",
     "masses_of",
-    "molecular_pressure",
+    "move_constraints",
     "positions_of",
     "surface_parts",
-    "take_constraints",
     "velocities_of",
     "worst_length",
 ]

@@ -12,6 +12,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
+from kcons.constraints import FixedAtoms
 from kcons.constraints.arguments import ANY, Unitless, has_units, quantity_text
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
@@ -124,6 +125,19 @@ def masses_of(system: openmm.System) -> FloatArray:
 def held_without_mass(system: openmm.System) -> list[int]:
     """Particles without mass that are no virtual sites: they stay where they are."""
     return [k for k in np.flatnonzero(masses_of(system) == 0).tolist() if not system.isVirtualSite(k)]
+
+
+def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
+    """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
+    if not all(isinstance(item, Constraint) for item in given):
+        return given  # ConstraintSet says what is wrong
+    used = [item.atoms.ravel() for item in given]
+    touched = np.unique(np.concatenate([*used, np.zeros(0, np.int64)]))
+    still = touched[touched < len(masses)]
+    still = still[masses[still] == 0]
+    fixed = [item.atoms.ravel() for item in given if item.fixes_atoms]
+    still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
+    return (*given, FixedAtoms(still)) if len(still) else given
 
 
 T = TypeVar("T")

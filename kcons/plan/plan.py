@@ -30,7 +30,7 @@ DENSE_ROWS = 1500
 
 @dataclass(frozen=True)
 class ClusterKind:
-    """One line of the plan: clusters of the same kind and their solver."""
+    """One line of the plan: clusters of the same kind and their solver; `example` is the name of one row."""
 
     solver: str
     clusters: int

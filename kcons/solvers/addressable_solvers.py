@@ -36,7 +36,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.kernels.aligned_memory import in_one_array
-from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, none_of, piece, view
+from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, none_of, table_array, view
 from kcons.solvers.kernels.lattices import NO_LATTICE, lattice_kind
 from kcons.solvers.kernels.two_and_four_wide import load_double, load_index, store_double
 from kcons.solvers.tolerances import MAX_ROUNDS
@@ -273,7 +273,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     pinned, places = at_piece(u, h, _PINNED), at_piece(t, h, _PLACES)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
         store_double(x, 3 * load_index(pinned, k // 3) + k % 3, load_double(places, k))
-    words, lattice, kind, none = piece(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
+    words, lattice, kind, none = table_array(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
     most = 0
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
@@ -310,7 +310,7 @@ def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     pinned = at_piece(u, h, _PINNED)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
         store_double(v, 3 * load_index(pinned, k // 3) + k % 3, 0.0)
-    words, lattice, kind, none = piece(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
+    words, lattice, kind, none = table_array(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
         if not _call_tangents(words[k + 1], (False, x, v, none, lattice, kind, mine, numbers))[0]:

@@ -13,7 +13,7 @@ from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import Kernels
 from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver
 from kcons.solvers.kernels.aligned_memory import copied, in_one_array, room
-from kcons.solvers.kernels.array_views import at_first, halves, integers, none_of, piece
+from kcons.solvers.kernels.array_views import at_first, halves, integers, none_of, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -124,7 +124,8 @@ def _report(multipliers, slots, place, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz)
 def project_triangles(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
     """Project one group of eight triangles after another; `SimdClusterSolver` says what the arguments are."""
     t, h, u = tables, integers(tables), halves(tables)
-    atoms, slots, inv_mass, undo = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2), piece(t, h, _UNDO)
+    atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
+    inv_mass, undo = table_array(t, h, 2), table_array(t, h, _UNDO)
     move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
     n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
     # Arrays that are handed on inside the loop would cost reference counting.
@@ -222,7 +223,7 @@ def project_triangles(tangent, points, references, velocities, inverse_dt, given
 @njit(cache=True, nogil=True)
 def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """This and the next two as `kcons.solvers.addressable_solvers` says."""
-    sides = wanted if wanted.size else piece(tables, integers(tables), _SIDES)
+    sides = wanted if wanted.size else table_array(tables, integers(tables), _SIDES)
     return project_triangles(None, x, x_ref, v, inv_dt, sides, lattice, kind, none_of(tables), tables)
 
 
@@ -235,8 +236,8 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):
 @njit(cache=True, nogil=True)
 def _undo(points, tangents, velocities, tables):
     h, u = integers(tables), halves(tables)
-    groups, kept, first = piece(u, h, 1).size // WIDTH, 3 if tangents else 6, 3 if velocities else 0
-    restore_points(points, piece(u, h, 0), piece(tables, h, _UNDO), groups, 3, kept, first)
+    groups, kept, first = table_array(u, h, 1).size // WIDTH, 3 if tangents else 6, 3 if velocities else 0
+    restore_points(points, table_array(u, h, 0), table_array(tables, h, _UNDO), groups, 3, kept, first)
 
 
 class RigidTriangles(SimdClusterSolver):

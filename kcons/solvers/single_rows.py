@@ -16,7 +16,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
-from kcons.solvers.kernels.array_views import halves, integers, piece
+from kcons.solvers.kernels.array_views import halves, integers, table_array
 from kcons.solvers.kernels.lattices import OPEN
 from kcons.solvers.kernels.two_and_four_wide import (
     extract,
@@ -155,7 +155,8 @@ def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
 def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
-    links, atoms, pushes, solution = piece(u, h, 0), piece(u, h, 1), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
+    links, atoms = table_array(u, h, 0), table_array(u, h, 1)
+    pushes, solution = table_array(t, h, _PUSHES), table_array(t, h, _SOLUTION)
     for k in range(len(solution)):
         change = factor * load_double(solution, k)
         for p in range(load_index(links, 3 * k), load_index(links, 3 * k + 3)):
@@ -171,11 +172,12 @@ def _positions(  # type: ignore[no-untyped-def]
 ):
     """As `kcons.solvers.addressable_solvers` says; all is careful here."""
     t, h, u = tables, integers(tables), halves(tables)
-    links, atoms, masses, base = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2), piece(t, h, 3)
-    state, scale, pushes, solution = piece(t, h, 4), piece(t, h, 5), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
+    links, atoms, masses, base = table_array(u, h, 0), table_array(u, h, 1), table_array(t, h, 2), table_array(t, h, 3)
+    state, scale = table_array(t, h, 4), table_array(t, h, 5)
+    pushes, solution = table_array(t, h, _PUSHES), table_array(t, h, _SOLUTION)
     if not wanted.size:
-        wanted = piece(t, h, 6)
-    runs, periodic = piece(h, h, _RUNS), kind != OPEN
+        wanted = table_array(t, h, 6)
+    runs, periodic = table_array(h, h, _RUNS), kind != OPEN
     worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     for begin in range(0, len(solution), BLOCK):
         stop = min(begin + BLOCK, len(solution))
@@ -271,9 +273,9 @@ def _positions(  # type: ignore[no-untyped-def]
 def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
-    links, atoms, masses = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2)
-    pushes, solution, driven = piece(t, h, _PUSHES), piece(t, h, _SOLUTION), wanted.size > 0
-    runs, periodic = piece(h, h, _RUNS), kind != OPEN
+    links, atoms, masses = table_array(u, h, 0), table_array(u, h, 1), table_array(t, h, 2)
+    pushes, solution, driven = table_array(t, h, _PUSHES), table_array(t, h, _SOLUTION), wanted.size > 0
+    runs, periodic = table_array(h, h, _RUNS), kind != OPEN
     worst, worst_row, most, outs = 0.0, -1, 0, runs[0]
     begin, rows = 0, np.int64(0)
     for k in range(len(solution)):

@@ -15,7 +15,7 @@ from kcons.constraints.compilation import njit
 from kcons.solvers.distance_clusters import SimdClusterSolver
 from kcons.solvers.kernels import groups_of_eight as groups
 from kcons.solvers.kernels.aligned_memory import in_one_array, room
-from kcons.solvers.kernels.array_views import at_first, halves, integers, piece
+from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -211,8 +211,9 @@ def _kernel(n_rows: int) -> Any:
     def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
         """Project one group of eight clusters after another; `SimdClusterSolver` says what the arguments are."""
         t, h, u = tables, integers(tables), halves(tables)
-        atoms, slots, ends, weights = piece(u, h, 0), piece(u, h, 1), piece(h, h, 2), piece(t, h, 3)
-        couplings, undo = piece(t, h, 4), piece(t, h, 5)
+        atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
+        ends, weights = table_array(h, h, 2), table_array(t, h, 3)
+        couplings, undo = table_array(t, h, 4), table_array(t, h, 5)
         move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]
         # Arrays that are handed on inside the loop would cost reference counting.

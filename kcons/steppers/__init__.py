@@ -10,12 +10,10 @@ A stepper never changes its input. Where it raises, nothing has happened.
 - `stepper`: what a stepper is
 - `splitting`: kicks and drifts in turn, of orders 2, 4 and 6
 - `extrapolation`: steps that choose their own size
-- `projected_ode`: the projected equation of motion, for comparison
 - `running`, `reversibility_check`: steps one after another, and taken back
 """
 
 from kcons.steppers.extrapolation import Extrapolation
-from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
 from kcons.steppers.reversibility_check import ReversibilityCheck
 from kcons.steppers.running import Observer, Trajectory, run
 from kcons.steppers.splitting import (
@@ -35,7 +33,6 @@ from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper
 
 __all__ = [
-    "Baumgarte",
     "BlanesMoan4",
     "BlanesMoan6",
     "BlanesMoan6a",
@@ -44,8 +41,6 @@ __all__ = [
     "Geodesic",
     "KahanLi6",
     "Observer",
-    "ProjectedRungeKutta4",
-    "ProjectedVerlet",
     "Rattle",
     "ReversibilityCheck",
     "RungeKuttaNystrom",

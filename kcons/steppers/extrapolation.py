@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, positive
+from kcons.constraints.arguments import Positive, checked, finite_number, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     ConvergenceError,
@@ -82,18 +82,18 @@ class Extrapolation:
     Hairer, Lubich and Wanner, Geometric Numerical Integration, IV.4 (projection) and VII.1.4 (RATTLE).
     """
 
+    @checked
     def __init__(
         self,
-        tolerance: float = 1e-8,
+        tolerance: Positive = 1e-8,
         *,
-        length: float = 1.0,
-        speed: float | None = None,
+        length: Positive = 1.0,
+        speed: Positive | None = None,
         base: Stepper | None = None,
     ) -> None:
-        if finite_number(tolerance, "tolerance") < 1e-14:
+        if tolerance < 1e-14:
             raise InputError(f"tolerance is {tolerance}; give a number of 1e-14 or more", item="tolerance")
-        self.tolerance, self.length = float(tolerance), positive(length, "length")
-        self.speed = None if speed is None else positive(speed, "speed")
+        self.tolerance, self.length, self.speed = tolerance, length, speed
         self.base: Stepper = Geodesic(4) if base is None else base
         require_stepper(self.base, "base")
         if not (self.base.reversible and self.base.order == 2):

@@ -20,7 +20,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_array, finite_number, numbers, whole_number
+from kcons.constraints.arguments import as_float_array, finite_array, finite_number, whole_number
 from kcons.errors import InputError, OccupiedError
 
 if sys.platform == "win32":
@@ -301,7 +301,7 @@ def checked_state(values: dict[str, Any]) -> dict[str, Any]:
         if name in values:
             values[name] = finite_array(values[name], shape[0], name)
     for name in {"thermostat", "barostat"} & set(values):
-        values[name] = np.atleast_1d(numbers(values[name], name))
+        values[name] = np.atleast_1d(as_float_array(values[name], name))
         if not np.isfinite(values[name]).all():
             raise ValueError(f"{name} is not finite")
     if len(values.get("barostat", range(9))) < 9:

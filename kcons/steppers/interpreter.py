@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy import empty, ndarray
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError
@@ -71,12 +72,16 @@ class Interpreted(Listed):
     def _made_from(self, system: System, state: State, dt: float, steps: int) -> tuple[State, int]:
         """The state after steps, and how many they were."""
         kept, system.going = system.going, None
-        known, steps = self.depends_on(system, state), self.at_once(state, steps)
+        known = self.depends_on(system, state)
         if kept is not None and kept[0] is state and kept[1] is self and kept[2] == known and kept[3].dt == dt:
             on_their_way = kept[3]
-            on_their_way.resume(state, steps)
+            on_their_way.resume(state, steps if steps == 1 else self.at_once(state, steps))
         else:
-            on_their_way = self.begun(system, state, dt, steps)
+            self.check(system)
+            still = stays(state, dt)
+            if still is not None:
+                return still, 1
+            on_their_way = self.begun(system, state, dt, self.at_once(state, steps))
         after = on_their_way.through()
         self.note(after)
         if known is not None and not on_their_way.far:
@@ -100,10 +105,6 @@ class Interpreted(Listed):
         UnsupportedError
             The stepper may not be used with this system.
         """
-        self.check(system)
-        still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
-        if still is not None:
-            return still
         return self._made_from(system, state, dt, 1)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -122,7 +123,7 @@ class Interpreted(Listed):
         """
         self.check(system)
         check_every, spare = checked_every(check_every if dt != 0 else 0)
-        alone = type(self).step is not Interpreted.step or dt == 0 or not math.isfinite(dt)
+        alone = type(self).step is not Interpreted.step
         while steps > 0:
             n = left = system.schedule.within(steps, check_every)
             while left > 0:
@@ -168,7 +169,7 @@ class Interpreter:
     __slots__ = (
         *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
-        "far",
+        *("far", "unchanging"),
     )
 
     #: Whether forces are those of the System's function, all at once.
@@ -209,6 +210,9 @@ class Interpreter:
             for k, row in enumerate(program.rows):
                 if row.name == "fly":
                     room[ROOM + WIDTH * k + LENGTH] = self.length(row) / dt
+        sets, lists = system.motion.sources, (program.rows, program.shown, program.ends, program.flies)
+        simple, end = self.simple and not system.velocity_dependent, len(program.rows) - 1
+        self.unchanging = _compiled(), system, dt, room, shape, *sets, *lists, simple, end
         self.then, self.left_over_then = start.time, start.time_remainder
         self.made, self.number = -1, start.step
         self._next_step()
@@ -255,14 +259,11 @@ class Interpreter:
     def _march(self) -> int:
         """Go through the program; where the positions are in the end."""
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
-        system, program, dt, v, room, shape = self.system, self.program, self.dt, self.v, self.room, self.shape
-        packed, force, shift, run, at = system.packed, system.force, self.shift, _compiled(), 0
-        given, held = system.motion.sources
+        run, system, dt, room, shape, given, held, rows, shown, ends, flies, simple, end = self.unchanging
+        v, packed, force, shift, at = self.v, system.packed, system.force, self.shift, 0
         room[ENGINE] = packed is None
         tables = system.tables_without_rows if packed is None else packed.tables
-        simple, cell, last = self.simple and not system.velocity_dependent, held.lattice, self.steps - 1
-        shown, ends, flies = program.shown, program.ends, program.flies
-        new, array, double, end = np.empty, np.ndarray, _FLOAT, len(program.rows) - 1
+        cell, last = held.lattice, self.steps - 1
         x, out, forces, more = self.x, self.out, self.forces, self.made < last
         while True:
             begun, found = at, run(at, more, dt, x, out, v, forces, room, tables)
@@ -283,25 +284,25 @@ class Interpreter:
                         there.setflags(False)  # type: ignore[call-arg]
                     raw: Any = force(there, now)
                     # What System.accepted finds most often.
-                    usual = type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray
+                    usual = type(raw) is ndarray and raw.dtype is _FLOAT and raw.shape == shape and raw.flags.carray
                     forces = raw if usual else system.accepted(raw, self.number, False)
                     self.known = True
                     if held.lattice is not cell or given.lattice is not cell:
                         # It may be a barostat, too.
                         tables, cell = tables if packed is None else packed.tables, held.lattice
                 if more or flies[at]:
-                    out = new(shape)
+                    out = empty(shape)
                 at += 1
                 continue
             self.x, self.out, self.forces = x, out, forces
-            row = program.rows[at]
+            row = rows[at]
             if at == end:
                 if row.here:
                     self.x = x = self.place(row.here)
                 if not more or room[FAR]:
                     break
                 # The kernel goes on by itself but where positions are in another array.
-                out, at = new(shape), 0
+                out, at = empty(shape), 0
                 if self.low is not None:
                     self.low.fill(0.0)
                 self._next_step()

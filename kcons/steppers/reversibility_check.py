@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
+from kcons.errors import ConvergenceError, ReversibilityError, UnsupportedError
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
 from kcons.steppers.stepper import Listed, Stepper, require_stepper, retold
@@ -33,15 +36,14 @@ class ReversibilityCheck(Listed):
         The scheme is not reversible at all.
     """
 
-    def __init__(self, stepper: Stepper, tolerance: float = 1e-9) -> None:
+    @checked
+    def __init__(self, stepper: Stepper, tolerance: Positive = 1e-9) -> None:
         require_stepper(stepper)
         if not stepper.reversible:
             raise UnsupportedError(
                 f"{stepper!r} is not reversible, so there is nothing to check; use Rattle, Geodesic, a Composition "
                 "or a RungeKuttaNystrom stepper"
             )
-        if not tolerance > 0:
-            raise InputError(f"tolerance is {tolerance}; give a positive number", item="tolerance")
         self.stepper = stepper
         self.tolerance = tolerance
         self.order = stepper.order
@@ -76,16 +78,27 @@ class ReversibilityCheck(Listed):
             Whatever the stepper raises, forward or back.
         """
         after = self.stepper.step(system, state, dt)
-        if dt == 0:
-            return after
+        if dt != 0:
+            self.take_back(system, state, after, dt, lambda: [system.with_forces(after).forces])
+        return after
+
+    def take_back(
+        self, system: System, state: State, after: State, dt: float, forces: Callable[[], list[FloatArray | None]]
+    ) -> None:
+        """Make the step back from `after` and compare with `state`; `forces` gives those of the step, for rounding.
+
+        Raises
+        ------
+        ReversibilityError
+            As `step`.
+        """
         try:
             back = self.stepper.step(system, after, -dt)
         except ConvergenceError as error:
             message = f"step {after.step} cannot be taken back: {error}"
             raise retold(error, message, ReversibilityError, after.step) from error
-        forces = system.with_forces(after).forces
-        assert forces is not None
-        off = missed(state, after, back, dt, _largest(forces * system.inverse_masses))
+        acceleration = max((_largest(f * system.inverse_masses) for f in forces() if f is not None), default=0.0)
+        off = _missed(state, after, back, dt, acceleration)
         residual = float(off.max(initial=0.0))
         if not residual <= self.tolerance:
             atom = int(np.argmax(off.max(axis=1)))
@@ -97,20 +110,10 @@ class ReversibilityCheck(Listed):
                 atoms=[atom],
                 step=after.step,
             )
-        return after
 
 
-def missed(state: State, after: State, back: State, dt: float, acceleration: float) -> FloatArray:
-    """How far a step that was taken back misses its start, relative as in `ReversibilityCheck`, shape (n_atoms, 3).
-
-    Parameters
-    ----------
-    state, after, back : State
-        Before the step, after it, and after the step back.
-    dt : float
-    acceleration : float
-        The largest that forces cause.
-    """
+def _missed(state: State, after: State, back: State, dt: float, acceleration: float) -> FloatArray:
+    """How far a step that was taken back misses its start, relative as in `ReversibilityCheck`, shape (n_atoms, 3)."""
     speed = max(_largest(state.velocities), _largest(after.velocities))
     length = max(extent(state.positions), speed * abs(dt))
     rounding = 8 * float(np.spacing(_largest(state.positions)))

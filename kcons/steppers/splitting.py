@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Sequence
 
+from kcons.constraints.arguments import Count, checked
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Operation, mirrored, splitting
@@ -201,10 +202,9 @@ class Geodesic(Splitting):
     Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016); notes, eqs. 105-107.
     """
 
-    def __init__(self, substeps: int = 8, great_circles: bool | None = None) -> None:
-        if not (substeps >= 1 and float(substeps).is_integer()):
-            raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
-        self.substeps, self.great_circles = int(substeps), great_circles
+    @checked
+    def __init__(self, substeps: Count = 8, great_circles: bool | None = None) -> None:
+        self.substeps, self.great_circles = substeps, great_circles
         flight = (1.0 / self.substeps,) * self.substeps
         super().__init__((0.5, 0.5), (1.0,), flight, exact_flight=great_circles is not False)
 

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import (
     as_array,
+    as_float_array,
     check_call,
     finite_array,
     finite_number,
-    numbers,
     read_only_view,
     refuse_other,
 )
@@ -424,7 +424,7 @@ class System:
         if type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.shape == self._shape and raw.flags.carray:
             return raw.copy() if copy else raw
         try:
-            f = np.array(numbers(raw, "forces"), order="C")
+            f = np.array(as_float_array(raw, "forces"), order="C")
         except InputError as error:
             raise InputError(f"the force function, at step {step}: {error}", item="forces") from None
         if f.shape != self._shape:

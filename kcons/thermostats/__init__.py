@@ -20,7 +20,7 @@ from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import Counts, HamiltonianMonteCarlo
 from kcons.thermostats.monte_carlo.replica_exchange import exchange
-from kcons.thermostats.monte_carlo.tuning import Tuned, best_share, tune
+from kcons.thermostats.monte_carlo.tuning import Tuned, best_acceptance, tune
 from kcons.thermostats.multistep import (
     ForceGroups,
     IsokineticSpheres,
@@ -62,7 +62,7 @@ __all__ = [
     "TemperatureSplit",
     "Tuned",
     "autocorrelation_time",
-    "best_share",
+    "best_acceptance",
     "configurational_sample",
     "configurational_temperature",
     "evaluations_per_sample",

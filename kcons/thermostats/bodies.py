@@ -10,7 +10,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
-from kcons.constraints.vectors import extent
+from kcons.constraints.vectors import extent, row_norms
 from kcons.motion.motion import Motion
 
 #: How far each atom is moved to see whether a row changes elsewhere, relative to the size of the system.
@@ -50,16 +50,8 @@ def row_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all rows by motions, relative to their gradients, here and at two places nearby, shape (n_rows, k).
 
-    At a single place they may cancel by symmetry. Fixed atoms stay. Not finite where a surface is not defined.
-
-    Parameters
-    ----------
-    motion : Motion
-    positions : ndarray, shape (n_atoms, 3)
-    fields : callable
-        Gets positions, gives the velocities of k motions as columns, shape (3 n_atoms, k).
-    size : float, optional
-        Of the system.
+    At a single place they may cancel by symmetry. Fixed atoms stay. Not finite where a surface is not defined. `fields`
+    gets positions and gives the velocities of k motions as columns, shape (3 n_atoms, k); `size` is that of the system.
     """
     held, rng = motion.constraint_set, np.random.default_rng(0)
     size = size or extent(positions) or 1.0
@@ -69,7 +61,7 @@ def row_changes(
         x = positions + shake
         with np.errstate(all="ignore"):
             rows = held.jacobian(x, time)
-            lengths = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+            lengths = row_norms(rows)
             yield np.asarray(rows @ fields(x)) / np.where(lengths == 0, 1.0, lengths)[:, None]
 
 

@@ -15,12 +15,12 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers, whole_number
+from kcons.constraints.arguments import as_float_array, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.thermostats.correlated_series import Estimate, checked, few, spread
-from kcons.thermostats.isokinetic.step import constrained_acceleration
+from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Standard errors by which the mean curvature must differ from 0 for a ratio to have an error.
@@ -51,7 +51,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
     Raises
     ------
     InputError
-        Fewer than 32 samples, or not as many of one as of the other; a NaN or infinity; curvatures that are all 0.
+        Fewer than 32 samples; curvatures that are all 0.
 
     Warns
     -----
@@ -59,7 +59,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
         Fewer than 10 independent samples; a mean curvature that is 0 within three standard errors, so that the ratio
         has no error: it is given as infinite.
     """
-    above, below = numbers(squares, "squares"), numbers(curvatures, "curvatures")
+    above, below = as_float_array(squares, "squares"), as_float_array(curvatures, "curvatures")
     if above.shape != below.shape:
         raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
     for series, name in ((above, "squares"), (below, "curvatures")):
@@ -93,8 +93,6 @@ def configurational_sample(
     ------
     UnsupportedError
         Targets move, or forces depend on the velocities.
-    InputError
-        Fewer than one direction.
     """
     if system.motion.plan.driven or system.velocity_dependent:
         raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")

@@ -7,8 +7,8 @@ a shape L that makes it R N at frequency zero,
 
 L is that of an exponential memory (a Lorentzian), or of an oscillator that is damped critically or less. R > 1 is
 something slow, beside whatever noise there is; R < 1 are values that swing back; R = 1 are independent values. All
-memories from a third of a block to a sixth of the series, with several frequencies each, and all R are tried on the
-means of 16 to 127 blocks, by the likelihood of what is left when the mean (or the line) is taken out. The error is the
+memories up to a sixth of the series, with several frequencies each, and all R are tried on the 16 to 64 slowest cosines
+of the series (DCT-II), by the likelihood of what is left when the mean (or the line) is taken out. The error is the
 average over all of them: a slow part that a run barely shows counts as far as the run leaves it likely.
 """
 
@@ -21,29 +21,30 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.fft import dct
 
-from kcons.constraints.arguments import numbers, positive
+from kcons.constraints.arguments import as_float_array, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Fewest values that `mean` takes an error from, and independent ones below which it is not to be relied on.
-FEWEST, FEW_INDEPENDENT = 32, 10
-#: Fewest blocks of a long series. They are joined in pairs while neighbors are so alike and `_JOINED` remain: what
-#: matters is how the spectrum begins, not how smooth a series is from value to value.
-_BLOCKS, _JOINED, _ALIKE = 64, 16, 0.8
-#: Shortest memory in blocks, longest as a part of the series, and how many are tried between them.
-_SHORTEST, _LONGEST, _MEMORIES = 0.35, 1 / 6, 12
-#: Oscillators, by frequency times memory (0.05 stands for critical damping), how likely each is against an exponential
-#: memory before the values are seen, and their shortest period in blocks.
-_OSCILLATORS, _RARER, _PERIOD = (0.05, 2.0, 4.0, 10.0), 0.4, 1.3
+MIN_SAMPLES, FEW_INDEPENDENT = 32, 10
+#: Cosines of a long series. Their number is halved while the faster ones have hardly anything of the spread and
+#: `_FEWEST_COSINES` remain: what matters is how the spectrum begins, not how smooth a series is from value to value.
+_COSINES, _FEWEST_COSINES, _SMOOTH = 64, 16, 0.8
+#: Shortest memory times the number of cosines, longest as a part of the series, and how many are tried between them.
+_SHORTEST, _LONGEST, _MEMORIES = 0.35, 1 / 6, 18
+#: Oscillators, by frequency times memory (0.05 stands for critical damping), and their shortest period times the number
+#: of cosines.
+_OSCILLATORS, _PERIOD = (0.05, 2.0, 3.5, 6.0, 10.0), 1.3
 #: Smallest part of the level N that a spectrum with R < 1 falls to.
-_LOWEST = 0.05
+_LOWEST = 0.02
 #: ln R. Before the values are seen R is 1 within a factor of 7 or so (a Cauchy distribution of this width).
-_LOG_R: FloatArray = np.linspace(-math.log(16.0), math.log(4096.0), 48)
+_LOG_R: FloatArray = np.linspace(-math.log(64.0), math.log(4096.0), 48)
 _WIDTH = 2.0
-#: Before the values are seen a memory t has the density t^-0.25 in ln t. Chosen, with the bounds of R, so that errors
+#: Before the values are seen a memory t has the density t^-0.4 in ln t. Chosen, with the bounds of R, so that errors
 #: are right on average for series of 20 memories and more, whether all of a series is slow or a small part of it.
-_SLOWER = 0.25
+_SLOWER = 0.4
 #: Spread relative to the values below which it is rounding.
 _ROUNDING = 1e-13
 
@@ -63,85 +64,79 @@ class Estimate(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Of the mean of a series.
+    """Standard error of the mean of a series, and how many independent values would give the same.
 
-    Attributes
-    ----------
-    error : float
-        Standard error.
-    independent : float
-        As many independent values would give the same error. Where fewer than 10 blocks make up the spread, as of a
-        distribution with heavy tails, at most so many.
+    Where fewer than 10 blocks make up the spread, as of a distribution with heavy tails, at most so many.
     """
 
     error: float
     independent: float
 
 
-class _Process(NamedTuple):
-    """Covariances between blocks: along their axes, of the mean or the slope, and ln of how likely the process is."""
+class _Processes(NamedTuple):
+    """What is tried: p shapes with r ratios each, at level 1.
 
-    sizes: FloatArray
+    Axes, shape (p, k, cosines), along which the cosines are independent; weights 1/S along these, shape (p, r, k); the
+    variance of the mean or the slope, shape (p, r); ln of how likely each is but for the level, shape (p, r), -inf
+    where a spectrum would be negative.
+    """
+
     axes: FloatArray
-    own: float
-    prior: float
+    weights: FloatArray
+    own: FloatArray
+    prior: FloatArray
 
 
 @lru_cache(maxsize=4)
-def _processes(blocks: int, degree: int) -> tuple[list[_Process], float]:
-    """All that are tried, and for independent blocks of unit variance the variance of the mean or of the slope."""
-    t = np.arange(blocks, dtype=np.float64)
-    design = np.vander(t - t.mean(), degree + 1)
+def _processes(cosines: int, degree: int) -> _Processes:
+    """All that are tried, for the mean (degree 0) or the slope (1) of as many values as cosines."""
+    k, t = np.arange(cosines), np.arange(cosines, dtype=np.float64)
+    design = dct(np.vander(t - t.mean(), degree + 1), axis=0, norm="ortho")
     inside = np.linalg.qr(design, mode="complete")[0][:, degree + 1 :]
     rule = np.linalg.pinv(design)[0]
-    apart = np.abs(np.subtract.outer(t, t)).astype(np.int64)
+    same_parity = (k[:, None] - k) % 2 == 0
     found = []
     for turn in (0.0, *_OSCILLATORS):
-        for memory in np.geomspace(_SHORTEST, blocks * _LONGEST, _MEMORIES):
-            if 2 * math.pi * memory < _PERIOD * turn:
+        for memory in np.geomspace(_SHORTEST / cosines, _LONGEST, _MEMORIES):
+            if 2 * math.pi * memory * cosines < _PERIOD * turn:
                 continue
-            # Means over blocks of Re(a exp(-z|t|)), of which the sum over all lags is Re(2 a/z).
+            # Of Re(a exp(-z|t|)) in a series of length 1: the spectrum, and what its two ends take from it.
             z, a = complex(1.0, -turn) / memory, complex(1.0, -1.0 / turn if turn else 0.0)
-            lags = (a / z**2 * (np.cosh(z) - 1.0) * np.exp(-z * t)).real
-            lags[0] = (a / z * (1.0 - (1.0 - np.exp(-z)) / z)).real
-            covariance = (lags / (a / z).real)[apart]
+            lorentz = z / (z**2 + (math.pi * k) ** 2)
+            ends = np.where(k, math.sqrt(2.0), 1.0) * lorentz
+            ends = same_parity * np.outer(ends, ends * (1.0 - np.where(k % 2, -1.0, 1.0) * np.exp(-z)))
+            covariance = (a * (np.diag(lorentz) - ends)).real / (a / z).real
             sizes, axes = np.linalg.eigh(inside.T @ covariance @ inside)
-            prior = math.log(_RARER if turn else 1.0) - _SLOWER * math.log(memory / _SHORTEST)
-            found.append(_Process(sizes, axes.T @ inside.T, float(rule @ covariance @ rule), prior))
-    return found, float(rule @ rule)
+            spectrum = 1.0 + np.expm1(_LOG_R)[:, None] * sizes
+            allowed = spectrum[:, -1] > _LOWEST
+            spectrum[~allowed] = 1.0
+            prior = -_SLOWER * math.log(memory * cosines / _SHORTEST) - np.log1p((_LOG_R / _WIDTH) ** 2)
+            prior -= 0.5 * np.log(spectrum).sum(axis=1)
+            own = rule @ rule + np.expm1(_LOG_R) * (rule @ covariance @ rule)
+            found.append((axes.T @ inside.T, 1.0 / spectrum, own, np.where(allowed, prior, -np.inf)))
+    return _Processes(*(np.array(part) for part in zip(*found, strict=True)))
 
 
-def _means(values: FloatArray, size: int) -> FloatArray:
-    count = len(values) // size
-    return np.asarray(values[: size * count].reshape(count, size).mean(axis=1))
-
-
-def _error(values: FloatArray, degree: int) -> tuple[float, FloatArray]:
-    """Standard error of the mean (degree 0), or of the slope by the index (1); the blocks it was taken from.
+def _error(values: FloatArray, degree: int) -> tuple[float, int]:
+    """Standard error of the mean (degree 0), or of the slope by the index (1); the number of cosines it was taken from.
 
     Of values whose mean, and slope, is 0.
     """
-    size = max(len(values) // _BLOCKS, 1)
-    blocks = _means(values, size)
-    while len(blocks) >= 2 * _JOINED and blocks[1:] @ blocks[:-1] > _ALIKE * float(blocks @ blocks):
-        size *= 2
-        blocks = _means(values, size)
-    count = len(blocks)
-    processes, plain = _processes(count, degree)
-    logarithms, errors = [], []
-    for process in processes:
-        log_r = _LOG_R[1.0 + np.expm1(_LOG_R) * process.sizes[-1] > _LOWEST]
-        more = np.expm1(log_r)
-        spectrum = 1.0 + more[:, None] * process.sizes
-        level = ((process.axes @ blocks) ** 2 / spectrum).sum(axis=1) / len(process.sizes)
-        level = np.maximum(level, np.finfo(float).tiny)
-        likely = -0.5 * (len(process.sizes) * np.log(level) + np.log(spectrum).sum(axis=1))
-        logarithms.append(likely - np.log1p((log_r / _WIDTH) ** 2) + process.prior)
-        errors.append(np.sqrt(level * (plain + more * process.own)))
-    found = np.concatenate(logarithms)
-    weights = np.exp(found - found.max())
-    error = float(weights @ np.concatenate(errors) / weights.sum())
-    return error * (size * count / len(values)) ** (0.5 + degree) * size**-degree, blocks
+    # In the fastest third the spectrum of values at intervals is not that of a continuous motion.
+    found = dct(values, norm="ortho")[: min(_COSINES, max(2 * len(values) // 3, _FEWEST_COSINES))]
+    while len(found) >= 2 * _FEWEST_COSINES:
+        squares = found**2
+        if squares @ np.cos(np.pi / len(found) * np.arange(len(found))) <= _SMOOTH * squares.sum():
+            break
+        found = found[: len(found) // 2]
+    count = len(found)
+    tried = _processes(count, degree)
+    along = (tried.axes @ found) ** 2
+    level = np.maximum((tried.weights @ along[..., None])[..., 0] / along.shape[1], np.finfo(float).tiny)
+    likely = tried.prior - 0.5 * along.shape[1] * np.log(level)
+    likely = np.exp(likely - likely.max())
+    error = float((likely * np.sqrt(level * np.maximum(tried.own, 0.0))).sum() / likely.sum())
+    return error * (count / len(values)) ** (0.5 + degree), count
 
 
 def spread(series: FloatArray) -> Spread:
@@ -151,7 +146,9 @@ def spread(series: FloatArray) -> Spread:
     if not variance > (_ROUNDING * float(np.abs(series).max())) ** 2:
         return Spread(0.0, float(len(series)))
     off = off / math.sqrt(variance)
-    error, blocks = _error(off, 0)
+    error, count = _error(off, 0)
+    size = len(off) // count
+    blocks = off[: size * count].reshape(count, size).mean(axis=1)
     squares = (blocks - blocks.mean()) ** 2
     # The number of blocks where these are normal; 3 where one has all of the spread.
     carriers = 3.0 * float(squares.sum()) ** 2 / max(float((squares**2).sum()), np.finfo(float).tiny)
@@ -163,8 +160,8 @@ def spread(series: FloatArray) -> Spread:
 
 def checked(series: FloatArray, item: str) -> FloatArray:
     """The same series, if an error can be taken from it; `InputError` otherwise."""
-    if series.ndim != 1 or len(series) < FEWEST:
-        raise InputError(f"{series.shape} {item} are too few for an error; give {FEWEST} or more", item=item)
+    if series.ndim != 1 or len(series) < MIN_SAMPLES:
+        raise InputError(f"{series.shape} {item} are too few for an error; give {MIN_SAMPLES} or more", item=item)
     if not np.isfinite(series).all():
         bad = int(np.argmin(np.isfinite(series)))
         raise InputError(f"number {bad} of {item} is not finite; leave it out", item=item)
@@ -199,7 +196,7 @@ def mean(values: ArrayLike) -> Estimate:
     UserWarning
         Fewer than 10 independent values.
     """
-    series = checked(numbers(values, "values"), "values")
+    series = checked(as_float_array(values, "values"), "values")
     found = spread(series)
     doubt = few(len(series), found.independent)
     if doubt:
@@ -214,14 +211,9 @@ def autocorrelation_time(values: ArrayLike) -> float:
     sequence, Stat. Sci. 7, 473 (1992)). It is for long runs, where it is known to a few percent. The error of a mean is
     that of `mean`, which also knows of slow parts that noise hides.
 
-    1 for a series that does not change, or whose values swing back.
-
-    Raises
-    ------
-    InputError
-        Fewer than 32 values; a NaN or infinity.
+    1 for a series that does not change, or whose values swing back; 32 values or more are needed.
     """
-    series = checked(numbers(values, "values"), "values")
+    series = checked(as_float_array(values, "values"), "values")
     n = len(series)
     off = series - series.mean()
     power = np.fft.rfft(off, 2 * n)
@@ -243,11 +235,6 @@ def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:
         An observable along a run, after equilibration.
     evaluations : float
         Of the forces in question from one value to the next, for example from `ForceGroups.evaluations`.
-
-    Raises
-    ------
-    InputError
-        As for `autocorrelation_time`; evaluations not positive.
     """
     return positive(evaluations, "evaluations") * autocorrelation_time(values)
 

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
@@ -62,6 +63,7 @@ class Freedom:
     turns: bool = False
 
 
+@checked
 def freedom(
     system: System, state: State, forces: FloatArray, atoms: ArrayLike | None = None, momentum: Momentum = "auto"
 ) -> Freedom:
@@ -90,12 +92,7 @@ def freedom(
     OverdeterminedError
         No degree of freedom is left.
     """
-    if momentum not in ("auto", "conserved", "free"):
-        raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
-    chosen = None if atoms is None else atom_numbers(atoms, system.n_atoms)
-    if chosen is not None and len(chosen) == system.n_atoms:
-        chosen = None
-    count = system.motion.degrees_of_freedom if chosen is None else _count(system, state, chosen)
+    chosen, count = _counted(system, state, atoms)
     directions = np.zeros((0, 3))
     turns = False
     if momentum == "conserved":
@@ -116,21 +113,22 @@ def freedom(
 
 def may_be(count: float, system: System, state: State, atoms: ArrayLike | None, momentum: Momentum) -> bool:
     """Whether `freedom` could find this count: states that were loaded may be of other rows, or of other `momentum`."""
-    chosen = None if atoms is None else atom_numbers(atoms, system.n_atoms)
-    if chosen is not None and len(chosen) == system.n_atoms:
-        chosen = None
-    most = system.motion.degrees_of_freedom if chosen is None else _count(system, state, chosen)
+    chosen, most = _counted(system, state, atoms)
     if momentum == "free" or (momentum == "auto" and chosen is not None):
         return count == most
     least = most - len(open_directions(system.motion, state.positions, state.time))
     return count == least if momentum == "conserved" else least <= count <= most
 
 
-def _count(system: System, state: State, chosen: IntArray) -> int:
+def _counted(system: System, state: State, atoms: ArrayLike | None) -> tuple[IntArray | None, int]:
+    """The chosen atoms, None for all, and 3 for each less the rank of their rows."""
+    chosen = None if atoms is None else atom_numbers(atoms, system.n_atoms)
+    if chosen is None or len(chosen) == system.n_atoms:
+        return None, system.motion.degrees_of_freedom
     held = system.motion.constraint_set
     count = 3 * len(chosen)
     if not held.n_rows:
-        return count
+        return chosen, count
     inside = np.zeros(system.n_atoms, dtype=np.int64)
     inside[chosen] = 1
     touches = held.incidence @ inside
@@ -145,7 +143,7 @@ def _count(system: System, state: State, chosen: IntArray) -> int:
     if len(rows):
         part, numbers = held.subset(rows)
         count -= Motion(part, state.positions[numbers], time=state.time).rank
-    return count
+    return chosen, count
 
 
 # -- total momentum ---------------------------------------------------------------------------------
@@ -209,13 +207,8 @@ def _places(system: System, state: State, forces: FloatArray) -> Iterator[tuple[
 class RigidMotions:
     """Motions of everything at once, shifts and turns about the middle, that change no row and meet no force.
 
-    Each place takes one of six away, unless forces do no work in any that is left.
-
-    Parameters
-    ----------
-    positions : ndarray, shape (n, 3)
-    turn : bool
-        False for none: in a cell, whose turn changes what is meant.
+    Each place takes one of six away, unless forces do no work in any that is left. With `turn` False there are none: in
+    a cell, whose turn changes what is meant.
     """
 
     def __init__(self, positions: FloatArray, turn: bool = True) -> None:
@@ -266,16 +259,7 @@ class RigidMotions:
 def warn_of_conserved_momenta(
     masses: FloatArray, velocities: FloatArray, directions: FloatArray, turns: bool, stacklevel: int
 ) -> None:
-    """Say so where conserved momenta keep a deterministic thermostat from sampling a temperature.
-
-    Parameters
-    ----------
-    masses : ndarray, shape (n,)
-    velocities : ndarray, shape (n, 3)
-    directions, turns
-        As in `Freedom`.
-    stacklevel : int
-    """
+    """Say so where conserved momenta, see `Freedom`, keep a deterministic thermostat from sampling a temperature."""
     if momentum_share(masses, velocities, directions) > AT_REST:
         warnings.warn(
             "total momentum is not zero, and a thermostat that scales velocities scales it too instead of forgetting "
@@ -301,13 +285,7 @@ def momentum_share(masses: FloatArray, velocities: FloatArray, directions: Float
 
 
 def drift_velocity(velocities: FloatArray, masses: FloatArray, directions: FloatArray) -> FloatArray:
-    """Velocity of the center of mass along `directions`, shape (3,).
-
-    Raises
-    ------
-    UnsupportedError
-        There are none: total momentum cannot be taken out.
-    """
+    """Velocity of the center of mass along `directions`, shape (3,); `UnsupportedError` where there are none."""
     if not len(directions):
         raise UnsupportedError(_HELD)
     mean = masses @ velocities / masses.sum()
@@ -318,17 +296,10 @@ def drift_velocity(velocities: FloatArray, masses: FloatArray, directions: Float
 
 
 def warn_of_bodies_apart(system: System, state: State, stacklevel: int) -> None:
-    """Say so where a deterministic thermostat is all that couples the parts of a system.
+    """Say so where a deterministic thermostat is all that couples the parts of a system, at a state with its forces.
 
     Thermostats ask once, after `LOOK_AT` steps: one evaluation of the forces, and up to 20 more where bodies seem not
     to feel each other.
-
-    Parameters
-    ----------
-    system : System
-    state : State
-        With its forces.
-    stacklevel : int
     """
     if _apart(system, state):
         warnings.warn(
@@ -376,13 +347,7 @@ def _apart(system: System, state: State) -> bool:
 
 
 def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
-    """Different atom numbers in order.
-
-    Raises
-    ------
-    InputError
-        None, or numbers out of range or not whole.
-    """
+    """Different atom numbers in order, one or more; `InputError` otherwise."""
     given = np.asarray(atoms)
     if given.dtype == bool and given.shape == (n_atoms,):
         given = np.flatnonzero(given)
@@ -394,17 +359,8 @@ def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
 
 
 def refuse_dissipation(system: System, why: str) -> None:
-    """Refuse friction of the system, which takes out heat that no noise brings, and velocity-dependent forces.
-
-    Parameters
-    ----------
-    system : System
-    why : str
-        What a thermostat lacks for the latter, and what to do.
-
-    Raises
-    ------
-    UnsupportedError
+    """Raise `UnsupportedError` for friction of the system, which takes out heat that no noise brings, and
+    velocity-dependent forces; `why` says what a thermostat lacks for these, and what to do.
     """
     if system.velocity_dependent:
         raise UnsupportedError(f"forces that depend on the velocities have no {why}")
@@ -416,22 +372,9 @@ def refuse_dissipation(system: System, why: str) -> None:
 
 
 def carried(state: State, size: int, name: str, *, marked: bool = False) -> bool:
-    """Whether the state carries the variables of this thermostat.
+    """Whether the state carries the `size` variables of the thermostat of this name; `InputError` for those of another.
 
-    Parameters
-    ----------
-    state : State
-    size : int
-        How many variables there are.
-    name : str
-        Of the thermostat.
-    marked : bool
-        Whether they begin with `MARK`, since there may be as many of another thermostat.
-
-    Raises
-    ------
-    InputError
-        It carries those of another.
+    They are `marked` if they begin with `MARK`, since there may be as many of another thermostat.
     """
     if state.thermostat is None:
         return False

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, positive, seed_number, whole_number
+from kcons.constraints.arguments import Count, NotNegative, Positive, Rng, checked, seed_from
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -48,11 +48,10 @@ _GENERATOR = _Generator()
 
 def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
     """This thread's generator of numbers that are a function of a key, the number of a step and its part."""
-    generator = _GENERATOR
-    generator.key[:] = key
-    generator.counter[2:] = number, part
-    generator.bits.state = generator.state
-    return generator.numbers
+    _GENERATOR.key[:] = key
+    _GENERATOR.counter[2:] = number, part
+    _GENERATOR.bits.state = _GENERATOR.state
+    return _GENERATOR.numbers
 
 
 class SeededBath(Interpreted):
@@ -61,7 +60,9 @@ class SeededBath(Interpreted):
     Attributes
     ----------
     thermal_energy, friction : float
-    seed, substeps : int
+    seed : int
+        What `rng` was, or what was drawn from it.
+    substeps : int
         See `Langevin`.
     exchanged : (int, float) or None
         Number of the last step that was made, and its kinetic energy after noise in its middle, for logs: there
@@ -69,23 +70,30 @@ class SeededBath(Interpreted):
     """
 
     exchanged: tuple[int, float] | None = None
+    #: The operations of a step, and as the interpreter goes through them; of one whose flights are great circles.
+    _in_flights: tuple[tuple[Operation, ...], Program]
+    _great_circles: tuple[tuple[Operation, ...], Program]
 
     order = 2
     reversible = False
     symplectic = False
     force_evaluations = 1
 
-    def __init__(self, thermal_energy: float, friction: float, seed: int, substeps: int) -> None:
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        self.friction = finite_number(friction, "friction")
-        if self.friction < 0:
-            raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
-        self.seed = seed_number(seed)
-        self.substeps = whole_number(substeps, "substeps")
+    @checked
+    def __init__(self, thermal_energy: Positive, friction: NotNegative, rng: Rng, substeps: Count) -> None:
+        self.thermal_energy, self.friction, self.substeps = thermal_energy, friction, substeps
+        self.seed = seed_from(rng)
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
         refuse_dissipation(system, "place in this scheme; use friction")
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self.listed(system)[0]
+
+    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
+        """The operations, and as the interpreter goes through them."""
+        return self._in_flights if system is None or system.great_circles is None else self._great_circles
 
     def depends_on(self, system: System, state: State) -> Any:
         return self.thermal_energy, self.friction, self.seed
@@ -117,7 +125,8 @@ class Langevin(SeededBath):
         k_B T in the units of energy in use.
     friction : float
         gamma, in inverse units of time.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        A seed, or what one is drawn from, which `seed` then tells; None takes it from the operating system.
     substeps : int
         RATTLE substeps in each of the two drifts.
     conserve_momentum : bool
@@ -143,26 +152,19 @@ class Langevin(SeededBath):
         self,
         thermal_energy: float,
         friction: float,
-        seed: int,
+        rng: Rng,
         *,
         substeps: int = 3,
         conserve_momentum: bool = False,
     ) -> None:
-        super().__init__(thermal_energy, friction, seed, substeps)
+        super().__init__(thermal_energy, friction, rng, substeps)
         self.conserve_momentum = bool(conserve_momentum)
         self._in_flights = listed_and_made(_geodesic_baoab((1.0 / self.substeps,) * self.substeps))
         self._great_circles = listed_and_made(_geodesic_baoab((1.0,), exact=True))
         self._open: tuple[System, FloatArray] | None = None
 
     def __repr__(self) -> str:
-        return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
-
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self.listed(system)[0]
-
-    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
-        """The operations, and as the interpreter goes through them."""
-        return self._in_flights if system is None or system.great_circles is None else self._great_circles
+        return f"Langevin({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}, substeps={self.substeps})"
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)

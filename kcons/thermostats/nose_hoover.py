@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.arguments import Count, Positive, checked
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
@@ -38,29 +38,15 @@ from kcons.thermostats.langevin import kinetic
 FRACTIONS = {2: (1.0,), 4: SUZUKI_4, 6: KAHAN_LI_6}
 #: What comes before a step on the constraints, and after it.
 HALF = Chain(0.5)
+ChainOrder = Literal[2, 4, 6]
 #: What the numbers of a program begin with: k_B T, the links, the fractions in which they move, and how often they do;
 #: after them as many masses of the links, positions and velocities of these with g, and masses for each coordinate.
 KT, LINKS, PARTS, SIZE = range(4)
 
 
-def chain_fractions(chain_order: int, repeats: int) -> tuple[float, ...]:
-    """The fractions of its time in which a chain moves on.
-
-    Parameters
-    ----------
-    chain_order : {2, 4, 6}
-    repeats : int
-        How many times in succession, each over its part of the time.
-
-    Raises
-    ------
-    InputError
-        Another order; no repeat.
-    """
-    if chain_order not in FRACTIONS:
-        raise InputError(f"chain_order is {chain_order!r}; give 2, 4 or 6", item="chain_order")
-    count = whole_number(repeats, "repeats")
-    return tuple(share / count for share in FRACTIONS[chain_order]) * count
+def chain_fractions(chain_order: ChainOrder, repeats: int) -> tuple[float, ...]:
+    """The fractions of its time in which a chain moves on, `repeats` times in succession."""
+    return tuple(share / repeats for share in FRACTIONS[chain_order]) * repeats
 
 
 class NoseHooverChain(Interpreted):
@@ -111,21 +97,20 @@ class NoseHooverChain(Interpreted):
     reversible = True
     symplectic = False
 
+    @checked
     def __init__(
         self,
-        thermal_energy: float,
-        period: float,
+        thermal_energy: Positive,
+        period: Positive,
         *,
-        length: int = 3,
-        chain_order: int = 4,
-        repeats: int = 1,
+        length: Count = 3,
+        chain_order: ChainOrder = 4,
+        repeats: Count = 1,
         stepper: Splitting | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        self.length = whole_number(length, "length")
+        self.thermal_energy, self.period, self.length = thermal_energy, period, length
         self.fractions = chain_fractions(chain_order, repeats)
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        self.period = positive(period, "period")
         self.stepper: Splitting = Rattle() if stepper is None else stepper
         if not isinstance(self.stepper, Splitting):
             raise InputError(f"stepper is {stepper!r}; give a splitting, such as kcons.Rattle()", item="stepper")

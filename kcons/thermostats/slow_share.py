@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import generator_of, numbers, refuse_other
+from kcons.constraints.arguments import Rng, as_float_array, generator_of, refuse_other
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.isokinetic.step import constrained_acceleration
+from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.multistep import ForceGroups
 from kcons.thermostats.temperature_split import configuration, flight_of
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -21,7 +21,7 @@ REACH = 0.03
 
 
 def slow_share(
-    system: System, frames: ArrayLike, group: str = "slow", *, seed: int = 0, displacement: float | None = None
+    system: System, frames: ArrayLike, group: str = "slow", *, rng: Rng = 0, displacement: float | None = None
 ) -> float:
     """Share of the stiffness that one group of forces carries along the constraints, root mean square.
 
@@ -37,7 +37,7 @@ def slow_share(
         Configurations on the constraints: ten of a short run for large systems, more for small ones.
     group : str
         The slow forces.
-    seed : int
+    rng : int, numpy.random.Generator or None
         Of the random moves, one a frame, which costs two evaluations of every group.
     displacement : float, optional
         Typical move of an atom for differences of forces; 0.03 of the distance to the next atom by default, as in a
@@ -48,10 +48,7 @@ def slow_share(
     UnsupportedError
         Targets move, rows hold velocities, or forces come in no groups.
     InputError
-        No such group; no frames, or of another shape, or off the constraints; a displacement that is not positive;
-        forces that do not change with the positions; all atoms fixed.
-    NonFiniteError
-        Forces that are not finite.
+        No such group; frames off the constraints; forces that do not change with the positions; all atoms fixed.
     """
     refuse_other(system, System, "system", "a kcons.steppers.System")
     if system.motion.plan.driven or not system.motion.constraint_set.holonomic.all():
@@ -61,15 +58,15 @@ def slow_share(
         raise UnsupportedError("the System has no groups of forces; make it with System(motion, ForceGroups({...}))")
     if group not in force.groups:
         raise InputError(f"there is no group {group!r} of forces; there are {', '.join(force.groups)}", item="group")
-    x = numbers(frames, "frames")
+    x = as_float_array(frames, "frames")
     if x.ndim != 3 or not len(x):
         raise InputError(f"frames have shape {x.shape}; give (n_frames, n_atoms, 3)", item="frames")
-    rng = generator_of(seed, "seed")
+    generator = generator_of(rng)
     slow, whole, flight = 0.0, 0.0, 0.0
     for number, frame in enumerate(x):
         here = configuration(system, frame)
         flight = flight or flight_of(system, here, displacement, REACH)
-        v = thermal_velocities(system, here, 1.0, rng)
+        v = thermal_velocities(system, here, 1.0, generator)
         changes = np.zeros((2, *here.shape))
         for way in (flight, -flight):
             there, _ = system.flown(here, v, way)

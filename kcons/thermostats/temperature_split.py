@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, generator_of, positive, refuse_other, whole_number
+from kcons.constraints.arguments import Rng, as_array, generator_of, positive, refuse_other, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -39,9 +39,9 @@ from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.bodies import UNCHANGED, bodies, row_changes
 from kcons.thermostats.configurational_temperature import temperature
-from kcons.thermostats.correlated_series import FEWEST, Estimate
+from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate
 from kcons.thermostats.freedom import atom_numbers
-from kcons.thermostats.isokinetic.step import constrained_acceleration
+from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Typical move for a difference, as a share of the distance to the next atom.
@@ -186,7 +186,7 @@ class TemperatureSplit:
     ----------
     system : System
         Constraints, and forces of any provider; in any consistent units.
-    seed : int
+    rng : int, numpy.random.Generator or None
         Of the random moves.
     displacement : float, optional
         Typical move of an atom for a difference; a thousandth of the distance to the next atom by default. Forces in
@@ -198,8 +198,6 @@ class TemperatureSplit:
 
     Raises
     ------
-    InputError
-        A displacement that is not positive, bad atom numbers, no direction.
     UnsupportedError
         Targets move, rows hold velocities, or forces depend on velocities.
 
@@ -213,7 +211,7 @@ class TemperatureSplit:
         self,
         system: System,
         *,
-        seed: int = 0,
+        rng: Rng = 0,
         displacement: float | None = None,
         directions: int = 1,
         groups: Mapping[str, ArrayLike] | None = None,
@@ -230,7 +228,7 @@ class TemperatureSplit:
         self._system, self._displacement = system, displacement
         self._directions = whole_number(directions, "directions")
         self._groups = {name: atom_numbers(atoms, system.n_atoms) for name, atoms in (groups or {}).items()}
-        self._rng = generator_of(seed, "seed")
+        self._rng = generator_of(rng)
         self._clusters: Clusters | None = None
         #: Clusters with motions besides shifts and turns; known after the first draw.
         self._rest: NDArray[np.bool_] | None = None
@@ -246,9 +244,7 @@ class TemperatureSplit:
         Raises
         ------
         InputError
-            Wrong shapes, NaN or infinity; positions off the constraints; groups without a cluster.
-        NonFiniteError
-            Forces that are not finite.
+            Positions off the constraints; groups without a cluster.
         """
         system = self._system
         x = configuration(system, positions)
@@ -282,9 +278,9 @@ class TemperatureSplit:
         UserWarning
             Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
         """
-        if len(self._series) < FEWEST or self._clusters is None or self._rest is None:
+        if len(self._series) < MIN_SAMPLES or self._clusters is None or self._rest is None:
             raise InputError(
-                f"{len(self._series)} samples are too few for an error; add {FEWEST} or more", item="samples"
+                f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
             )
         names = [None, *self._groups]
         if group not in names:
@@ -422,13 +418,7 @@ class TemperatureSplit:
 
 
 def configuration(system: System, positions: ArrayLike) -> FloatArray:
-    """Positions that are on the constraints.
-
-    Raises
-    ------
-    InputError
-        Another shape, NaN or infinity; off the constraints.
-    """
+    """Positions, shape (n_atoms, 3), that are finite and on the constraints; `InputError` otherwise."""
     x = as_array(positions, (system.n_atoms, 3), "positions")
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
     if len(bad):
@@ -463,12 +453,7 @@ def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:
 def flight_of(system: System, x: FloatArray, displacement: float | None, share: float) -> float:
     """How long atoms that move fly at unit thermal energy until they have typically moved so far.
 
-    By default that is a share of the distance to the next atom.
-
-    Raises
-    ------
-    InputError
-        All atoms are fixed; a displacement that is not positive; none, and one atom only.
+    By default that is a share of the distance to the next atom, which a single atom has not.
     """
     moving = system.inverse_masses > 0
     if not moving.any():

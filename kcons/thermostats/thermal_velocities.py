@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, generator_of, positive
+from kcons.constraints.arguments import Rng, as_array, generator_of, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import System
@@ -18,7 +18,7 @@ def thermal_velocities(
     system: System,
     positions: ArrayLike,
     thermal_energy: float,
-    rng: np.random.Generator | int,
+    rng: Rng,
     *,
     time: float = 0.0,
     zero_momentum: bool = False,
@@ -36,8 +36,7 @@ def thermal_velocities(
         On the constraints.
     thermal_energy : float
         k_B T.
-    rng : numpy.random.Generator or int
-        A generator, or a seed for one.
+    rng : int, numpy.random.Generator or None
     time : float
         For targets that move.
     zero_momentum : bool
@@ -48,7 +47,7 @@ def thermal_velocities(
     Raises
     ------
     InputError
-        Energies that are not positive; nothing can move.
+        Nothing can move.
     UnsupportedError
         `zero_momentum` with rows that hold atoms in space in every direction.
     """

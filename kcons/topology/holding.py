@@ -159,13 +159,7 @@ class Holding:
 
 
 def water_geometry(given: Any, item: str) -> tuple[float, float]:
-    """O-H length (angstrom) and H-O-H angle (degrees) that somebody gave.
-
-    Raises
-    ------
-    InputError
-        No two numbers; no geometry of a water.
-    """
+    """O-H length (angstrom) and H-O-H angle (degrees) that somebody gave."""
     try:
         length, angle = (float(v) for v in given)
     except (TypeError, ValueError):

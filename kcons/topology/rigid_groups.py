@@ -211,13 +211,7 @@ def _water_sites(
 
 
 def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
-    """The atoms of the residues with these names, one array of shape (n_residues, n_atoms) for each size.
-
-    Raises
-    ------
-    InputError
-        A name that no residue has.
-    """
+    """The atoms of the residues with these names, one array of shape (n_residues, n_atoms) for each size."""
     topology = snapshot.topology
     present = np.char.upper(np.char.strip(topology.residue_names))
     chosen = np.zeros(len(present), dtype=bool)

@@ -76,12 +76,7 @@ class HeldRows(list[Constraint]):
         return self.snapshot.topology
 
     def require_atoms(self, n: int, indices: IntArray | None, host: str) -> None:
-        """Refuse these rows for another system, or for another part of the same; `indices`, `host` as of a `Snapshot`.
-
-        Raises
-        ------
-        InputError
-        """
+        """Refuse these rows for another system or part of it; `indices`, `host` as of a `Snapshot`."""
         mine = self.snapshot
         remedy = "make them for the same atoms: constraints_of(group), with the group that is given here"
         if mine.topology.n_atoms != n:

@@ -412,12 +412,7 @@ def whole_numbers(ids: StrArray) -> IntArray:
 
 
 def require_standard_form(cell: FloatArray, engine: str, positive: bool = False) -> None:
-    """Refuse a cell that would have to be turned, and the positions with it; if `positive`, also one turned inside out.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a cell that has to be turned, and positions with it; if `positive`, also one turned inside out."""
     turned = np.abs(np.triu(cell, 1)).max() > 1e-6 * np.abs(cell).max()
     if turned or (positive and np.diag(cell).min() <= 0):
         raise InputError(
@@ -431,12 +426,7 @@ def require_standard_form(cell: FloatArray, engine: str, positive: bool = False)
 
 
 def require_kind(given: Any, kind: type | UnionType, item: str, wanted: str) -> None:
-    """Refuse what is no `kind`; `wanted` says of such a one what it is and where it comes from.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse what is no `kind`; `wanted` says of such a one what it is and where it comes from."""
     if not isinstance(given, kind):
         each = "; of several, give one at a time" if isinstance(given, list | tuple) else ""
         raise InputError(f"{item} must be {wanted}, not {type(given).__name__}{each}", item=item)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -42,7 +42,7 @@ class VirtualSites:
 
     def place(self, positions: ArrayLike) -> FloatArray:
         """Positions with the sites where they belong, shape (n_atoms, 3); molecules must be whole."""
-        x = np.array(numbers(positions, "positions"))
+        x = np.array(as_float_array(positions, "positions"))
         origin, u, w = self._arms(x)
         a, b, c = self.coefficients.T[:, :, None]
         x[self.sites] = origin + a * u + b * w + c * np.cross(u, w)
@@ -53,8 +53,8 @@ class VirtualSites:
 
         The work along any motion of the parents, total force and torque stay the same.
         """
-        x = numbers(positions, "positions")
-        f = np.array(numbers(forces, "forces"))
+        x = as_float_array(positions, "positions")
+        f = np.array(as_float_array(forces, "forces"))
         if f.shape != x.shape:
             raise InputError(f"forces have shape {f.shape}, positions {x.shape}", item="forces")
         _, u, w = self._arms(x)

@@ -35,12 +35,10 @@ from kcons.ase import (
     constrain,
     rigid_water,
 )
-from kcons.constraints import Angle, CenterDistance, Distance, LinearVelocity, Sphere
+from kcons.constraints import Angle, CenterDistance, Distance, Sphere
 from kcons.errors import (
-    ContradictionError,
     ConvergenceError,
     InputError,
-    SingularGeometryError,
     UnsupportedError,
 )
 from kcons.steppers import BlanesMoan4
@@ -210,43 +208,7 @@ def test_fixed_atoms_and_components_alongside(run):
     assert atoms.get_number_of_degrees_of_freedom() == 27 - 3 - 2 - 3
 
 
-@pytest.mark.parametrize(
-    ("row", "what"),
-    [
-        (Distance([0, 1], lambda t: 1.0 + t), "moves with time"),
-        (LinearVelocity(0, [[1, 0, 0]]), "constrains velocities"),
-    ],
-)
-def test_rows_that_need_the_time_are_refused(row, what):
-    with pytest.raises(UnsupportedError, match=what):
-        constrain(molecule("H2O"), row)
-
-
 # -- bad input --------------------------------------------------------------------------------------
-
-
-def nan_at(atom):
-    atoms = molecule("H2O")
-    atoms.positions[atom, 1] = np.nan
-    return atoms
-
-
-@pytest.mark.parametrize(
-    ("atoms", "rows", "error", "message"),
-    [
-        (nan_at(1), Distance([0, 1]), InputError, "position of atom 1 is not finite"),
-        (molecule("H2O"), Distance([0, 7]), InputError, "no atom 7"),
-        (Atoms("OH", np.eye(3)[:2], masses=[16, 0]), Distance([0, 1]), InputError, "atom 1 has mass 0"),
-        (Atoms("OH"), Distance([0, 1]), SingularGeometryError, "atoms 0 and 1 coincide"),
-        (Atoms("OH", np.eye(3)[:2], cell=[2.5] * 3, pbc=True), Distance([0, 1], 1.5), InputError, "half the box"),
-        (molecule("H2O"), [Distance([0, 1], 0.9), Distance([1, 0], 1.0)], ContradictionError, "different targets"),
-        (molecule("H2O"), [FixAtoms([0])], InputError, "from_ase_constraints"),
-    ],
-)
-def test_bad_input_is_named(atoms, rows, error, message):
-    with pytest.raises(error, match=message):
-        constrain(atoms, rows)
-    assert atoms.constraints == []
 
 
 def test_a_step_too_large_changes_nothing():
@@ -265,29 +227,6 @@ def test_a_step_too_large_changes_nothing():
         atoms.set_positions(new)
     assert np.array_equal(atoms.positions, before)
     atoms.set_positions(before + 0.01)  # and the object still works
-
-
-@pytest.mark.parametrize("hook", ["adjust_positions", "adjust_momenta", "adjust_forces"])
-def test_hooks_refuse_what_is_not_finite_or_of_another_shape(hook):
-    atoms = molecule("H2O")
-    held = constrain(atoms, rigid_water(atoms))
-    values = np.ones((3, 3))
-    values[1, 1] = np.nan
-    asked = values.copy()
-    with pytest.raises(InputError, match=r"(position|momentum|force) of atom 1 is not finite"):
-        getattr(held, hook)(atoms, values)
-    assert np.array_equal(values, asked, equal_nan=True)
-    with pytest.raises(InputError, match=r"shape \(3, 3\)"):
-        getattr(held, hook)(atoms, np.zeros((4, 3)))
-
-
-def test_time_step_too_large_in_dynamics():
-    atoms, held = rigid(2, temperature=3000)
-    atoms.calc = Free()
-    with pytest.raises(ConvergenceError, match="smaller"):
-        VelocityVerlet(atoms, 60 * units.fs).run(50)
-    assert off(atoms, held) <= 1e-13
-    assert np.isfinite(atoms.get_momenta()).all()
 
 
 def test_a_second_object_of_kcons_says_how_to_make_one():

@@ -13,11 +13,11 @@ from ase.calculators.tip3p import TIP3P
 from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase_systems import FS, Free, loose_waters, off, random, rigid, row_of_dumbbells, slip
+from ase_systems import FS, Free, loose_waters, off, random, rigid, slip
 
 from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
 from kcons.ase.topology import bonds_of
-from kcons.constraints import CenterDistance, Dihedral, Distance, FixedAtoms
+from kcons.constraints import CenterDistance, Dihedral, Distance
 from kcons.errors import ContradictionError, InfeasibleError, InputError
 
 # -- dynamics and optimization ----------------------------------------------------------------------
@@ -49,18 +49,6 @@ def test_agrees_with_fix_bond_lengths():
     assert np.abs(atoms.get_velocities() - peer.get_velocities()).max() <= 1e-9
 
 
-def test_free_dumbbells_keep_energy_momentum_and_angular_momentum():
-    atoms = row_of_dumbbells(3)
-    held = constrain(atoms, Distance([[0, 1], [2, 3], [4, 5]]))
-    thermalize_momenta(atoms, 300, rng=random(0))
-    before = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
-    VelocityVerlet(atoms, 2 * units.fs).run(100)
-    after = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
-    for a, b in zip(before, after, strict=True):
-        assert a == pytest.approx(b, rel=1e-10, abs=1e-10)
-    assert off(atoms, held) <= 1e-14
-
-
 def test_periodic_wrap_changes_nothing():
     cell = np.array([[7.0, 0, 0], [2.0, 6.5, 0], [-1.0, 1.5, 6.0]])
     whole = molecule("H2O")
@@ -80,17 +68,6 @@ def test_periodic_wrap_changes_nothing():
     cells = (wrapped.positions - whole.positions) @ np.linalg.inv(cell)
     assert np.abs(cells - np.round(cells)).max() <= 1e-11
     assert np.ptp(np.round(cells), axis=0).max() > 0  # the molecule was really cut
-
-
-def test_pendulum_of_fixed_atom_and_bond():
-    atoms = Atoms("CO", positions=[[0, 0, 0], [1.1, 0, 0]], calculator=Free())
-    held = constrain(atoms, [Distance([0, 1]), FixedAtoms([0])])
-    atoms.set_momenta([[3.0, 0, 0], [1.0, 2.0, 0]])
-    VelocityVerlet(atoms, 1 * units.fs).run(100)
-    assert np.array_equal(atoms.positions[0], [0, 0, 0])
-    assert np.array_equal(atoms.get_momenta()[0], [0, 0, 0])
-    assert off(atoms, held) <= 1e-14
-    assert atoms.get_kinetic_energy() == pytest.approx(0.5 * 2.0**2 / atoms.get_masses()[1], rel=1e-10)
 
 
 def test_float32_forces():

@@ -77,17 +77,6 @@ def test_atoms_at_rest_ask_for_the_same_positions():
     assert atoms.positions == pytest.approx(start, abs=1e-14)
 
 
-def test_momenta_of_edited_atoms():
-    atoms, held = dumbbells(2)
-    before = atoms.get_momenta()
-    atoms.positions[0] += 0.1
-    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\).*restore"):
-        atoms.set_momenta(np.ones((4, 3)))
-    assert np.array_equal(atoms.get_momenta(), before)
-    held.restore(atoms)
-    atoms.set_momenta(np.ones((4, 3)))
-
-
 def test_positions_that_are_not_finite_are_named():
     held = ConstraintSet(Distance([[0, 1]]), [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [1.0, 1.0])
     with pytest.raises(InputError, match="position of atom 1 is not finite"):

@@ -100,7 +100,7 @@ def test_the_notes_convention_is_found_to_be_hot():
 
 def test_results_can_be_repeated():
     again = sample(chain(), SAMPLERS["langevin"], 5 * UNIT, 0.01 / UNIT, length=40_000 * UNIT)
-    other = sample(chain(), SAMPLERS["langevin"], 5 * UNIT, 0.01 / UNIT, length=40_000 * UNIT, seed=2)
+    other = sample(chain(), SAMPLERS["langevin"], 5 * UNIT, 0.01 / UNIT, length=40_000 * UNIT, rng=2)
     assert again["turn"] == one("langevin")["turn"] != other["turn"]
 
 
@@ -196,7 +196,7 @@ def test_a_sampler_of_ones_own_goes_on_and_its_lines_run():
         ({"methods": ["rattle"]}, "there is no thermostat 'rattle'; there are langevin"),
         ({"methods": []}, "no thermostat is named"),
         ({"methods": ["spheres"]}, "spheres uses cheap forces"),
-        ({"budget": 0}, "give a positive number of seconds"),
+        ({"budget": 0}, "budget is 0; give a positive number"),
         ({"steps": [4.0, -3.0]}, "time step -3 fs: give a positive number"),
         ({"steps": [4.0, 4000.0]}, "a step of 4000 fs is too long"),
         ({"frictions": [0.1, -1.0]}, "friction is"),

@@ -160,7 +160,7 @@ def test_what_a_method_raises_is_a_result(registry):
 
 
 def test_bad_input():
-    with pytest.raises(InputError, match="the budget is 0 s; give a positive number"):
+    with pytest.raises(InputError, match="budget is 0; give a positive number"):
         compare(chain(), ["rattle"], budget=0)
 
 

@@ -40,7 +40,7 @@ def apart(system):
 
 
 def test_a_test_system_of_ones_own():
-    def two(size, seed, *, stretch=1.0):
+    def two(size, rng, *, stretch=1.0):
         return replace(small("rotor"), name="mine", title=f"{size} {stretch}")
 
     add_system("mine", two, "mine", size=3, quick_size=2, takes=("stretch",))
@@ -92,10 +92,10 @@ def test_error_estimate_of_the_converged_reference_is_honest():
 def test_thermal_velocities():
     system = small("water")
     draw = functools.partial(thermal_velocities, system.motion, system.positions, 300.0)
-    v, masses = draw(seed=3), system.masses[:, None]
+    v, masses = draw(rng=3), system.masses[:, None]
     assert np.abs(np.sum(masses * v, axis=0)).max() < 1e-12
     assert 0.5 * np.sum(masses * v**2) == pytest.approx(0.5 * (6 * 8 - 3) * units.kB * 300.0, rel=1e-12)
-    assert np.array_equal(v, draw(seed=3)) and not np.allclose(v, draw(seed=4))
+    assert np.array_equal(v, draw(rng=3)) and not np.allclose(v, draw(rng=4))
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_integration_meets_the_exponential_and_states_an_honest_error():
 
 
 def test_free_particles_stay_on_their_great_circles():
-    system = test_systems.build("sphere", 3, seed=5)
+    system = test_systems.build("sphere", 3, rng=5)
     there, x, v = system.reference().positions[0], system.positions[0], system.velocities[0]
     assert np.linalg.norm(there) == pytest.approx(1.0, abs=1e-14)
     assert there @ np.cross(x, v) == pytest.approx(0.0, abs=1e-14)

@@ -94,7 +94,7 @@ masses = np.array([63.5, 40.0, 12.0, 1.0])
 force = lambda q, t: -0.3 * (q - x) * (1 + q * q)
 for rows, stepper in (
     ([Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2]])], None),
-    ([Sphere([3], [0.5, 0.5, 0.5], None)], Langevin(0.1, 0.1, seed=1)),
+    ([Sphere([3], [0.5, 0.5, 0.5], None)], Langevin(0.1, 0.1, rng=1)),
     ([Distance([[0, 1], [1, 2]])], Isokinetic()),
 ):
     motion = Motion(ConstraintSet(rows, x, masses), x)

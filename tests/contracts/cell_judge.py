@@ -14,10 +14,10 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.md.verlet import VelocityVerlet
 from cell_molecules import half_width
-from cell_oracle import EPS, Array, NoSolution, advance
+from cell_oracle import EPS, Array, NoSolution, advance, stepper_of
 from cell_worlds import World, world, wrapping
 
-from kcons import ConstraintSet, Motion, State, System, run, steppers
+from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
 from kcons.errors import KconsError
 
@@ -171,7 +171,7 @@ class Judge:
         anchors = w.stored(w.anchors)
         system = System(self.motion, lambda x, t: -w.springs * (x - anchors))
         try:
-            run(system, State(self.x.copy(), w.v.copy()), w.dt / 8, 8 * (step + 2), stepper=_stepper(w.stepper))
+            run(system, State(self.x.copy(), w.v.copy()), w.dt / 8, 8 * (step + 2), stepper=stepper_of(w.stepper))
         except KconsError as again:
             return UNDEFINED in str(again) and abs(getattr(again, "step", 0) / 8 - step) < 2
         return False
@@ -407,7 +407,7 @@ class Judge:
         """A run in parts; between them an MD engine may choose other images, or another cell."""
         w, rows, rng = self.w, self.rows, self.rng
         images, cell = w.images, w.cell
-        stepper = _stepper(w.stepper)
+        stepper = stepper_of(w.stepper)
         anchors = [w.stored(w.anchors)]
         system = System(self.motion, lambda x, t: -w.springs * (x - anchors[0]))
         state = State(self.x.copy(), w.v.copy())
@@ -631,14 +631,6 @@ class Springs(Calculator):
         super().calculate(atoms, properties, system_changes)
         d = atoms.positions - self.anchors
         self.results = {"energy": 0.5 * float((self.springs * d * d).sum()), "forces": -self.springs * d}
-
-
-def _stepper(name: str) -> Any:
-    if name.startswith("Geodesic"):
-        return steppers.Geodesic(int(name[8:]), great_circles=False)
-    if name == "ProjectedVerlet":
-        return steppers.ProjectedVerlet(project=True)
-    return getattr(steppers, name)()
 
 
 def _top(*arrays: Array) -> float:

@@ -1,20 +1,23 @@
 """Dense mechanics of rows on whole molecules: what the engine is judged by in periodic cells.
 
-Nothing here comes from the package, and nothing here knows of minimum images: positions are those of whole molecules,
-and a row that leads through the boundary says by which lattice vectors. Every row is a function of a few vectors that
-are linear in the positions; values, gradients and second derivatives along a motion are taken from there by the
-product rule. Projections are least squares on the singular vectors of B = A M^-1/2, so that rows may depend on each
-other; fixed atoms have infinite mass.
+Nothing here comes from the package but the fractions of a step, and nothing knows of minimum images: positions are
+those of whole molecules, and a row that leads through the boundary says by which lattice vectors. Every row is a
+function of a few vectors that are linear in the positions; values, gradients and second derivatives along a motion are
+taken from there by the product rule. Projections are least squares on the singular vectors of B = A M^-1/2, so that
+rows may depend on each other; fixed atoms have infinite mass.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+
+from kcons import steppers
+from kcons.comparison.projected_equation import ProjectedEquation
 
 Array = np.ndarray
 EPS = float(np.finfo(float).eps)
@@ -395,33 +398,14 @@ def _dihedral_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
 
 # -- motion -------------------------------------------------------------------------------------
 
-_S = 1.0 / (4.0 - 4.0 ** (1 / 3))
-_Y = 1.0 / (2.0 - 2.0 ** (1 / 3))
-_KL = (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230)
-_BM_B = (0.0829844064174052, 0.396309801498368, -0.0390563049223486)
-_BM_A = (0.245298957184271, 0.604872665711080)
-#: Kicks, drifts and the parts of each drift, as fractions of the step (Suzuki 1990; Yoshida 1990; Kahan and Li 1997;
-#: Blanes and Moan 2002, SRKN 6b).
-_FRACTIONS = {
-    "Suzuki4": (_S, _S, 1 - 4 * _S, _S, _S),
-    "Yoshida4": (_Y, 1 - 2 * _Y, _Y),
-    "KahanLi6": (*_KL, 1 - 2 * sum(_KL), *_KL[::-1]),
-}
 
-
-def scheme(name: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Kicks, drifts and parts of a drift of a stepper."""
-    if name == "Rattle":
-        return (0.5, 0.5), (1.0,), (1.0,)
+def stepper_of(name: str) -> Any:
+    """A stepper of the package: its fractions of kicks and drifts are the only thing that the oracle takes from it."""
     if name.startswith("Geodesic"):
-        parts = int(name[8:])
-        return (0.5, 0.5), (1.0,), (1 / parts,) * parts
-    if name == "BlanesMoan4":
-        middle = 0.5 - sum(_BM_A)
-        return (*_BM_B, 1 - 2 * sum(_BM_B), *_BM_B[::-1]), (*_BM_A, middle, middle, *_BM_A[::-1]), _FRACTIONS["Suzuki4"]
-    g = _FRACTIONS[name]
-    ends = [0.0, *g, 0.0]
-    return tuple(0.5 * (a + b) for a, b in itertools.pairwise(ends)), g, (1.0,)
+        return steppers.Geodesic(int(name[8:]), great_circles=False)
+    if name == "ProjectedVerlet":
+        return ProjectedEquation(project=True)
+    return getattr(steppers, name)()
 
 
 def advance(rows: Dense, name: str, x: Array, v: Array, t: float, dt: float, force) -> tuple[Array, Array]:
@@ -432,7 +416,8 @@ def advance(rows: Dense, name: str, x: Array, v: Array, t: float, dt: float, for
         y = rows.solve(x + dt * half, x, t + dt)[0]
         v = half + 0.5 * dt * rows.acceleration(y, half + 0.5 * dt * a, force(y), t + dt)
         return y, rows.velocities(y, v, t + dt)
-    kicks, drifts, parts = scheme(name)
+    stepper = stepper_of(name)
+    kicks, drifts, parts = stepper.kicks, stepper.drifts, stepper.flight
     weights = rows.weights[:, None]
     end = t + dt
     v = v + kicks[0] * dt * weights * force(x)

@@ -49,15 +49,12 @@ from kcons.constraints import (
 )
 from kcons.errors import KconsError
 from kcons.steppers import (
-    Baumgarte,
     BlanesMoan4,
     BlanesMoan6,
     BlanesMoan6a,
     Extrapolation,
     Geodesic,
     KahanLi6,
-    ProjectedRungeKutta4,
-    ProjectedVerlet,
     ReversibilityCheck,
     Splitting,
     Suzuki4,
@@ -294,9 +291,7 @@ def plain_steppers() -> Iterator[tuple[str, list[State]]]:
                 continue
             yield f"{name}: {label}", trail(system, state, stepper)
     checked = ReversibilityCheck(Rattle(), 1e-6)
-    for stepper in (ProjectedVerlet(), ProjectedVerlet(project=True), ProjectedRungeKutta4(project=True), checked):
-        yield f"small clusters: {stepper!r}", trail(*molecules(*GROUPS), stepper)
-    yield "moving targets: Baumgarte", trail(*driven(), Baumgarte(1.0))
+    yield f"small clusters: {checked!r}", trail(*molecules(*GROUPS), checked)
     for name, make in (("small clusters", lambda: molecules(*GROUPS)), ("moving targets", driven)):
         system, state = make()
         yield f"{name}: Extrapolation", list(Extrapolation(1e-9).states(system, state, state.time + 0.5))

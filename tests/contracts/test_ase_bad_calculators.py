@@ -107,3 +107,5 @@ def test_atoms_that_are_not_held_count_too(atom, bad):
         with pytest.raises(InputError, match=f"{what}.* of atom {atom} is not finite|{what}.*atom {atom}"):
             getattr(held, hook)(atoms, values)
         assert np.array_equal(values, asked, equal_nan=True)
+        with pytest.raises(InputError, match=r"shape \(9, 3\)"):
+            getattr(held, hook)(atoms, np.zeros((4, 3)))

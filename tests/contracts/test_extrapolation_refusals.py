@@ -14,7 +14,6 @@ from kcons.steppers import (
     Composition,
     Extrapolation,
     Geodesic,
-    ProjectedVerlet,
     Rattle,
     ReversibilityCheck,
     Suzuki4,
@@ -108,7 +107,7 @@ def test_wrong_shapes_of_forces() -> None:
 
 @pytest.mark.parametrize(
     "base",
-    [ProjectedVerlet(project=True), Suzuki4(), Isokinetic(1.0), Langevin(1.0, 1.0, 1)],
+    [Suzuki4(), Isokinetic(1.0), Langevin(1.0, 1.0, 1)],
     ids=lambda base: type(base).__name__,
 )
 def test_bases_that_cannot_be_extrapolated(base) -> None:
@@ -142,7 +141,3 @@ def test_what_the_base_refuses_is_refused_before_any_step() -> None:
     swinging, start = rotor()
     with pytest.raises(UnsupportedError, match="great circles"):
         Extrapolation(base=Geodesic(great_circles=True)).states(swinging, start, 1.0)
-
-
-def test_repr() -> None:
-    assert repr(Extrapolation(1e-9)) == "Extrapolation(1e-09, base=Geodesic(substeps=4))"

@@ -1,21 +1,20 @@
-"""The isokinetic thermostat: parts of a system, times and restarts, and every bad input named."""
+"""The isokinetic thermostat: parts of a system, what runs go on from, extremes, and bad input named."""
 
 from __future__ import annotations
 
-import io
 import math
 import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from isokinetic_systems import ORDERS, water_and_more
+from isokinetic_systems import water_and_more
 from thermostat_systems import dumbbells, swirling, system, waves, waves_potential
 
 from kcons.constraints import Distance, Plane, Sphere
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
-from kcons.steppers import State, System, run
-from kcons.thermostats import Isokinetic, Langevin, thermal_velocities
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import BlanesMoan6, Rattle, State, System, run
+from kcons.thermostats import Isokinetic, thermal_velocities
 
 # -- parts, times, restarts -------------------------------------------------------------------------
 
@@ -30,8 +29,6 @@ def test_a_subset_keeps_its_kinetic_energy_and_the_rest_its_motion():
         inside = (np.array(masses)[:3, None] * after.velocities[:3] ** 2).sum()
         assert inside == pytest.approx((6 - 1) * 0.5, rel=1e-14)
         # Here the field couples nothing: the other molecule moves as without a thermostat.
-        from kcons.steppers import BlanesMoan6, Rattle
-
         plain = run(held, start, 0.01, 100, stepper=Rattle() if order == 2 else BlanesMoan6())
         assert np.abs(after.positions[3:] - plain.positions[3:]).max() <= (1e-13 if order == 2 else 1e-8)
         assert np.abs(after.positions[:3] - plain.positions[:3]).max() > 0.05
@@ -45,24 +42,6 @@ def test_a_strong_force_on_a_subset_leaves_the_rest_alone():
     after = Isokinetic(atoms=[0]).step(held, start, 0.1)
     np.testing.assert_allclose(np.linalg.norm(after.velocities[0]), 1.0, rtol=1e-14)
     np.testing.assert_allclose(after.velocities[1], [0, 0.1, 1.0], rtol=1e-14)
-
-
-@pytest.mark.parametrize("far", [0.0, 1e6])
-@ORDERS
-def test_a_saved_run_goes_on_to_the_last_bit(order, far):
-    held, x = dumbbells(2, force=lambda x, t: waves(x - far))
-    thermostat = Isokinetic(0.5, order=order)
-    start = held.initial_state(x + far, thermal_velocities(held, x, 0.5, 4), project=True)
-    assert (start.remainder is not None) == (far > 0)
-    half = run(held, start, 0.02, 25, stepper=thermostat)
-    whole = run(held, half, 0.02, 25, stepper=thermostat)
-    file = io.BytesIO()
-    half.save(file)
-    file.seek(0)
-    again = run(held, State.load(file), 0.02, 25, stepper=Isokinetic(0.5, order=order))
-    for name in ("positions", "velocities", "forces", "thermostat"):
-        assert np.array_equal(getattr(whole, name), getattr(again, name)), name
-    assert again.time == whole.time and again.step == 50
 
 
 def test_a_run_goes_on_from_positions_and_velocities_alone():
@@ -83,14 +62,6 @@ def test_forces_that_were_dropped_are_found_again():
     stale = replace(state, forces=None, thermostat=state.thermostat * [1, 1, 17.0, 1])
     a, b = (thermostat.step(held, s, 0.02) for s in (state, stale))
     assert np.array_equal(a.positions, b.positions) and np.array_equal(a.velocities, b.velocities)
-
-
-def test_a_step_of_zero_changes_nothing():
-    held, x = dumbbells(2)
-    state = Isokinetic(0.5).start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4)))
-    after = Isokinetic(0.5).step(held, state, 0.0)
-    assert np.array_equal(after.positions, state.positions) and np.array_equal(after.velocities, state.velocities)
-    assert after.step == 1
 
 
 def test_velocities_off_the_constraints_are_projected_and_scaled():
@@ -127,23 +98,11 @@ def test_force_evaluations():
 # -- bad input --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", [0.0, 1e-160])
-def test_zero_velocity(speed):
-    """H22: also where 2K underflows."""
-    held, x = dumbbells(2)
-    v = speed * thermal_velocities(held, x, 1.0, 0)
-    with pytest.raises(InputError, match="needs non-zero kinetic energy: draw velocities first"):
-        Isokinetic(0.5).step(held, State(x, v), 0.01)
-
-
 def test_one_degree_of_freedom():
-    """H23: g = 1 has no temperature, but a kinetic energy; g = 2 has beta = 1/2K."""
+    """g = 1 has no temperature, but a kinetic energy; g = 2 has beta = 1/2K."""
     x = np.array([[1.0, 0, 0]])
     one = [Plane([0], [0, 0, 1.0]), Sphere([0], [0, 0, 0], 1.0)]
     state = State(x, np.array([[0.0, 0.7, 0.0]]))
-    with pytest.raises(OverdeterminedError, match="g - 1 = 0: isokinetic temperature undefined") as caught:
-        Isokinetic(1.0).step(system(one, x, [1.0], waves), state, 0.01)
-    assert isinstance(caught.value, ValueError)
     ring = system(one, x, [1.0], waves)
     after = run(ring, state, 0.01, 100, stepper=Isokinetic(kinetic_energy=0.1))
     assert ring.kinetic_energy(after.velocities) == pytest.approx(0.1, rel=1e-14)
@@ -152,17 +111,8 @@ def test_one_degree_of_freedom():
 
 
 @pytest.mark.parametrize("size", [1e6, 1e12])
-def test_huge_forces(size):
-    """H24, H25: the naive cosh overflows; along a bond nothing of them may be left."""
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    across = size * np.array([[0, 1.0, 0], [0, 0.5, 0.1]])
-    free = system([], x, [1.0, 2.0], lambda x, t: across)
-    v = np.array([[0.3, -0.2, 0.1], [0.1, -0.4, 0.3]])
-    after = Isokinetic(momentum="free").step(free, State(x, v), 0.01)
-    twice = 2 * free.kinetic_energy(v)
-    assert 2 * free.kinetic_energy(after.velocities) == pytest.approx(twice, rel=1e-15)
-    pace = across / free.masses[:, None]
-    np.testing.assert_allclose(after.velocities, pace * math.sqrt(twice / (across * pace).sum()), rtol=1e-13)
+def test_nothing_is_left_of_huge_forces_along_a_bond(size):
+    x, v = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.3, -0.2, 0.1], [0.1, -0.4, 0.3]])
     held = system([Distance([[0, 1]])], x, [1.0, 2.0], lambda x, t: waves(x) + size * _along(x))
     plain = system([Distance([[0, 1]])], x, [1.0, 2.0], waves)
     thermostat = Isokinetic(momentum="free")
@@ -177,26 +127,6 @@ def _along(x):
     return np.array([-d, d])
 
 
-def test_bad_forces_leave_the_state_alone():
-    held, x = dumbbells(2)
-    calls = [0]
-
-    def bad(x, t):
-        calls[0] += 1
-        return waves(x) * (np.nan if calls[0] > 3 else 1.0)
-
-    broken = System(held.motion, bad)
-    state = State(x, thermal_velocities(held, x, 0.5, 1))
-    state = Isokinetic(0.5, momentum="free").step(broken, state, 0.01)
-    copies = [state.positions.copy(), state.velocities.copy(), state.thermostat.copy()]
-    state = Isokinetic(0.5).step(broken, state, 0.01)
-    copies = [state.positions.copy(), state.velocities.copy(), state.thermostat.copy()]
-    with pytest.raises(NonFiniteError, match="non-finite force at step 3"):
-        Isokinetic(0.5).step(broken, state, 0.01)
-    for now, before in zip((state.positions, state.velocities, state.thermostat), copies, strict=True):
-        assert np.array_equal(now, before)
-
-
 def test_forces_whose_squares_overflow():
     x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     v = np.array([[0.3, -0.2, 0.1], [0.1, -0.4, 0.3]])
@@ -208,13 +138,6 @@ def test_forces_whose_squares_overflow():
         Isokinetic(momentum="free").step(light, State(x, v), 0.01)
 
 
-def test_a_step_that_is_too_large_names_itself():
-    held, x = dumbbells(2)
-    state = State(x, thermal_velocities(held, x, 5.0, 1))
-    with pytest.raises(ConvergenceError, match=r"step 1: time step too large \(dt = 9\)"):
-        Isokinetic(5.0).step(held, state, 9.0)
-
-
 def test_targets_that_are_too_fast():
     x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]])
     fast = system([Distance([[0, 1]], lambda t: 1 + 50.0 * t)], x, [1.0, 1.0, 1.0], waves)
@@ -224,20 +147,6 @@ def test_targets_that_are_too_fast():
     later = system([Distance([[0, 1]], lambda t: 1 + 20.0 * t**2)], x, [1.0, 1.0, 1.0], waves)
     with pytest.raises(InputError, match="than the thermostat allows at step"):
         run(later, later.initial_state(x, thermal_velocities(later, x, 0.5, 0)), 0.01, 100, stepper=Isokinetic(0.5))
-
-
-def test_velocity_dependent_forces_are_refused():
-    held, x = dumbbells(2)
-    with pytest.raises(UnsupportedError, match="no closed kick"):
-        Isokinetic(0.5).step(System(held.motion, lambda x, v, t: -v, velocity_dependent=True), State(x, x), 0.1)
-
-
-def test_variables_of_another_thermostat_are_refused():
-    held, x = dumbbells(2)
-    other = Langevin(0.5, 1.0, seed=1).step(held, State(x, thermal_velocities(held, x, 0.5, 1)), 0.01)
-    with pytest.raises(InputError, match="variables of another thermostat, not of Isokinetic"):
-        Isokinetic(0.5).step(held, other, 0.01)
-    Isokinetic(0.5).step(held, replace(other, thermostat=None), 0.01)
 
 
 def test_a_row_between_inside_and_outside_is_refused():
@@ -256,9 +165,3 @@ def test_momentum_stays_zero():
         state = State(x, thermal_velocities(held, x, 0.5, 1, zero_momentum=True))
         after = run(held, state, 0.01, 2000, stepper=Isokinetic(0.5))
     assert np.abs(held.masses @ after.velocities).max() <= 1e-11
-
-
-def test_repr_shows_what_differs():
-    assert repr(Isokinetic(0.5)) == "Isokinetic(0.5)"
-    assert repr(Isokinetic(kinetic_energy=1.0, order=4)) == "Isokinetic(kinetic_energy=1.0, order=4)"
-    assert repr(Isokinetic(0.5, atoms=3)) == "Isokinetic(0.5, atoms=<1 atoms>)"

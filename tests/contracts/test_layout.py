@@ -119,19 +119,6 @@ def test_functions_are_small():
     assert found == {}, "too large"
 
 
-def test_what_is_larger_than_it_may_be_is_found(tmp_path, monkeypatch):
-    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
-    body = "    x = 0\n"
-    long = f"def f({', '.join(f'a{k}' for k in range(12))}):\n{body * 100}"
-    small = f"def g(self, {', '.join(f'a{k}' for k in range(11))}):\n{body * 99}"
-    path = tmp_path / "module.py"
-    path.write_text(f"{long}\n{small}")
-    assert sizes(path) == {
-        "module.py: lines of f": 101,
-        "module.py: parameters of f": 12,
-    }
-
-
 def test_there_is_one_tolerance_of_ranks():
     """Outside the oracle; other limits are of other quantities, and have names of their own."""
     defined = re.compile(r"^_?RANK_TOLERANCE\b.*=", re.MULTILINE)

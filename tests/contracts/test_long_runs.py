@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stepper_systems import PROJECTED, SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
+from stepper_systems import SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
 
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Distance
 from kcons.steppers import (
     BlanesMoan4,
@@ -13,8 +14,6 @@ from kcons.steppers import (
     BlanesMoan6a,
     Geodesic,
     KahanLi6,
-    ProjectedRungeKutta4,
-    ProjectedVerlet,
     Rattle,
     State,
     Stepper,
@@ -141,14 +140,14 @@ def test_energy_has_no_slope(stepper) -> None:
 
 def test_projected_verlet_has_one_a_thousand_times_larger() -> None:
     """At dt = 0.01 about -1e-6 per unit time, a thousand times what the symmetric ones may have; more unprojected."""
-    projected = energy_slope(ProjectedVerlet(project=True), 0.01, 4_000)
+    projected = energy_slope(ProjectedEquation(project=True), 0.01, 4_000)
     assert -2e-6 < projected <= -1e-6
-    assert energy_slope(ProjectedVerlet(), 0.01, 4_000) > 1e-3
+    assert energy_slope(ProjectedEquation(), 0.01, 4_000) > 1e-3
 
 
 def test_projected_runge_kutta_loses_energy_steadily() -> None:
     """Where the symmetric scheme of the same order has no slope: at steps that both can take."""
-    lossy = energy_slope(ProjectedRungeKutta4(project=True), 0.1, 1500)
+    lossy = energy_slope(ProjectedEquation(4, project=True), 0.1, 1500)
     assert lossy < 0
     assert abs(lossy) >= 1000 * abs(energy_slope(BlanesMoan4(), 0.1, 1500))
 
@@ -156,29 +155,14 @@ def test_projected_runge_kutta_loses_energy_steadily() -> None:
 # -- reversal ---------------------------------------------------------------------------------------
 
 
-def check_reversal(stepper: Stepper, steps: int) -> None:
+@pytest.mark.validation
+@REVERSIBLE
+def test_ten_thousand_steps_and_back(stepper) -> None:
+    """A few hundred of each stepper: `tests/steppers/test_stepper.py`."""
     system, start = spherical_pendulum()
-    end = run(system, start, 0.02, steps, stepper=stepper)
-    back = run(system, end, -0.02, steps, stepper=stepper)
+    end = run(system, start, 0.02, 10_000, stepper=stepper)
+    back = run(system, end, -0.02, 10_000, stepper=stepper)
     assert np.abs(back.positions - start.positions).max() <= 1e-11
     assert np.abs(back.velocities - start.velocities).max() <= 1e-11
     assert np.abs(end.positions - start.positions).max() > 1e-3  # it went somewhere
     assert back.time == pytest.approx(0.0, abs=1e-12)
-
-
-@REVERSIBLE
-def test_some_hundred_steps_and_back(stepper) -> None:
-    check_reversal(stepper, 250 if isinstance(stepper, LONGEST) else 1_000)
-
-
-@pytest.mark.validation
-@REVERSIBLE
-def test_ten_thousand_steps_and_back(stepper) -> None:
-    check_reversal(stepper, 10_000)
-
-
-@pytest.mark.parametrize("stepper", [s for s in PROJECTED if s.order == 2], ids=repr)
-def test_projected_schemes_do_not_come_back(stepper) -> None:
-    system, start = spherical_pendulum()
-    back = run(system, run(system, start, 0.02, 1000, stepper=stepper), -0.02, 1000, stepper=stepper)
-    assert np.abs(back.positions - start.positions).max() > 1e-7

@@ -6,6 +6,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = '''
 import importlib, json, pkgutil, sys, types
 
@@ -65,6 +67,7 @@ print(json.dumps({"looked at": len(before), "changed": changed, "kcons": ours}))
 '''
 
 
+@pytest.mark.slow
 def test_every_namespace_is_as_it_was():
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", SCRIPT], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

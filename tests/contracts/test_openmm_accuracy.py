@@ -17,7 +17,6 @@ from openmm_systems import (
     rows_of,
     started,
     state_of,
-    total_energy,
     water_box,
 )
 
@@ -93,8 +92,10 @@ def test_far_fewer_force_evaluations_than_rattle(truth):
 # -- constraints ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("platform", PLATFORMS)
-@pytest.mark.parametrize("scheme", [*SCHEMES, "leapfrog"])
+@pytest.mark.parametrize(  # on the CPU, programs are run by the code of Reference
+    ("scheme", "platform"),
+    [*((scheme, "Reference") for scheme in (*SCHEMES, "leapfrog")), ("rattle", "CPU"), ("leapfrog", "CPU")],
+)
 def test_constraints_to_the_last_digits(scheme, platform):
     system, x, v = alanine()
     integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-13)
@@ -128,8 +129,7 @@ def test_constraints_of_water(scheme, platform):
 # -- back in time -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dt", [0.5e-3, 2e-3])
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(("scheme", "dt"), [*((scheme, 2e-3) for scheme in SCHEMES), ("rattle", 0.5e-3)])
 def test_reversible(scheme, dt):
     """20 steps there and back. OpenMM takes no negative steps; velocities are turned round instead."""
     system, x, v = alanine()
@@ -226,25 +226,6 @@ def test_one_bond_as_the_core_stepper(scheme):
         assert np.abs(state_of(context)[0] - state.positions).max() <= limit
 
 
-def test_energy_is_kept():
-    """Fluctuations fall with the order; there is no drift."""
-    system, x, v = alanine()
-    spread = {}
-    for scheme in ("rattle", "suzuki4", "blanes-moan6"):
-        integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12)
-        context = started(system, integrator, x, v)
-        energies = []
-        for _ in range(100):
-            integrator.step(2)
-            energies.append(total_energy(context))
-        half = len(energies) // 2
-        spread[scheme] = np.std(energies)
-        # Below 1e-8 kJ/mol it is rounding.
-        assert abs(np.mean(energies[:half]) - np.mean(energies[half:])) <= max(spread[scheme], 1e-8)
-    assert spread["suzuki4"] < 0.05 * spread["rattle"]
-    assert spread["blanes-moan6"] < 0.01 * spread["suzuki4"]
-
-
 def test_one_force_evaluation_a_step():
     """Counted by a force that is a Python function."""
     calls = []
@@ -269,12 +250,12 @@ def test_one_force_evaluation_a_step():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
-def test_a_protein_as_verlet_integrator(tolerance):
+def test_a_protein_as_verlet_integrator():
     """Dihydrofolate reductase with 2523 bonds held, 50 steps: the same positions (nm) within the tolerance.
 
     The forces of the CPU platform are single precision, which a much finer tolerance would show.
     """
+    tolerance = 1e-8
     pdb = app.PDBFile(str(DATA / "5dfr_minimized.pdb"))
     system = app.ForceField("amber99sb.xml").createSystem(pdb.topology, constraints=app.AllBonds, rigidWater=False)
     dt = 1e-3

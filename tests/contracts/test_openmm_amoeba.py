@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from functools import cache
 
 import numpy as np
 import openmm
 import pytest
 from openmm import app
-from openmm_ensembles import ENSEMBLES
 from openmm_systems import started, state_of, total_energy
 
-from kcons.constraints import Angle, Distance
 from kcons.openmm import ProjectedIntegrator, RattleIntegrator
-from kcons.openmm.callback_rows.hold import hold
 
 #: A Context with AMOEBA takes OpenMM 13 s here.
 pytestmark = pytest.mark.validation
@@ -72,36 +68,3 @@ def test_energy_is_conserved_to_second_order_and_as_by_verlet(kind, make):
     assert 1.7 < np.log2(spread[make, 1e-3] / spread[make, 5e-4]) < 2.3
     for dt in (1e-3, 5e-4):
         assert spread[make, dt] == pytest.approx(spread[openmm.VerletIntegrator, dt], rel=0.05)
-
-
-@pytest.mark.filterwarnings("ignore:the forces exert no torque")
-@pytest.mark.parametrize("name", ENSEMBLES)
-def test_ensembles_run(name):
-    system, x, v = waters("mutual")
-    integrator = ProjectedIntegrator(1e-3, ensemble=ENSEMBLES[name](300))
-    context = started(system, integrator, x, v)
-    integrator.setVelocitiesToTemperature(context, 300)
-    integrator.step(50)
-    integrator.check()
-
-
-def test_bonds_and_angles_are_carried():
-    """Of flexible molecules, by kcons; the energy is then conserved as with OpenMM's SETTLE."""
-    flexible, x, v = waters("mutual", rigid=False)
-    oxygen = 3 * np.arange(4)
-    bonds = np.stack([oxygen, oxygen + 1, oxygen, oxygen + 2], axis=1).reshape(-1, 2)
-    rows = [Distance(bonds), Angle(np.stack([oxygen + 1, oxygen, oxygen + 2], axis=1))]
-    spread = []
-    for dt in (1e-3, 5e-4):
-        system = copy.deepcopy(flexible)
-        part = hold(system, rows, x)
-        integrator = ProjectedIntegrator(dt, parts=[part])
-        context = started(system, integrator, x, v)
-        integrator.applyVelocityConstraints(context)
-        energies = []
-        for _ in range(round(0.1 / (10 * dt))):
-            integrator.step(10)
-            energies.append(total_energy(context))
-        assert part.worst_violation(context) is None
-        spread.append(np.std(energies))
-    assert 1.7 < np.log2(spread[0] / spread[1]) < 2.3

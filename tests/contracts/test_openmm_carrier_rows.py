@@ -14,18 +14,6 @@ from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.callback_rows.hold import hold
 
-
-def test_particles_without_mass_are_fixed():
-    part = hold(system := free([0.0, 2.0]), Distance([[0, 1]]), [[0, 0, 0], [0.4, 0, 0]])
-    context = context_of(system, ProjectedIntegrator(0.01, parts=[part]))
-    context.setPositions([[0, 0, 0], [0.4, 0, 0]])
-    context.setVelocities([[0, 0, 0], [0, 1.0, 0]])
-    context.getIntegrator().step(10)
-    angle = 10 * np.arcsin(0.01 / 0.4)
-    assert part.rank() == 1
-    assert np.abs(state_of(context)[0] - [[0, 0, 0], [0.4 * np.cos(angle), 0.4 * np.sin(angle), 0]]).max() <= 1e-13
-
-
 # -- periodic boxes -------------------------------------------------------------------------------
 
 

@@ -13,7 +13,6 @@ from openmm_systems import started, state_of
 
 from kcons.errors import UnsupportedError
 from kcons.openmm import ProjectedIntegrator, RattleIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
 
 
 @cache
@@ -36,8 +35,8 @@ def refused(integrator, step, platform="Reference"):
     assert context.getStepCount() == 0
 
 
-@pytest.mark.parametrize("scheme", [*SCHEMES, "leapfrog"])
-def test_drude_particles_are_refused_by_all_schemes(scheme):
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan4", "leapfrog"])
+def test_drude_particles_are_refused_by_schemes(scheme):
     integrator = ProjectedIntegrator(0.0005, scheme)
     refused(integrator, lambda context: integrator.step(1))
 

@@ -24,7 +24,7 @@ def _chain() -> tuple[openmm.System, np.ndarray]:
     return system, x
 
 
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "blanes-moan4"])
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan4"])
 def test_three_kinds_of_parts_go_together(scheme):
     system, x = _chain()
     carried = hold(system, [Angle([(0, 1, 2)], ANGLE)], positions=x)
@@ -39,7 +39,7 @@ def test_three_kinds_of_parts_go_together(scheme):
     integrator.setVelocitiesToTemperature(context, 300, 4)
     energies = []
     for _ in range(5):
-        integrator.step(20)
+        integrator.step(10)
         integrator.check()
         state = context.getState(positions=True, energy=True, groups=set(range(32)) - integrator.row_groups)
         r = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)

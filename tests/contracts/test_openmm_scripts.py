@@ -35,22 +35,19 @@ SWAPS = {
 #: Which swaps each script is run with.
 SCRIPT_SWAPS = {
     "simulate_pdb": ("Langevin",),  # begins at rest, which Isokinetic refuses
-    "simulate_implicit": ("RattleIntegrator", "rattle", "leapfrog"),
+    "simulate_implicit": ("RattleIntegrator", "leapfrog"),
     "simulate_gbn2": ("Langevin",),
-    "simulate_tip4pew": ("RattleIntegrator", "rattle"),
+    "simulate_tip4pew": ("rattle",),
     "simulate_npt": ("Langevin", "Isokinetic"),
     "simulate_hmr": ("Langevin",),
 }
 CASES = [
     *(pytest.param(name, swap, "CPU") for name, swaps in SCRIPT_SWAPS.items() for swap in swaps),
-    *(pytest.param(name, SCRIPT_SWAPS[name][0], "Reference") for name in ("simulate_implicit", "simulate_tip4pew")),
+    pytest.param("simulate_implicit", "RattleIntegrator", "Reference"),
 ]
-#: Always in single precision without a box; in a long run each script in each precision.
+#: In a long run, each script in each precision: a usual one has `test_openmm_simulation` there.
 ON_GPUS = [
-    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, *([] if quick else [LONG])])
-    for p in GPUS
-    for name in SCRIPT_SWAPS
-    for quick in ["none" in p.id or (name == "simulate_implicit" and "single" in p.id)]
+    pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=[*p.marks, LONG]) for p in GPUS for name in SCRIPT_SWAPS
 ]
 
 

@@ -91,8 +91,9 @@ def test_gpus_place_sites_where_positions_are_constrained(platform):
 # -- constant energy --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", CONSERVING)
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    ("model", "kind"), [*((model, "rattle") for model in MODELS), *(("tip5p", k) for k in CONSERVING if k != "rattle")]
+)
 def test_energy_is_conserved_to_the_order_of_the_scheme(model, kind):
     made, order = CONSERVING[kind]
     steps = np.array([2e-3, 1e-3, 5e-4]) / (2 if model == "mixed" else 1)
@@ -230,7 +231,7 @@ def test_orientations_of_dipoles_in_a_field():
         assert abs(np.mean(values) - exact) < 4 * error
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", ["tip4pew", "mixed"])
 @pytest.mark.parametrize("ensemble", [Isokinetic(), NoseHoover(300, 20)], ids=["Isokinetic", "NoseHoover"])
 def test_energies_of_thermostats_are_conserved_to_second_order(model, ensemble):
     system, x, v = prepared(model)
@@ -264,31 +265,6 @@ def test_programs_that_openmm_runs_by_itself_are_refused():
     context = started(system, compound, x, v)
     with pytest.raises(UnsupportedError, match=r"particle 3 is a virtual site.*CompoundIntegrator.*leapfrog"):
         ours.attach(context)
-
-
-def test_after_a_failure_the_next_step_is_whole():
-    """A NaN in the middle of a step leaves nothing half done."""
-    system, x, v = prepared("tip4pew")
-    system = copy.deepcopy(system)
-    wall = openmm.CustomExternalForce("1e-12*sqrt(limit-z)")
-    wall.addGlobalParameter("limit", 100.0)
-    wall.addParticle(0)
-    system.addForce(wall)
-    integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x, v)
-    integrator.step(5)
-    integrator.check()
-    before = state_of(context)
-    context.setParameter("limit", -100.0)
-    with pytest.raises(Exception, match=r"NaN|not finite"):
-        integrator.step(3)
-        integrator.check()
-    context.setParameter("limit", 100.0)
-    np.testing.assert_array_equal(state_of(context), before)
-    integrator.step(5)
-    reference = started(system, other := ProjectedIntegrator(1e-3), x, v)
-    other.step(10)
-    np.testing.assert_allclose(state_of(context)[0], state_of(reference)[0], atol=1e-12)
 
 
 def test_temperature_of_a_simulation_does_not_count_sites():

@@ -115,7 +115,7 @@ WRONG = {LENGTH: unit.kelvin, ANGLE: nm, SPEED: nm, TIME: nm, NUMBER: nm}
 
 
 def kind_of(family, name):
-    kind = rules_of(family.__init__.__wrapped__)[name][0]
+    kind = rules_of(family.__init__.__wrapped__)[name].kind
     return family.held if kind is HELD else kind
 
 

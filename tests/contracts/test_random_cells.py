@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 import cell_judge
@@ -19,24 +20,12 @@ from hypothesis import strategies as st
 from kcons import Motion
 from kcons.errors import ConvergenceError
 
-#: Some of those of the long run; in the last ones atoms that keep to places are given in other images.
-FAST = (*range(60), 67, 84, 106, 108, 147, 154)
 
-
-def test_a_share_of_the_cases():
-    found = random_cells.summary([judge(seed) for seed in FAST])
-    assert found["faults"] == {}
-    assert found["outcomes"]["right"] > 0.8 * len(FAST)
-    assert set(found["kinds"]) == set(KINDS)
-    assert found["features"]["longer than the cell"]["right"] > 3
-    assert found["features"]["drifting"]["refused"] > 0
-    assert found["features"]["places in other images"]["right"] > 8
-    assert found["allowed"]["largest"] < 1e-7
-
-
+@pytest.mark.slow
 @settings(max_examples=60)
-@given(seed=st.integers(10_000, 2**32 - 1), periodic=st.booleans())
+@given(seed=st.integers(10_000, 2**32 - 1), periodic=st.sampled_from([True, True, False]))
 def test_molecules_that_nobody_has_seen(seed, periodic):
+    """Without a cell as well: what is found in cells alone is due to the cells."""
     assume(periodic or not {"winding", "fixed pair"} & set(world(seed).kinds))
     case = judge(seed, periodic)
     assert case.outcome in ("right", "refused"), [v for v in case.verdicts if v.outcome not in ("right", "refused")]
@@ -48,16 +37,7 @@ def test_ten_thousand_cases(tmp_path):
     assert random_cells.main(["--cases", "10000", "--out", str(tmp_path / "random_cells.json")]) == 0
 
 
-def test_without_a_cell_the_engine_and_the_oracle_agree():
-    """What the judge finds in cells is therefore due to the cells."""
-    cases = [
-        judge(seed, periodic=False) for seed in range(30) if not {"winding", "fixed pair"} & set(world(seed).kinds)
-    ]
-    assert {case.outcome for case in cases} <= {"right", "refused"}
-    assert sum(case.outcome == "right" for case in cases) > 0.9 * len(cases)
-
-
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(12))
 def test_gradients_and_second_derivatives_of_the_oracle(seed):
     """Against central differences of the values: error h^2 with h = 1e-4, and rounding of 1e-16/h^2."""
     w = world(seed)
@@ -133,6 +113,7 @@ def test_the_judge_lets_a_displacement_be_too_long_where_smaller_steps_help():
         assert by.may_refuse(link) is allowed
 
 
+@cache
 def _seed_of(kind: str) -> int:
     return next(s for s in range(1000) if world(s).kinds == [kind] and judge(s).outcome == "right")
 
@@ -216,3 +197,6 @@ def test_the_committed_run_has_no_faults():
     found = json.loads((Path(__file__).parents[2] / "docs" / "results" / "random_cells.json").read_text())
     assert found["cases"] == 10_000 and found["first"] == 0 and found["faults"] == {}
     assert found["outcomes"]["right"] > 8000 and found["outcomes"]["silent"] == found["outcomes"]["unfounded"] == 0
+    assert set(found["kinds"]) == set(KINDS) and found["allowed"]["largest"] < 1e-5
+    assert found["features"]["longer than the cell"]["right"] > 100
+    assert found["features"]["places in other images"]["right"] > 100 and found["features"]["drifting"]["refused"] > 0

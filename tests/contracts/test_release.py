@@ -1,4 +1,4 @@
-"""What goes with a release says the same as the package: version, dependencies, licences."""
+"""What goes with a release says the same as the package: version, dependencies, licenses."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_the_conda_recipe_needs_nothing_else():
     assert set(run) == {"python", *(parts(r)[0] for r in PROJECT["dependencies"])}
 
 
-def test_licences_of_all_dependencies_are_listed():
-    page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
+def test_licenses_of_all_dependencies_are_listed():
+    page = (ROOT / "docs" / "licenses.md").read_text(encoding="utf-8")
     listed = {
         name.lower(): extra for name, extra in re.findall(r"^\| ([\w-]+) \| (?:`([\w-]+)`)? ?\|", page, re.MULTILINE)
     }
@@ -60,11 +60,11 @@ def test_hosted_checks_are_those_of_the_project():
 
 
 def test_works_cited_in_the_paper_are_in_its_bibliography():
-    paper, works = ((ROOT / "paper" / name).read_text(encoding="utf-8") for name in ("paper.md", "paper.bib"))
+    paper, works = ((ROOT / "docs" / "paper" / name).read_text(encoding="utf-8") for name in ("paper.md", "paper.bib"))
     cited = set(re.findall(r"@([\w-]+)\]", paper))
     assert cited and cited == set(re.findall(r"^@\w+\{([\w-]+),", works, re.MULTILINE))
     for picture in re.findall(r"\]\((\.\./[^)]+\.png)\)", paper):
-        assert (ROOT / "paper" / picture).is_file()
+        assert (ROOT / "docs" / "paper" / picture).is_file()
 
 
 def test_the_source_distribution_has_what_it_names():

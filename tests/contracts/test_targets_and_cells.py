@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from motion_systems import TRIANGLE, WATER, ZIGZAG, steps
 
 from kcons import constraints as held
 from kcons.constraints import Angle, Constraint, Distance, FixedAtoms, RadiusOfGyration, projection
@@ -118,32 +117,6 @@ def test_dependent_rows_on_fixed_atoms_share_their_multiplier() -> None:
     lam = motion.multipliers(x, np.zeros((3, 3)), f)
     np.testing.assert_allclose(lam[6:], [-2.0, -2.0], rtol=1e-14)
     np.testing.assert_allclose(motion.constraint_force(x, np.zeros((3, 3)), f).sum(axis=0), [-4.0, 0, 0], atol=1e-14)
-
-
-CELL = np.array([[9.0, 0, 0], [2.0, 8.5, 0], [-1.5, 1.0, 9.5]])
-
-
-@pytest.mark.parametrize("extra", [0, 400])
-def test_triclinic_cell(extra: int) -> None:
-    """Wrapped atoms, one by one: same corrections as in the open, for compiled and interpreted rows."""
-    rng = np.random.default_rng(2)
-    x = np.vstack([WATER, WATER[:2] + 2, ZIGZAG[:9], rng.uniform(0, 2, (3, 3)), rng.uniform(-4, 4, (extra, 3))])
-    rows = [
-        held.Distance([*TRIANGLE, (3, 4), *((k, k + 1) for k in range(5, 13)), (14, 15)]),
-        held.Angle([(14, 15, 16)]),
-        held.CenterDistance([[0, 1, 2]], [[3, 4]]),
-    ]
-    masses = rng.uniform(1, 20, len(x))
-    open_motion = Motion(ConstraintSet(rows, x, masses), x)
-    shift = rng.integers(-2, 3, x.shape) @ CELL
-    periodic = Motion(ConstraintSet(rows, x + shift, masses, cell=CELL), x + shift)
-    assert periodic.rank == open_motion.rank
-    move, v = steps(len(x), 8)
-    again = rng.integers(-1, 2, x.shape) @ CELL
-    found = periodic.project_positions(x + move + again, x + shift)
-    np.testing.assert_allclose(found - again, open_motion.project_positions(x + move, x), rtol=0, atol=1e-12)
-    expected = open_motion.project_velocities(x, v)
-    np.testing.assert_allclose(periodic.project_velocities(x + shift, v), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("extra", [0, 400])

@@ -64,11 +64,6 @@ def test_hangles_as_angles_are_the_same_angles(views):
     assert len(ends) == angles.n_rows > 100
 
 
-def test_rows_hold_at_the_positions_they_were_made_at(views):
-    rows = quietly(kcons.mdanalysis.constraints_of, views[0], "hangles")
-    assert np.abs(rows.constraint_set.value(rows.snapshot.positions)).max() < 1e-12
-
-
 def test_selection_keeps_rows_inside(views):
     universe = views[0]
     every = quietly(kcons.mdanalysis.constraints_of, universe, "allbonds")

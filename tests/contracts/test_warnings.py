@@ -6,36 +6,27 @@ import warnings
 
 import pytest
 
+OURS = ("kcons", "kcons.motion", "test_motion", "openmm_systems", "tests.reference.cases")
+THEIRS = ("numpy", "ase.md.md", "kcons_like", "MDAnalysis.core")
+
 
 def warn(category, module):
     warnings.warn_explicit("said by a test", category, f"{module}.py", 1, module=module)
 
 
 @pytest.mark.parametrize("category", [DeprecationWarning, PendingDeprecationWarning, FutureWarning, SyntaxWarning])
-@pytest.mark.parametrize("module", ["kcons", "kcons.motion", "test_motion", "openmm_systems", "tests.reference.cases"])
-def test_own_deprecations_are_errors(category, module):
-    with pytest.raises(category, match="said by a test"):
-        warn(category, module)
-
-
-@pytest.mark.parametrize("category", [DeprecationWarning, PendingDeprecationWarning, FutureWarning, SyntaxWarning])
-@pytest.mark.parametrize("module", ["numpy", "ase.md.md", "kcons_like", "MDAnalysis.core"])
-def test_those_of_other_packages_are_not(category, module):
-    with warnings.catch_warnings(record=True) as seen:
-        warn(category, module)
-    assert [w.category for w in seen] == [category]
+def test_own_deprecations_are_errors_and_those_of_other_packages_are_not(category):
+    for module in OURS:
+        with pytest.raises(category, match="said by a test"):
+            warn(category, module)
+    for module in THEIRS:
+        with warnings.catch_warnings(record=True) as seen:
+            warn(category, module)
+        assert [w.category for w in seen] == [category]
 
 
 @pytest.mark.parametrize("category", [RuntimeWarning, UserWarning, ResourceWarning])
-@pytest.mark.parametrize("module", ["kcons.motion", "test_motion", "numpy.linalg", "ase.md.md"])
-def test_all_other_warnings_are_errors(category, module):
-    with pytest.raises(category, match="said by a test"):
-        warn(category, module)
-
-
-def test_a_deprecated_call_is_an_error_where_it_is_made():
-    def outdated():
-        warnings.warn("said by a test", DeprecationWarning, stacklevel=2)
-
-    with pytest.raises(DeprecationWarning, match="said by a test"):
-        outdated()
+def test_all_other_warnings_are_errors(category):
+    for module in (*OURS, *THEIRS):
+        with pytest.raises(category, match="said by a test"):
+            warn(category, module)

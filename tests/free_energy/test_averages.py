@@ -26,7 +26,7 @@ def test_samples_are_worth_fewer_independent_ones():
     rng = np.random.default_rng(1)
     for memory in (0.0, 0.7, 0.9):
         exact = (1 + memory) / (1 - memory)
-        found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(100)]
+        found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(300)]
         assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
         assert np.median([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
 

@@ -31,7 +31,7 @@ def recorded(coordinates, others=(), dt=0.01, steps=40, stepper=None):
 
 def test_a_run_records_by_name():
     turn = {"turn": Dihedral([[0, 1, 2, 3]])}
-    recorder = recorded(turn, [Distance([[0, 1], [1, 2], [2, 3]])], stepper=Langevin(1.0, 1.0, seed=1))
+    recorder = recorded(turn, [Distance([[0, 1], [1, 2], [2, 3]])], stepper=Langevin(1.0, 1.0, rng=1))
     series = recorder.series
     assert len(series) == 41 and series.multiplier.shape == (41, 1)
     np.testing.assert_allclose(series.time, 0.01 * np.arange(41), atol=1e-12)
@@ -58,7 +58,7 @@ def test_states_of_a_barostat_are_measured_in_their_own_cell():
     motion = Motion(ConstraintSet([*held.values()], x, np.ones(3), cell=[10.0] * 3), x)
     system = CellSystem(motion)
     recorder = Recorder(system, HeldCoordinates(motion, held, x))
-    stepper = ConstantPressure(Langevin(1.0, 1.0, seed=1), MonteCarloBarostat(0.01, every=1, width=0.2))
+    stepper = ConstantPressure(Langevin(1.0, 1.0, rng=1), MonteCarloBarostat(0.01, every=1, width=0.2))
     kept = run(system, system.initial_state(x), 0.01, 9, stepper=stepper, record=3)
     assert len({frame.cell[0, 0] for frame in kept.frames}) > 1
     for frame in kept.frames:

@@ -65,11 +65,11 @@ def no_projection(program: Program, quick: bool) -> Outcome:
         found.append((f"dt {dt:g}: residual", seen.residual, 1e-12))
     remark = f"t = {horizon:g}"
     if isinstance(program, Core):
-        from kcons.steppers import ProjectedVerlet
+        from kcons.comparison.projected_equation import ProjectedEquation
 
         seen = Seen(problem)
         try:
-            program.run(problem, 0.04, round(horizon / 0.04), seen, stepper=ProjectedVerlet(project=False))
+            program.run(problem, 0.04, round(horizon / 0.04), seen, stepper=ProjectedEquation())
             remark += f"; on request, without projection: residual {seen.residual:.2g}"
         except KconsError as error:
             remark += f"; on request, without projection: {type(error).__name__} at residual {seen.residual:.2g}"

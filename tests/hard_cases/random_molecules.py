@@ -15,6 +15,7 @@ import numpy as np
 from hard_cases.motions import every
 from hard_cases.problem import Array
 from hard_cases.small_systems import separated
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
@@ -24,7 +25,6 @@ from kcons.steppers import (
     BlanesMoan6,
     Geodesic,
     KahanLi6,
-    ProjectedVerlet,
     Rattle,
     Stepper,
     Suzuki4,
@@ -50,7 +50,7 @@ STEPPERS: tuple[Callable[[], Stepper], ...] = (
     BlanesMoan4,
     KahanLi6,
     BlanesMoan6,
-    lambda: ProjectedVerlet(project=True),
+    lambda: ProjectedEquation(project=True),
 )
 
 

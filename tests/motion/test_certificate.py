@@ -10,10 +10,11 @@ from ase.md.verlet import VelocityVerlet
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Angle, Distance, Sphere
 from kcons.errors import CertificateError, InputError
 from kcons.solvers.cluster_solver import Outcome
-from kcons.steppers import Baumgarte, ProjectedVerlet, Rattle, Suzuki4
+from kcons.steppers import Rattle, Suzuki4
 
 X = np.array([[0.9, 0, -0.4], [1.5, 0, 0.1], [2.0, 0.3, -0.2]])
 V = np.array([[0.1, 0.5, 0.2], [-0.3, 0.1, 0.4], [0.2, 0.3, -0.5]])
@@ -105,12 +106,11 @@ def test_certificates_change_no_trajectory_and_observers_see_what_they_are_due()
     assert seen == [0, 25, 50, 75, 100]
 
 
-@pytest.mark.parametrize("stepper", [Baumgarte(rate=1.0), ProjectedVerlet()])
-def test_steppers_that_let_constraints_drift_are_not_certified(stepper):
+def test_steppers_that_let_constraints_drift_are_not_certified():
     held, start = system()
-    end = run(held, start, 0.05, 50, stepper=stepper, check_every=1)
+    end = run(held, start, 0.05, 50, stepper=ProjectedEquation(), check_every=1)
     assert np.abs(held.motion.constraint_set.value(end.positions)).max() > 1e-9
-    run(held, start, 0.05, 50, stepper=ProjectedVerlet(project=True), check_every=1)
+    run(held, start, 0.05, 50, stepper=ProjectedEquation(project=True), check_every=1)
 
 
 def test_a_start_off_its_constraints_is_put_right_by_the_first_step():

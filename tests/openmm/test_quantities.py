@@ -6,7 +6,7 @@ import numpy as np
 import openmm
 import pytest
 from openmm import unit
-from openmm_systems import context_of, dumbbell, started
+from openmm_systems import dumbbell, started
 
 from kcons.constraints import (
     Angle,
@@ -92,19 +92,6 @@ def test_moving_targets_may_return_quantities():
         sigma([Distance([[0, 1]], lambda t: 300 * kelvin)])
     with pytest.raises(InputError, match="give it in nm/ps"):
         sigma([Distance([[0, 1]], MovingTarget(lambda t: 0.1, lambda t: 1 * nm))]).velocity_target(X, 0.0)
-
-
-def test_a_moving_target_with_units_is_followed():
-    system, x, v = dumbbell()
-    system.addParticle(14.0)
-    x, v = np.vstack([x, x[:1] + np.array([0.2, 0.1, 0.0])]), np.vstack([v, [[0.1, 0, 0]]])
-    start = np.hypot(0.2, 0.1)
-    part = hold(system, [Distance([[0, 2]], lambda t: (start + 0.5 * t) * nm)], positions=x * nm, time=0 * ps)
-    integrator = ProjectedIntegrator(1 * unit.femtosecond, parts=[part])
-    context = started(system, integrator, x, v)
-    integrator.step(50)
-    r = context.getState(positions=True).getPositions(asNumpy=True)._value
-    assert abs(np.linalg.norm(r[2] - r[0]) - start - 0.5 * 0.05) < 1e-12
 
 
 def level(r):
@@ -206,21 +193,3 @@ def test_positions_of_the_wrong_kind():
             call()
     with pytest.raises(InputError, match="time is 1 nm; give it in ps"):
         hold(atoms(), [Distance([[0, 1]])], positions=X, time=1 * nm)
-
-
-def test_a_run_with_quantities_is_the_run_with_numbers():
-    ends = []
-    for lengths, angle in ((np.array([1.0, 1.2]) * angstrom, 100 * unit.degree), ([0.1, 0.12], np.radians(100))):
-        system = atoms()
-        spring = openmm.HarmonicBondForce()
-        spring.addBond(2, 3, 2 * angstrom, 1000)
-        system.addForce(spring)
-        part = hold(system, [Distance([[0, 1], [1, 2]], lengths), Angle([[0, 1, 2]], angle)], positions=X)
-        integrator = ProjectedIntegrator(2e-3, parts=[part])
-        context = context_of(system, integrator)
-        context.setPositions(X)
-        integrator.applyConstraints(context)
-        integrator.setVelocitiesToTemperature(context, 300 * kelvin, 3)
-        integrator.step(20)
-        ends.append(context.getState(positions=True).getPositions(asNumpy=True)._value)
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)

@@ -6,6 +6,8 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 import kcons
 from kcons.cli import main
 
@@ -58,4 +60,32 @@ def test_each_command_has_its_help():
 
 
 def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100
+
+
+#: Pages whose length is that of a table of what there is.
+LISTS = {"equations.md", "glossary.md", "index.md", "solved_threads.md"}
+
+
+def pages_about_what_to_do():
+    return [page for page in sorted(DOCS.glob("*.md")) if page.name not in LISTS]
+
+
+@pytest.mark.parametrize("page", pages_about_what_to_do(), ids=lambda page: page.stem)
+def test_a_page_is_read_in_one_sitting(page):
+    """At most 200 lines; results are on the pages of docs/evidence, which are made from the result files."""
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= 200
+
+
+def test_the_prose_stays_a_guide():
+    """What is written by hand; docs/evidence is made from results, docs/reference from docstrings."""
+    pages = [*DOCS.glob("*.md"), *(DOCS / "tutorials").glob("*.md")]
+    assert sum(len(page.read_text(encoding="utf-8").splitlines()) for page in pages) <= 4500
+
+
+def test_the_sidebar_has_at_most_twenty_links():
+    text = (DOCS / "index.md").read_text(encoding="utf-8")
+    listings = re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    links = [line for listing in listings for line in listing.split("\n") if line and not line.startswith(":")]
+    assert {"ase", "openmm", "glossary", "reference/index"} <= set(links)
+    assert len(links) <= 20

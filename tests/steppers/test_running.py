@@ -45,7 +45,7 @@ IMPOSSIBLE += [{"step": step} for step in (-3, 2.5, True, None)]
 
 
 @pytest.mark.parametrize("impossible", IMPOSSIBLE, ids=str)
-@pytest.mark.parametrize("stepper", [None, BlanesMoan4(), Langevin(1.0, 1.0, seed=1)], ids=str)
+@pytest.mark.parametrize("stepper", [None, BlanesMoan4(), Langevin(1.0, 1.0, rng=1)], ids=str)
 def test_states_made_by_hand_with_impossible_numbers(stepper, impossible) -> None:
     """In a run, which shows them to nobody, and in a step by itself."""
     system, state = rotor()

@@ -21,6 +21,16 @@ BY_NAME = {candidate.name: candidate for candidate in CANDIDATES}
 
 
 @pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
+def test_systems_are_on_their_constraints_and_leave_them_in_a_step(system):
+    assert system.stretch(system.positions) < 1e-12
+    assert system.departure(system.positions, system.tangent) < 1e-13
+    assert 1e-4 < system.stretch(system.moved) < 0.5
+    assert system.departure(system.positions, system.thermal) > 0.1
+    speed = np.mean(system.masses[:, None] * system.thermal**2)
+    assert speed == pytest.approx(bare_systems.THERMAL_ENERGY, rel=0.5)
+
+
+@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
 @pytest.mark.parametrize("name", ["sweeps", "ase"])
 def test_residuals_follow_the_tolerance(name, system):
     for tolerance in (1e-4, 1e-10):

@@ -14,8 +14,17 @@ from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
 
 from kcons.ase import Constraints, constrain, draw_velocities, rigid_water
-from kcons.constraints import Angle, Distance
-from kcons.solvers.tolerances import NEWTON_TOLERANCE
+from kcons.constraints import (
+    Angle,
+    CenterOfMass,
+    Dihedral,
+    Distance,
+    DistanceDifference,
+    FixedAtoms,
+    Line,
+    LinearCombination,
+    Plane,
+)
 
 FS = units.fs
 TEMPERATURE = 300.0
@@ -49,6 +58,26 @@ class Field(Calculator):
         self.calls += 1
         self.results = {"energy": 0.5 * self.stiffness * float((x**2).sum()), "forces": forces}
 
+
+#: Names of objects of ASE, and rows of ethanol that they hold; a file of ASE without kcons has one object at most.
+AS_ASE = {
+    "FixAtoms": [FixedAtoms([8]), FixedAtoms([7])],
+    "FixBondLengths": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
+    "FixInternals": [
+        *(Distance([[0, 1]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])),
+        DistanceDifference([[0, 4], [1, 5]], weights=[1.0, -2.0]),
+    ],
+    "FixedPlane": [Plane([4, 0, 5], [0, 1, 2])],
+    "FixedPlane FixedPlane": [Plane([4, 5], [0, 1, 2]), Plane([6], [1, 0, 0])],
+    "FixedLine": [Line([4, 5], None, [0, 1, 2])],
+    "FixCartesian": [LinearCombination([[3], [5]], [[0, 0, 1.0]]), LinearCombination([[3], [5]], [[1.0, 0, 0]])],
+    "FixCartesian FixCartesian": [
+        LinearCombination([[3], [5]], [[0, 0, 2.0]]),
+        LinearCombination([[3]], [[1.0, 0, 0]]),
+    ],
+    "FixSubsetCom": [CenterOfMass([0, 1, 2])],
+    "FixAtoms FixBondLengths": [FixedAtoms([8]), Distance([[0, 1]])],
+}
 
 # -- atoms ------------------------------------------------------------------------------------------
 
@@ -87,16 +116,6 @@ def water(calc=None, temperature=300.0, at=0.0) -> tuple[Atoms, Constraints]:
     held = constrain(atoms, rigid_water(atoms))
     draw_velocities(atoms, temperature, rng=random(3))
     return atoms, held
-
-
-def row_of_dumbbells(n, seed=0) -> Atoms:
-    """Free CO on a line, nothing held."""
-    axis = random(seed).normal(size=(n, 3))
-    axis *= 1.1 / np.linalg.norm(axis, axis=1)[:, None]
-    positions = np.empty((2 * n, 3))
-    positions[0::2] = 5.0 * np.arange(n)[:, None] * [1, 0, 0]
-    positions[1::2] = positions[0::2] + axis
-    return Atoms("CO" * n, positions=positions, calculator=Free())
 
 
 def dumbbells(n=60, seed=0, side=60.0) -> tuple[Atoms, Constraints]:
@@ -139,17 +158,6 @@ def ethanol() -> tuple[Atoms, Constraints]:
 def off(atoms, held) -> float:
     """Largest violation of a row by the positions."""
     return float(np.abs(held.engine(atoms).constraint_set.value(atoms.positions)).max())
-
-
-def unavoidable(atoms, length) -> float:
-    """What `off` may be of held distances up to `length`, however well they are solved.
-
-    The solver accepts NEWTON_TOLERANCE of a length. Storing rounds each coordinate of both atoms by half a unit in
-    the last place, sqrt(3) units along a bond at most. Measuring rounds three differences, their squares, two sums and
-    a root, 3.5 units of 2^-53 at most; so did the solver when it measured.
-    """
-    stored = np.sqrt(3) * np.spacing(np.abs(atoms.positions).max())
-    return float(stored + (NEWTON_TOLERANCE + 7 * 2.0**-53) * length)
 
 
 def slip(atoms, held) -> float:

@@ -162,7 +162,7 @@ def dipeptide(constraints=app.AllBonds, platform="Reference", scheme="rattle", d
     context = context_of(system, integrator, positions, platform=platform)
     context.applyConstraints(1e-14)
     context.setVelocitiesToTemperature(300, 1)
-    part.restore(context, 1e-13)
+    part.restore(context)
     return context, integrator, part
 
 

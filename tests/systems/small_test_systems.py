@@ -12,7 +12,7 @@ from kcons.constraints import MovingTarget, Sphere
 from kcons.steppers import State, System, run
 
 
-def breathing(size, seed):
+def breathing(size, rng):
     """A spherical pendulum whose length breathes: what moves by itself."""
     swing = MovingTarget(lambda t: 1 + 0.2 * np.sin(t), lambda t: 0.2 * np.cos(t), lambda t: -0.2 * np.sin(t))
     x, masses = np.array([[0.6, 0.0, -0.8]]), np.ones(1)

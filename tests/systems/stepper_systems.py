@@ -6,18 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, MovingTarget
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import (
-    Baumgarte,
     BlanesMoan4,
     BlanesMoan6,
     BlanesMoan6a,
     Geodesic,
     KahanLi6,
-    ProjectedRungeKutta4,
-    ProjectedVerlet,
     Rattle,
     State,
     Stepper,
@@ -32,13 +30,11 @@ NYSTROM: list[Stepper] = [BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
 SYMMETRIC: list[Stepper] = [*COMPOSED, *NYSTROM]
 #: For comparison only.
 PROJECTED: list[Stepper] = [
-    ProjectedVerlet(),
-    ProjectedVerlet(project=True),
-    ProjectedRungeKutta4(),
-    ProjectedRungeKutta4(project=True),
-    Baumgarte(1.0),
+    ProjectedEquation(),
+    ProjectedEquation(project=True),
+    ProjectedEquation(4),
+    ProjectedEquation(4, project=True),
 ]
-EVERY: list[Stepper] = [*SYMMETRIC, *PROJECTED]
 
 
 def system_of(constraints, positions, masses, force=None, time=0.0, **options) -> System:

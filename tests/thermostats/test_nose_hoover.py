@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from thermostat_systems import METHANE, TEN, dumbbells, quartic, quartic_potential, system, waves
 
-from kcons.constraints import Distance, Plane
+from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import Geodesic, ReversibilityCheck, State, Suzuki4, run
 from kcons.thermostats import NoseHooverChain, thermal_velocities
@@ -83,13 +83,6 @@ def test_conserved_energy_has_no_slope():
     trend = np.polyfit(np.linspace(0, 200, len(values)), values, 1)[0]
     assert np.std(values) <= 5e-3
     assert abs(trend) <= 1e-5
-
-
-def test_degrees_of_freedom_by_rank():
-    x = METHANE
-    held = system([Distance(TEN), Plane([0], [0, 0, 1.0])], x, [12.0, 1, 1, 1, 1], waves)
-    state = State(x, thermal_velocities(held, x, 0.5, 1))
-    assert NoseHooverChain(0.5, 1.0).start(held, state).thermostat[-1] == 15 - 9 - 1
 
 
 def loaded(state):

@@ -7,12 +7,11 @@ import math
 import fluids as fluid
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, quartic, system, waves, waves_potential
+from thermostat_systems import dumbbells, quartic, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import run
-from kcons.thermostats import Langevin, TemperatureSplit, mean, thermal_velocities
+from kcons.thermostats import TemperatureSplit, mean
 
 KT = 0.6
 #: Free molecules of a kind, which do not act on each other: that many independent samples at once.
@@ -85,7 +84,7 @@ def test_curvatures_of_a_fluid():
     chosen = fluid.dumbbells(8)
     forces, kt = chosen.forces, chosen.thermal_energy
     x = forces.metropolis(chosen.positions, kt, 500, 10, 1, chosen.shift, chosen.turn)[1]
-    split = TemperatureSplit(chosen.system(), seed=3)
+    split = TemperatureSplit(chosen.system(), rng=3)
     for _ in range(1000):
         split.add(x)
     forward, bend, torque, twist = forces.split_sample(x)
@@ -205,7 +204,7 @@ def test_against_metropolis(flexible):
     configurations, masses = sampled(KT, 200, np.random.default_rng(5), flexible=flexible)
     k = 3 * np.arange(COPIES)
     pairs = [np.c_[k, k + 1], np.c_[k, k + 2], *([] if flexible else [np.c_[k + 1, k + 2]])]
-    split = TemperatureSplit(system([Distance(np.concatenate(pairs))], configurations[0], masses, waves), seed=1)
+    split = TemperatureSplit(system([Distance(np.concatenate(pairs))], configurations[0], masses, waves), rng=1)
     for x in configurations:
         split.add(x)
     found = split.result()
@@ -236,19 +235,6 @@ def test_groups_have_their_own_temperatures():
         assert found.shifts == 3 * COPIES
     with pytest.raises(InputError, match="no group 'warm'; there are cold, hot"):
         split.result("warm")
-
-
-def test_along_a_run():
-    """By observing a stepper: a Langevin run is where it should be."""
-    held, x = dumbbells(40)
-    split = TemperatureSplit(held)
-    state = held.initial_state(x, thermal_velocities(held, x, KT, 1))
-    stepper = Langevin(KT, 1.0, seed=2)
-    state = run(held, state, 0.1, 200, stepper=stepper)
-    run(held, state, 0.1, 1500, stepper=stepper, observers=[lambda s: split.add(s.positions, s.forces)], every=10)
-    found = split.result()
-    assert abs(found.shift.off(KT)) <= 3.5 and abs(found.turn.off(KT)) <= 3.5
-    assert found.shift.error < 0.05 * KT
 
 
 # -- what has no shifts or turns --------------------------------------------------------------------
@@ -343,18 +329,6 @@ def test_bad_input():
     assert len(split) == 0
     with pytest.raises(InputError, match="0 samples are too few"):
         split.result()
-    for options, text in (
-        ({"displacement": 0.0}, "displacement"),
-        ({"directions": 0}, "directions"),
-        ({"directions": 1.5}, "directions"),
-        ({"seed": "x"}, "seed"),
-        ({"groups": [[0, 1]]}, "groups"),
-        ({"groups": {"far": [99]}}, "atoms must be"),
-    ):
-        with pytest.raises(InputError, match=text):
-            TemperatureSplit(held, **options)
-    with pytest.raises(InputError, match="system is None; give"):
-        TemperatureSplit(None)
     with pytest.raises(InputError, match="group 'ends' has no first atom of a cluster"):
         TemperatureSplit(held, groups={"all": [0, 1, 2, 3], "ends": [1, 3]}).add(x)
     with pytest.raises(InputError, match="one atom only"):
@@ -382,10 +356,3 @@ def test_refused():
     moving = system([Distance([[0, 1]], lambda t: np.array([1.0 + t]))], x, [1.0, 1.0], quartic)
     with pytest.raises(UnsupportedError, match="targets rest"):
         TemperatureSplit(moving)
-
-
-def test_forces_of_a_wrong_shape():
-    held, x = dumbbells(2, force=lambda x, t: np.zeros((1, 3)))
-    with pytest.raises(InputError, match=r"must return \(4, 3\)"):
-        TemperatureSplit(held).add(x)
-    assert waves_potential(x) < 10  # the field of these tests is bounded

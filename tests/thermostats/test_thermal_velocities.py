@@ -78,20 +78,3 @@ def test_fixed_atoms_stay():
     assert (thermal_velocities(still, x, 1.0, 5) == 0).all()
     with pytest.raises(InputError, match="0 degrees of freedom are left"):
         thermal_velocities(still, x, 1.0, 5, kinetic_energy=1.0)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, None])
-def test_bad_energies(value):
-    held, x = dumbbells(1)
-    with pytest.raises(InputError, match=r"thermal_energy is .*give a positive number"):
-        thermal_velocities(held, x, value, 0)
-    if value is not None:
-        with pytest.raises(InputError, match=r"kinetic_energy is .*give a positive number"):
-            thermal_velocities(held, x, 1.0, 0, kinetic_energy=value)
-
-
-def test_one_molecule_without_room_to_turn():
-    """Total momentum of a single atom is all it has."""
-    held = system([], [[0.0, 0, 0]], [1.0])
-    with pytest.raises(InputError, match="0 degrees of freedom are left"):
-        thermal_velocities(held, np.zeros((1, 3)), 1.0, 0, zero_momentum=True, kinetic_energy=1.0)

@@ -18,6 +18,7 @@ from typing import Any
 
 from kcons.comparison.test_systems.registry import SYSTEMS, add_system, build
 from kcons.comparison.test_systems.system import Reference, TestSystem, Units
+from kcons.constraints.arguments import Rng, seed_from
 
 __all__ = [
     "SYSTEMS",
@@ -41,13 +42,13 @@ for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 
 
-def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options: Any) -> TestSystem:
+def from_file(path: Path | str, rng: Rng = 1, *, quick: bool = False, **options: Any) -> TestSystem:
     """The molecules of a PDB or mmCIF file with forces of OpenMM, or of any file that MDAnalysis reads.
 
     Parameters
     ----------
     path : path
-    seed : int
+    rng : int, numpy.random.Generator or None
     quick : bool
         Half the horizon.
     **options
@@ -61,7 +62,7 @@ def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options
         The file cannot be read, or does not fit the force field.
     """
     module = "any_file" if by_mdanalysis(str(path), options) else "structure"
-    system: TestSystem = import_module(f"{__name__}.{module}").from_file(path, seed, **options)
+    system: TestSystem = import_module(f"{__name__}.{module}").from_file(path, seed_from(rng), **options)
     return system.shortened(2) if quick else system
 
 

@@ -119,7 +119,7 @@ def plan(
 
 def from_file(
     path: Path | str,
-    seed: int = 1,
+    rng: int = 1,
     *,
     coordinates: Path | str | None = None,
     constrain: str = "hbonds",
@@ -137,7 +137,7 @@ def from_file(
     ----------
     path, coordinates, constrain, select, rigid_residues
         See `plan`.
-    seed : int
+    rng : int
         Of the velocities.
     forces : str
         'openmm'; 'emt', 'lj', 'tip3p', 'gfn1', 'gfn2', or the name of any calculator of ASE; or force fields of OpenMM
@@ -189,7 +189,7 @@ def from_file(
         f"{found.title}, {TEMPERATURE:g} K; ",
         held,
         x,
-        seed,
+        rng,
         potential=potential,
         symbols=[e or "X" for e in snapshot.topology.elements.tolist()],
         bonds=_distances(found.rows),

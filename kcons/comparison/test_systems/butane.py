@@ -39,7 +39,7 @@ BONDS = np.array([[0, 1], [1, 2], [2, 3]])
 TRIPLES = np.array([[0, 1, 2], [1, 2, 3]])
 
 
-def build(size: int, seed: int) -> TestSystem:
+def build(size: int, rng: int) -> TestSystem:
     """One molecule; its start is fixed."""
     return TestSystem(
         name="butane",

@@ -34,11 +34,11 @@ SHAPES = {
 }
 
 
-def build(size: int, seed: int, *, shape: str = "zigzag") -> TestSystem:
+def build(size: int, rng: int, *, shape: str = "zigzag") -> TestSystem:
     """A chain of `size` bonds; every atom is tied to its initial place by a soft anisotropic spring."""
     if size < 1:
         raise InputError(f"a chain needs at least one bond, not {size}", item="size")
-    x = positions(size, shape, seed)
+    x = positions(size, shape, rng)
     masses = np.full(size + 1, MASS)
     pairs = np.stack([np.arange(size), np.arange(1, size + 1)], axis=1)
     held = ConstraintSet(Distance(pairs, BOND), x, masses)
@@ -49,7 +49,7 @@ def build(size: int, seed: int, *, shape: str = "zigzag") -> TestSystem:
         horizon = 40.0
     if size >= VERY_LONG:
         horizon, steps = 20.0, steps[:3]
-    v = thermal_velocities(Motion(held, x), x, TEMPERATURE, seed, at_rest=False)
+    v = thermal_velocities(Motion(held, x), x, TEMPERATURE, rng, at_rest=False)
     return TestSystem(
         name="chain" if shape == "zigzag" else f"chain-{shape}",
         title=f"chain of {size} rigid bonds, {SHAPES[shape]}, 300 K; springs to the initial sites",
@@ -66,18 +66,12 @@ def build(size: int, seed: int, *, shape: str = "zigzag") -> TestSystem:
     )
 
 
-def positions(size: int, shape: str, seed: int = 1) -> FloatArray:
-    """Atoms of a chain of `size` bonds, shape (size + 1, 3), in Å.
-
-    Raises
-    ------
-    InputError
-        Unknown shape.
-    """
+def positions(size: int, shape: str, rng: int = 1) -> FloatArray:
+    """Atoms of a chain of `size` bonds, shape (size + 1, 3), in Å."""
     if shape not in SHAPES:
         raise InputError(f"no chain shape {shape!r}; there are {', '.join(SHAPES)}", item="shape")
     if shape == "free":
-        u = np.random.default_rng(seed).standard_normal((size, 3))
+        u = np.random.default_rng(rng).standard_normal((size, 3))
         steps = u / np.linalg.norm(u, axis=1)[:, None]
     else:
         bend = np.radians({"zigzag": 112.0, "straight": 180.0, "175": 175.0}[shape])

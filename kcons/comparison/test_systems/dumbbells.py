@@ -41,7 +41,7 @@ VELOCITIES = np.array(
 PAIRS = np.array([[0, 1], [2, 3]])
 
 
-def build(size: int, seed: int) -> TestSystem:
+def build(size: int, rng: int) -> TestSystem:
     """Two dumbbells that collide, from a fixed start."""
     return TestSystem(
         name="dumbbells",

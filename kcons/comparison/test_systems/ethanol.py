@@ -24,7 +24,7 @@ from kcons.motion.motion import Motion
 TEMPERATURE = 300.0
 
 
-def build(size: int, seed: int, *, forces: str = "") -> TestSystem:
+def build(size: int, rng: int, *, forces: str = "") -> TestSystem:
     """Forces are 'xtb' (GFN2-xTB by tblite, where it is installed) or 'emt' (a toy for this molecule, but smooth)."""
     atoms = molecule("CH3CH2OH")
     bonds, angles = topology(atoms)
@@ -39,7 +39,7 @@ def build(size: int, seed: int, *, forces: str = "") -> TestSystem:
         title=f"ethanol, all {len(bonds)} bonds and {len(angles)} angles, 300 K; {potential.name}",
         constraint_set=held,
         positions=x,
-        velocities=thermal_velocities(motion, x, TEMPERATURE, seed),
+        velocities=thermal_velocities(motion, x, TEMPERATURE, rng),
         potential=potential,
         symbols=atoms.get_chemical_symbols(),
         horizon=32 * units.fs,

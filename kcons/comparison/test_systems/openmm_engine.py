@@ -125,13 +125,7 @@ class OpenMMEngine:
 
 
 def place(platform: str) -> openmm.Platform:
-    """The platform of this name.
-
-    Raises
-    ------
-    InputError
-        There is none here.
-    """
+    """The platform of this name."""
     import openmm
 
     try:

@@ -56,7 +56,7 @@ PENDULUMS = {
 }
 
 
-def build(size: int, seed: int, *, kind: str = "pendulum") -> TestSystem:
+def build(size: int, rng: int, *, kind: str = "pendulum") -> TestSystem:
     """One of `PENDULUMS`; its start is fixed."""
     chosen = PENDULUMS[kind]
     angles, rates = np.array(chosen.angles), np.array(chosen.rates)

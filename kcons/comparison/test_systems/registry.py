@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from kcons.comparison.test_systems.system import TestSystem
+from kcons.constraints.arguments import Rng, seed_from
 from kcons.errors import InputError, did_you_mean
 
 
@@ -48,7 +49,7 @@ def add_system(
     name : str
         By which it is chosen. A test system of that name is replaced.
     make : callable
-        Size, seed and options to a `TestSystem`.
+        Size, rng and options to a `TestSystem`.
     text : str
         For the list of test systems.
     size, quick_size : int
@@ -65,7 +66,7 @@ def add_system(
     SYSTEMS[name] = Entry(make, text, size, size if quick_size is None else quick_size, unit, only, takes, options)
 
 
-def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False, **options: Any) -> TestSystem:
+def build(name: str, size: int | None = None, rng: Rng = 1, *, quick: bool = False, **options: Any) -> TestSystem:
     """The test system called `name`.
 
     Parameters
@@ -74,7 +75,7 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
         A key of `SYSTEMS`.
     size : int, optional
         Number of molecules, bonds or particles.
-    seed : int
+    rng : int, numpy.random.Generator or None
     quick : bool
         A smaller default size, half the horizon.
     **options
@@ -104,5 +105,5 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
                 item=option,
             )
         raise InputError(f"{name} takes {', '.join(entry.takes) or 'no options'}, not {option}", item=option)
-    system = entry.make(size, seed, **{**entry.options, **options})
+    system = entry.make(size, seed_from(rng), **{**entry.options, **options})
     return system.shortened(2) if quick else system

@@ -36,7 +36,7 @@ VELOCITIES = np.array(
 PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
-def build(size: int, seed: int) -> TestSystem:
+def build(size: int, rng: int) -> TestSystem:
     """The body; its start is fixed."""
     lengths = np.linalg.norm(POSITIONS[PAIRS[:, 0]] - POSITIONS[PAIRS[:, 1]], axis=1)
     return TestSystem(

@@ -25,7 +25,7 @@ VACUUM = 6.0
 TEMPERATURE = 300.0
 
 
-def build(size: int, seed: int) -> TestSystem:
+def build(size: int, rng: int) -> TestSystem:
     """`size` molecules, one on each 2 x 2 patch; patches beyond their number are left bare."""
     if size < 1:
         raise InputError(f"the slab needs at least one molecule, not {size}", item="size")
@@ -38,9 +38,9 @@ def build(size: int, seed: int) -> TestSystem:
     top = np.flatnonzero(atoms.get_tags() == 1).reshape(PATCH * along, PATCH * across)
     sites = atoms.positions[top[::PATCH, ::PATCH].ravel()[:size]]
     metal = len(atoms)
-    rng = np.random.default_rng(seed)
+    generator = np.random.default_rng(rng)
     up = np.array([0.0, 0.0, 1.0])
-    tilt = up + rng.normal(0.0, 0.1, (size, 3))
+    tilt = up + generator.normal(0.0, 0.1, (size, 3))
     carbon = sites + HEIGHT * up
     oxygen = carbon + BOND * tilt / np.linalg.norm(tilt, axis=1)[:, None]
     atoms += type(atoms)("CO" * size, positions=np.stack([carbon, oxygen], axis=1).reshape(-1, 3))
@@ -53,7 +53,7 @@ def build(size: int, seed: int) -> TestSystem:
         title=f"{molecules} on Cu(111), {metal} atoms in {LAYERS} layers of which {FIXED} are fixed, 300 K; ASE's EMT",
         constraint_set=held,
         positions=x,
-        velocities=thermal_velocities(Motion(held, x), x, TEMPERATURE, seed, at_rest=False),
+        velocities=thermal_velocities(Motion(held, x), x, TEMPERATURE, rng, at_rest=False),
         potential=of_calculator(atoms, EMT(), "ASE's EMT"),
         symbols=atoms.get_chemical_symbols(),
         horizon=48 * units.fs,

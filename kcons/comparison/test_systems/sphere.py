@@ -25,18 +25,18 @@ RADIUS = 1.0
 TILT, SLOW = 0.02, 0.01
 
 
-def build(size: int, seed: int, *, gravity: float = 0.0, near_top: bool = False) -> TestSystem:
+def build(size: int, rng: int, *, gravity: float = 0.0, near_top: bool = False) -> TestSystem:
     """`size` particles, each on its own sphere of radius 1, with speeds between 0.5 and 1."""
     if size < 1:
         raise InputError(f"a test system needs at least one particle, not {size}", item="size")
-    rng = np.random.default_rng(seed)
-    n: FloatArray = rng.standard_normal((size, 3))
+    generator = np.random.default_rng(rng)
+    n: FloatArray = generator.standard_normal((size, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]
     if near_top:
         n *= TILT / np.hypot(n[:, 0], n[:, 1])[:, None]
         n[:, 2] = np.sqrt(1.0 - TILT * TILT)
-    v = np.cross(n, rng.standard_normal((size, 3)))
-    v *= (SLOW if near_top else 1.0) * rng.uniform(0.5, 1.0, (size, 1)) / np.linalg.norm(v, axis=1)[:, None]
+    v = np.cross(n, generator.standard_normal((size, 3)))
+    v *= (SLOW if near_top else 1.0) * generator.uniform(0.5, 1.0, (size, 1)) / np.linalg.norm(v, axis=1)[:, None]
     centers = 4.0 * np.stack([np.arange(size), np.zeros(size), np.zeros(size)], axis=1)
     x = np.asarray(centers + RADIUS * n, dtype=float)
     masses = np.ones(size)

@@ -49,7 +49,7 @@ STRUCTURES: Mapping[str, tuple[str, str, int, str]] = {
 
 def build(
     size: int,
-    seed: int,
+    rng: int,
     *,
     structure: str,
     constrain: str = "",
@@ -72,7 +72,7 @@ def build(
         text,
         molecule.topology,
         _nanometers(molecule),
-        seed,
+        rng,
         constrain=constrain or held,
         field=force_field_of(force_field),
         platform=platform,
@@ -82,7 +82,7 @@ def build(
 
 def from_file(
     path: Path | str,
-    seed: int = 1,
+    rng: int = 1,
     *,
     constrain: str = "hbonds",
     force_field: Sequence[str] = FORCE_FIELD,
@@ -95,7 +95,7 @@ def from_file(
     Parameters
     ----------
     path : path
-    seed : int
+    rng : int
         Of the velocities.
     constrain : {'hbonds', 'allbonds', 'hangles'}
         What is held, beside rigid water: createSystem's HBonds, AllBonds or HAngles.
@@ -146,7 +146,7 @@ def from_file(
         path.name,
         topology,
         x,
-        seed,
+        rng,
         constrain=constrain,
         field=field,
         platform=platform,
@@ -256,7 +256,7 @@ def _test_system(
     text: str,
     topology: Any,
     x: FloatArray,
-    seed: int,
+    rng: int,
     *,
     constrain: str,
     field: Any,
@@ -294,7 +294,7 @@ def _test_system(
         f"{what}, {TEMPERATURE:g} K; {'PME, ' if box is not None else ''}",
         held,
         x / ASE_LENGTH,
-        seed,
+        rng,
         potential=md_engine.potential(),
         symbols=[atom.element.symbol if atom.element is not None else "X" for atom in topology.atoms()],
         bonds=rows.pairs,
@@ -304,7 +304,7 @@ def _test_system(
 
 
 def molecules_at_300_k(
-    name: str, title: str, held: ConstraintSet, x: FloatArray, seed: int, *, potential: Potential, **more: Any
+    name: str, title: str, held: ConstraintSet, x: FloatArray, rng: int, *, potential: Potential, **more: Any
 ) -> TestSystem:
     """A test system of molecules from a file: on the constraints, with thermal velocities, steps and horizon."""
     motion = Motion(held, x)
@@ -314,7 +314,7 @@ def molecules_at_300_k(
         title=title + potential.name,
         constraint_set=held,
         positions=on,
-        velocities=thermal_velocities(motion, on, TEMPERATURE, seed),
+        velocities=thermal_velocities(motion, on, TEMPERATURE, rng),
         potential=potential,
         thermal_energy=units.kB * TEMPERATURE,
         **steps_of(len(x)),
@@ -323,13 +323,7 @@ def molecules_at_300_k(
 
 
 def platform_of(n_atoms: int, platform: str) -> str:
-    """The platform of OpenMM that was asked for, or by default one that is fast enough.
-
-    Raises
-    ------
-    InputError
-        There is none of this name.
-    """
+    """The platform of OpenMM that was asked for, or by default one that is fast enough."""
     platform = platform or ("Reference" if n_atoms <= FEW_ATOMS else "CPU")
     place(platform)  # complain before the long part
     return platform

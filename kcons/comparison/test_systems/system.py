@@ -11,6 +11,7 @@ from ase import Atoms, units
 
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, PotentialCalculator
+from kcons.constraints.arguments import Rng, generator_of
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -155,13 +156,7 @@ class TestSystem:
         return atoms
 
     def with_time_steps(self, shown: Sequence[float]) -> TestSystem:
-        """The same test system with other steps, in the unit of time it shows.
-
-        Raises
-        ------
-        InputError
-            A step that is not positive, or does not divide the horizon.
-        """
+        """The same test system with other steps, in the unit of time it shows."""
         steps = []
         for dt in shown:
             internal = dt * self.units.time_unit
@@ -241,7 +236,7 @@ def thermal_velocities(
     motion: Motion,
     positions: FloatArray,
     temperature: float,
-    seed: int,
+    rng: Rng,
     *,
     at_rest: bool = True,
 ) -> FloatArray:
@@ -249,9 +244,9 @@ def thermal_velocities(
 
     Scaled so that the kinetic energy is exactly g k_B T/2.
     """
-    rng = np.random.default_rng(seed)
+    generator = generator_of(rng)
     masses = motion.masses[:, None]
-    v = rng.standard_normal(positions.shape) * np.sqrt(units.kB * temperature / masses)
+    v = generator.standard_normal(positions.shape) * np.sqrt(units.kB * temperature / masses)
     if at_rest:
         v -= np.sum(masses * v, axis=0) / masses.sum()
     v = motion.project_velocities(positions, v)

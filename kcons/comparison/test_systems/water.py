@@ -34,7 +34,7 @@ SMALLEST = 8
 MANY = 2000
 
 
-def build(size: int, seed: int, *, forces: str = "") -> TestSystem:
+def build(size: int, rng: int, *, forces: str = "") -> TestSystem:
     """`size` molecules with forces of 'openmm' (PME; the default where it is installed) or of 'ase' (its TIP3P)."""
     if size < SMALLEST:
         raise InputError(
@@ -53,8 +53,8 @@ def build(size: int, seed: int, *, forces: str = "") -> TestSystem:
     cutoff = min(CUTOFF, 0.49 * box)
     potential = _potential(forces, x, box, cutoff, masses)
     if not equilibrated:
-        x = _relaxed(motion, potential, x, seed)
-    v = thermal_velocities(motion, x, TEMPERATURE, seed)
+        x = _relaxed(motion, potential, x, rng)
+    v = thermal_velocities(motion, x, TEMPERATURE, rng)
     potential.forget()
     return TestSystem(
         name="water",
@@ -98,7 +98,7 @@ def _equilibrated(size: int) -> tuple[FloatArray, float]:
         return data["positions"].astype(float).reshape(size, 3, 3), float(data["box"])
 
 
-def _relaxed(motion: Motion, potential: Potential, x: FloatArray, seed: int) -> FloatArray:
+def _relaxed(motion: Motion, potential: Potential, x: FloatArray, rng: int) -> FloatArray:
     """Remove overlaps by descent with bounded displacements, then 100 fs with velocities reset every 10."""
     for _ in range(100):
         step = motion.project_forces(x, potential.forces(x)) / motion.masses[:, None]
@@ -106,7 +106,7 @@ def _relaxed(motion: Motion, potential: Potential, x: FloatArray, seed: int) -> 
         x = motion.project_positions(x + step * min(0.05 / longest, 0.02), x)
     system = System(motion, potential.forces)
     for round_ in range(10):
-        v = thermal_velocities(motion, x, TEMPERATURE, seed + 1000 + round_)
+        v = thermal_velocities(motion, x, TEMPERATURE, rng + 1000 + round_)
         state = State(x, v)
         for _ in range(10):
             state = Rattle().step(system, state, 1.0 * units.fs)

@@ -15,9 +15,9 @@ from kcons.constraints.arguments import (
     TAKES_TIME,
     Duration,
     FloatArray,
+    as_float_array,
     atom_column,
     check_call,
-    numbers,
     positive,
     read_only_view,
     unit,
@@ -44,8 +44,8 @@ _FLOAT = np.dtype(np.float64)
 _PLACES = (1, -1, 2, -2)
 _DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
 
-_Length: TypeAlias = Annotated[float | None, LENGTH, positive]
-_Period: TypeAlias = Annotated[float | None, ANY, positive]
+_Length: TypeAlias = Annotated[float, LENGTH, positive] | None
+_Period: TypeAlias = Annotated[float, ANY, positive] | None
 
 
 class PythonRows(Constraint, base=True):
@@ -84,7 +84,7 @@ class PythonRows(Constraint, base=True):
         if type(found) is float and not shape:
             return found
         if type(found) not in (np.ndarray, np.float64) or found.dtype is not _FLOAT:
-            found = numbers(found, f"{self.row_name(k)}: {name}")
+            found = as_float_array(found, f"{self.row_name(k)}: {name}")
         if found.shape != shape:
             raise InputError(
                 f"{self.family}: {name} returned shape {found.shape} for row {k}; it must return "
@@ -395,8 +395,8 @@ class ImplicitSurface(Custom):
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         found = function(*(read_only_view(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
         if name == "time_derivatives":
-            found = np.stack([np.broadcast_to(numbers(part, name), (self.n_rows,)) for part in found], axis=-1)
-        result = numbers(found, f"ImplicitSurface: {name}")
+            found = np.stack([np.broadcast_to(as_float_array(part, name), (self.n_rows,)) for part in found], axis=-1)
+        result = as_float_array(found, f"ImplicitSurface: {name}")
         wanted = (self.n_rows, 3) if shape == (1, 3) else (self.n_rows, *shape)
         if result.shape != wanted:
             raise InputError(

@@ -13,8 +13,8 @@ from kcons.constraints.arguments import (
     ANY,
     MD_UNITS,
     FloatArray,
+    as_float_array,
     atom_array,
-    numbers,
     out_of_range,
     positive,
     without_units,
@@ -82,7 +82,7 @@ class Formula(Constraint):
         parameters: Mapping[str, ArrayLike] | None = None,
         target: Target = 0.0,
         *,
-        period: Annotated[float | None, ANY, positive] = None,
+        period: Annotated[float, ANY, positive] | None = None,
     ) -> None:
         if not isinstance(parameters, Mapping | None):
             raise InputError(
@@ -107,7 +107,7 @@ class Formula(Constraint):
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)
             self.units = MD_UNITS if matters else self.units
-            column = numbers(plain, f"Formula: {name}")
+            column = as_float_array(plain, f"Formula: {name}")
             if column.shape not in ((), (1,), (self.n_rows,)):
                 raise InputError(
                     f"Formula: parameter {name!r} has shape {column.shape}; give one finite number, or one for each of "
@@ -194,7 +194,7 @@ class Formula(Constraint):
         wrong = sorted(wanted.symmetric_difference(set(data) - {"units"}))
         if wrong:
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
-        table = numbers(data["values"], f"{cls.family}: values")
+        table = as_float_array(data["values"], f"{cls.family}: values")
         if not isinstance(data["names"], list | tuple) or np.shape(table)[1:] != (len(data["names"]),):
             raise InputError(
                 f"{cls.family} cannot be read: values have shape {table.shape} for the names {data['names']!r:.80}; "

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from kcons.constraints.arguments import FloatArray, numbers, positive
+from kcons.constraints.arguments import FloatArray, as_float_array, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, learn
@@ -82,15 +82,9 @@ class Surface:
     _process: Learned
 
     def free_energy(self, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """F and its standard error, both against `zero`, at places of shape (m, d).
-
-        Raises
-        ------
-        InputError
-            A place outside of the range of the windows.
-        """
+        """F and its standard error, both against `zero`, at places of shape (m, d)."""
         found = []
-        for places in np.array_split(self._places(x), max(1, math.ceil(len(numbers(x, "x")) / _TOGETHER))):
+        for places in np.array_split(self._places(x), max(1, math.ceil(len(as_float_array(x, "x")) / _TOGETHER))):
             values, covariance = self._process.posterior((np.vstack([places, self.zero]), [-1]))
             variance = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
             found.append((values[:-1] - values[-1], np.sqrt(np.maximum(variance, 0.0))))
@@ -99,7 +93,7 @@ class Surface:
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        ends = [numbers(place, item) for place, item in ((a, "a"), (b, "b"))]
+        ends = [as_float_array(place, item) for place, item in ((a, "a"), (b, "b"))]
         if any(end.shape != self.low.shape for end in ends):
             raise InputError(f"a and b must be places of {len(self.low)} coordinates", item="a")
         return difference(*self._process.posterior((self._places(np.stack(ends)), [-1])))
@@ -122,7 +116,7 @@ class Surface:
         return sorted(minima, key=lambda minimum: minimum.F)
 
     def _places(self, x: ArrayLike) -> FloatArray:
-        places = numbers(x, "x")
+        places = as_float_array(x, "x")
         if places.ndim != 2 or places.shape[1] != len(self.low) or not np.isfinite(places).all():
             raise InputError(f"places must be finite and have shape (m, {len(self.low)})", item="x")
         slack = 1e-9 * (self.high - self.low)
@@ -201,7 +195,7 @@ def fit_surface(
     if zero is None:
         lowest = places[np.argmin(process.mean(places, [-1])[0])]
     else:
-        lowest = numbers(zero, "zero")
+        lowest = as_float_array(zero, "zero")
         if lowest.shape != (d,) or not np.isfinite(lowest).all():
             raise InputError(f"zero must be {d} finite numbers", item="zero")
     surface = Surface(places, forces, low, high, turns, lowest, consistency, process)

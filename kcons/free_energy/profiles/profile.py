@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from kcons.constraints.arguments import FloatArray, numbers, positive, whole_number
+from kcons.constraints.arguments import FloatArray, as_float_array, checked, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
@@ -204,10 +204,6 @@ class Profile:
         step = 1e-6 * np.ptp(self.windows)
         return (self._added(at + step) - self._added(at - step)) / (2 * step)
 
-    def next_window(self, *, between: tuple[float, float] | None = None, below: float | None = None) -> float:
-        """Where one more window would tell most; see `next_windows`."""
-        return self.next_windows(1, between=between, below=below)[0]
-
     def next_windows(
         self, count: int, *, between: tuple[float, float] | None = None, below: float | None = None
     ) -> list[float]:
@@ -226,11 +222,6 @@ class Profile:
         below : float, optional
             Only places count where the free energy is this much above its lowest value or less: rates and populations
             do not depend on the others.
-
-        Raises
-        ------
-        InputError
-            `between` is not in the range of the windows; `below` is not positive, or given beside `between`.
         """
         known = self._known
         grid = np.linspace(known.x[0], known.end, _POINTS)
@@ -257,6 +248,7 @@ class Profile:
         return chosen
 
 
+@checked
 def integrate(
     x: ArrayLike,
     f: ArrayLike,
@@ -300,8 +292,6 @@ def integrate(
     UserWarning
         The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
     """
-    if method not in ("gp", "spline"):
-        raise InputError(f"unknown method {method!r}; give 'gp' or 'spline'", item="method")
     known = _windows(x, f, e, period)
     points = np.linspace(known.x[0], known.end, _POINTS) if at is None else _places(at, known, "at")
     closure = None
@@ -372,7 +362,7 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
 
 def _places(at: ArrayLike, known: _Windows, item: str) -> FloatArray:
     """Places within the range of the windows; into it by periods where there is one."""
-    points = numbers(at, item)
+    points = as_float_array(at, item)
     if points.ndim != 1 or not np.isfinite(points).all():
         raise InputError(f"{item} must be a list of finite numbers", item=item)
     low, high = float(known.x[0]), known.end

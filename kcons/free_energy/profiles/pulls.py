@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers, positive
+from kcons.constraints.arguments import FloatArray, IntArray, Rng, as_float_array, generator_of, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
-FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03
+MIN_PULLS, _SAMPLES, _OVERLAP = 5, 500, 0.03
 #: Standard errors by which pulls both ways may gain work before that is warned of.
 _GAIN = 4.0
 #: Works over kT that differ by less are the same, but for rounding.
@@ -80,7 +80,7 @@ class Pulled:
 
 
 def pull_free_energy(
-    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, seed: int = 0
+    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, rng: Rng = 0
 ) -> Pulled:
     """Difference of free energy from the works of pulls.
 
@@ -94,7 +94,7 @@ def pull_free_energy(
         Work done on the system by pulls from end to start, each from equilibrium at the end.
     thermal_energy : float
         kT in the unit of the works.
-    seed : int
+    rng : int, numpy.random.Generator or None
         Of the bootstrap.
 
     Raises
@@ -111,8 +111,8 @@ def pull_free_energy(
         or gain work, as those of the wrong sign do.
     """
     kT = positive(thermal_energy, "thermal_energy")
-    ahead, rng = _works(forward, "forward", kT), generator_of(seed, "seed")
-    drawn = ahead[rng.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
+    ahead, generator = _works(forward, "forward", kT), generator_of(rng)
+    drawn = ahead[generator.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
     one = _one_way(ahead, drawn, kT)
     if backward is None:
         effective = one[-1]
@@ -125,7 +125,7 @@ def pull_free_energy(
             )
         return Pulled(*one, kT * float(ahead.mean()) - one[0].value)
     back = _works(backward, "backward", kT)
-    drawn_back = back[rng.integers(len(back), size=(_SAMPLES, len(back)))]
+    drawn_back = back[generator.integers(len(back), size=(_SAMPLES, len(back)))]
     difference, error = _bar(ahead, back)
     overlap = _overlap(ahead, back, difference)
     if overlap < _OVERLAP:
@@ -165,13 +165,8 @@ def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
     Returns
     -------
     ndarray, shape of `force`
-
-    Raises
-    ------
-    InputError
-        Shapes that do not go together; a NaN or infinity.
     """
-    path, pushes = numbers(x, "x"), numbers(force, "force")
+    path, pushes = as_float_array(x, "x"), as_float_array(force, "force")
     if path.ndim != 1 or len(path) < 2 or pushes.ndim not in (1, 2) or pushes.shape[-1] != len(path):
         raise InputError(f"forces of shape {pushes.shape} do not go with a path of shape {path.shape}", item="force")
     if not (np.isfinite(path).all() and np.isfinite(pushes).all()):
@@ -181,7 +176,7 @@ def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
 
 
 def work_profile(
-    works: ArrayLike, *, thermal_energy: float, log_weights: ArrayLike | None = None, seed: int = 0
+    works: ArrayLike, *, thermal_energy: float, log_weights: ArrayLike | None = None, rng: Rng = 0
 ) -> tuple[FloatArray, FloatArray]:
     """Free energy along the path of forward pulls, against its start, with bootstrapped errors.
 
@@ -194,25 +189,25 @@ def work_profile(
     thermal_energy : float
     log_weights : array_like, shape (n, m), optional
         ln Z^(-1/2) at each place: then F is -kT ln P of the coordinate. Without, it is that of the held system.
-    seed : int
+    rng : int, numpy.random.Generator or None
 
     Returns
     -------
     F, errors : ndarray, shape (m,)
     """
-    done = numbers(works, "works")
+    done = as_float_array(works, "works")
     if done.ndim != 2 or not done.shape[1]:
         raise InputError(f"works must have shape (n, m), not {done.shape}", item="works")
     reduced = np.stack([_works(column, "works", thermal_energy) for column in done.T], axis=1)
-    weights = np.zeros_like(reduced) if log_weights is None else numbers(log_weights, "log_weights")
+    weights = np.zeros_like(reduced) if log_weights is None else as_float_array(log_weights, "log_weights")
     if weights.shape != reduced.shape or not np.isfinite(weights).all():
         raise InputError(f"log_weights must be finite and have shape {reduced.shape}", item="log_weights")
 
     def along(chosen: IntArray | slice) -> FloatArray:
         return np.asarray(logsumexp(weights[chosen, 0], axis=0) - logsumexp(weights[chosen] - reduced[chosen], axis=0))
 
-    rng, n = generator_of(seed, "seed"), len(reduced)
-    sampled = np.array([along(rng.integers(n, size=n)) for _ in range(_SAMPLES)])
+    generator, n = generator_of(rng), len(reduced)
+    sampled = np.array([along(generator.integers(n, size=n)) for _ in range(_SAMPLES)])
     return thermal_energy * along(slice(None)), thermal_energy * sampled.std(axis=0, ddof=1)
 
 
@@ -234,8 +229,8 @@ def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
 def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
     """Works over kT."""
     values = finite(works, item, "work")
-    if values.ndim != 1 or len(values) < FEWEST:
-        raise InputError(f"{item} has works of shape {values.shape}; give {FEWEST} pulls or more", item=item)
+    if values.ndim != 1 or len(values) < MIN_PULLS:
+        raise InputError(f"{item} has works of shape {values.shape}; give {MIN_PULLS} pulls or more", item=item)
     return values / positive(thermal_energy, "thermal_energy")
 
 

@@ -25,7 +25,7 @@ from kcons import __version__
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.named_calculators import described
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import ANGLE, LENGTH, numbers
+from kcons.constraints.arguments import ANGLE, LENGTH, as_float_array
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, UnreadableError, UnsupportedError
 from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text
@@ -139,7 +139,7 @@ class Grid:
 
 def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:
     name = item.row_name(0)
-    axis = np.atleast_1d(np.array(numbers(given, f"values of {name}")))
+    axis = np.atleast_1d(np.array(as_float_array(given, f"values of {name}")))
     if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
         raise InputError(f"the values of {name} are not a list of finite numbers", item="values")
     ring, span = False, float(np.ptp(axis))
@@ -338,11 +338,6 @@ class Scan:
             Numbers of its values in the lists of the scan.
         hold : bool
             Whether the atoms get the constraints they had there: what was held besides, and the coordinates.
-
-        Raises
-        ------
-        InputError
-            The point was not reached.
         """
         if point not in self.best:
             raise InputError(

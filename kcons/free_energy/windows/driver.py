@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kcons.constraints.arguments import positive, seed_number, whole_number
+from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
-from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
+from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
 from kcons.steppers.files import ResultFolder, in_one_piece, text
@@ -131,13 +131,7 @@ class FreeEnergy:
 
     @cached_property
     def profile(self) -> Profile:
-        """Free energy along the only coordinate, kJ/mol.
-
-        Raises
-        ------
-        InputError
-            There are several coordinates, or too few windows.
-        """
+        """Free energy along the only coordinate, kJ/mol."""
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
         f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
@@ -146,13 +140,7 @@ class FreeEnergy:
 
     @cached_property
     def surface(self) -> Surface:
-        """Free energy in all coordinates, kJ/mol.
-
-        Raises
-        ------
-        InputError
-            Too few windows.
-        """
+        """Free energy in all coordinates, kJ/mol."""
         x, periods = self._places()
         f = np.array([w.force for w in self.windows])
         return fit_surface(x, f, np.array([w.covariance for w in self.windows]), periods=periods)
@@ -337,7 +325,8 @@ class Windows:
         Sample each window twice, pulled there from below and from above: what the two differ by is hysteresis.
     approach : float or array_like, shape (d,)
         From how far away it is pulled, in angstrom and radian.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        A folder goes on with the same number only.
     executor : Executor, optional
         Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
         processes of this machine.
@@ -363,7 +352,7 @@ class Windows:
         *,
         both_sides: bool = True,
         approach: ArrayLike = 0.1,
-        seed: int = 1,
+        rng: Rng = 1,
         executor: Executor | None = None,
         workers: int | None = None,
         progress: Callable[[int, int, float], None] | None = None,
@@ -371,7 +360,7 @@ class Windows:
         self.sampler, self.executor, self.progress = sampler, executor, progress
         self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         self.settings = settings or Settings()
-        self.both_sides, self.seed = both_sides, seed_number(seed)
+        self.both_sides, self.seed = both_sides, seed_from(rng)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
         self._failed: dict[str, str] = {}
@@ -490,7 +479,7 @@ class Windows:
         InputError
             No steps to pull in; fewer than 5 pulls that did not fail.
         """
-        whole_number(count, "count", FEWEST)
+        whole_number(count, "count", MIN_PULLS)
         if not self.settings.pull:
             raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
         ends = np.vstack([places_of([np.atleast_1d(end)], self.sampler.names) for end in (start, end)])
@@ -507,8 +496,8 @@ class Windows:
             failed = self._sample(missing, len(jobs) * count)
         if failed:
             said = f"{len(failed)} of {len(jobs) * count} pulls failed; {': '.join(next(iter(failed.items())))}"
-            if any(sum(job.name not in failed for job in each) < FEWEST for each in jobs):
-                raise InputError(f"{said}. A difference needs {FEWEST} each way", item="pull")
+            if any(sum(job.name not in failed for job in each) < MIN_PULLS for each in jobs):
+                raise InputError(f"{said}. A difference needs {MIN_PULLS} each way", item="pull")
             warnings.warn(f"{said}. They are left out, which makes the result doubtful", UserWarning, stacklevel=2)
         found = [[Series.load(self.file(job)) for job in each if job.name not in failed] for each in jobs]
         return _pulled(found, self.sampler.kJ, BOLTZMANN * self.settings.temperature)

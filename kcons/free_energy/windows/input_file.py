@@ -170,7 +170,7 @@ class Workers:
 
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
-_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "seed": Single}
+_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "rng": Single}
 #: Tables of a file; [sampling] becomes `Settings`.
 _TABLES: dict[str, Any] = {
     "structure": Structure,
@@ -195,7 +195,7 @@ class InputFile:
     targets : ndarray, shape (n, d)
         In angstrom and radian.
     options : dict
-        Of `Windows`: both_sides, approach, seed.
+        Of `Windows`: both_sides, approach, rng.
     improve : dict or None
         Of `Windows.improve`.
     pulls : dict or None
@@ -379,25 +379,14 @@ def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatAr
 
 
 def counted(atoms: Sequence[int], first: int) -> list[int]:
-    """Numbers from 0 of atoms that are counted from `first`.
-
-    Raises
-    ------
-    InputError
-        One below the first.
-    """
+    """Numbers from 0 of atoms that are counted from `first`."""
     if len(atoms) and min(atoms) < first:
         raise InputError(f"there is no atom {min(atoms)}; atoms are counted from {first}", item="atoms")
     return [atom - first for atom in atoms]
 
 
 def read_structure(path: Path) -> Any:
-    """The last structure of any file that ASE reads, as `Atoms`.
-
-    Raises
-    ------
-    InputError
-    """
+    """The last structure of any file that ASE reads, as `Atoms`."""
     import ase.io
 
     _require_file(path)

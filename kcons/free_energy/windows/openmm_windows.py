@@ -22,10 +22,10 @@ from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.callback_rows.callbacks import cell_of
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
 from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
-from kcons.openmm.quantities import accepted, masses_of, nanometers
+from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
 from kcons.openmm.states import positions_of, velocities_of
 from kcons.openmm.topology import bonds_of
 

@@ -8,13 +8,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import ANGLE, LENGTH, numbers, positive, whole_number
+from kcons.constraints.arguments import (
+    ANGLE,
+    LENGTH,
+    Count,
+    FromZero,
+    Positive,
+    as_float_array,
+    checked,
+)
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
@@ -73,31 +81,26 @@ class Settings:
         Steps from one sample to the next. Multipliers forget in 50 to 100 fs, and closer samples tell nothing more.
     """
 
-    temperature: float = 300.0
-    timestep: float = 1.0
+    temperature: Positive = 300.0
+    timestep: Positive = 1.0
     thermostat: Thermostat = "langevin"
-    friction: float = 5.0
-    relax: int = 50
-    pull: int = 1000
-    equilibration: int = 2000
-    production: int = 20000
-    every: int = 50
+    friction: Positive = 5.0
+    relax: FromZero = 50
+    pull: FromZero = 1000
+    equilibration: FromZero = 2000
+    production: Count = 20000
+    every: Count = 50
 
     def __post_init__(self) -> None:
-        for name in ("temperature", "timestep", "friction"):
-            object.__setattr__(self, name, positive(getattr(self, name), name))
-        for name in ("relax", "pull", "equilibration", "production", "every"):
-            least = int(name in ("production", "every"))
-            object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
-        known = get_args(Thermostat)
-        if self.thermostat not in known:
-            raise InputError(f"no thermostat {self.thermostat!r}; there are {', '.join(known)}", item="thermostat")
         if self.production // self.every < 32:
             raise InputError(
                 f"production of {self.production} steps with a sample every {self.every} gives fewer than 32 samples; "
                 "an error needs more; take a longer production, or a smaller `every`",
                 item="production",
             )
+
+
+Settings.__init__ = checked(Settings.__init__)  # type: ignore[method-assign]
 
 
 class Sampler(ABC):
@@ -208,7 +211,7 @@ def digest_of(*parts: Any) -> str:
 def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[str]) -> FloatArray:
     """Values of the coordinates, one row for each window, shape (n, d)."""
     listed = list(targets) if isinstance(targets, Iterable) and not isinstance(targets, np.ndarray) else targets
-    places = np.array(numbers(listed, "targets"))
+    places = np.array(as_float_array(listed, "targets"))
     places = places[:, None] if places.ndim == len(names) == 1 else places
     if places.ndim != 2 or places.shape[1] != len(names) or not len(places) or not np.all(np.isfinite(places)):
         raise InputError("targets must be finite numbers, one row for each window", item="targets")
@@ -217,7 +220,7 @@ def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[st
 
 def approach_of(approach: ArrayLike, names: Sequence[str]) -> FloatArray:
     """From how far away each coordinate is pulled, shape (d,)."""
-    given = numbers(approach, "approach")
+    given = as_float_array(approach, "approach")
     if given.shape not in ((), (len(names),)) or not np.isfinite(given).all():
         raise InputError(
             f"approach is {approach!r}; give a finite number, or one for each of {', '.join(names)}", item="approach"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import FloatArray, check_call, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, as_float_array, check_call, whole_number
 from kcons.constraints.target import WRONG
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.integration import STEP, called, check_derivative, jacobian_by_differences
@@ -89,7 +89,7 @@ class Flow:
         return solve_ivp(self.velocity, tuple(t_span), self._state(X0), method, rtol=rtol, atol=atol, **options)
 
     def _state(self, X: ArrayLike) -> FloatArray:
-        array = numbers(X, "X")
+        array = as_float_array(X, "X")
         if array.shape != (self.n,):
             raise InputError(f"a state of this flow has shape ({self.n},), not {array.shape}", item="X")
         if not np.all(np.isfinite(array)):
@@ -135,7 +135,7 @@ def phase_volume(
     ConvergenceError
         If the integration fails, or a volume shrinks beyond the digits of its propagator.
     """
-    wanted, pieces = numbers(times, "times"), whole_number(pieces, "pieces")
+    wanted, pieces = as_float_array(times, "times"), whole_number(pieces, "pieces")
     if wanted.ndim != 1 or len(wanted) < 1 or not np.all(np.diff(wanted) > 0):
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n

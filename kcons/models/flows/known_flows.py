@@ -13,9 +13,11 @@ from scipy.special import ellipj, ellipkinc
 
 from kcons.constraints.arguments import (
     FloatArray,
+    NotNegative,
+    Positive,
+    as_float_array,
     check_call,
-    finite_number,
-    numbers,
+    checked,
     positive,
     whole_number,
 )
@@ -32,10 +34,9 @@ NEAR_SEPARATRIX = 1e-9
 class DampedOscillator(LinearFlow):
     """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22)."""
 
-    def __init__(self, omega: float = 1.0, eta: float = 0.2) -> None:
-        self.omega, self.eta = positive(omega, "omega"), finite_number(eta, "eta")
-        if self.eta < 0:
-            raise InputError(f"eta is not negative, so it cannot be {eta}", item="eta")
+    @checked
+    def __init__(self, omega: Positive = 1.0, eta: NotNegative = 0.2) -> None:
+        self.omega, self.eta = omega, eta
         super().__init__([[0.0, self.omega], [-self.omega, -self.eta]])
 
     @property
@@ -98,7 +99,7 @@ class HarmonicOscillator(DampedOscillator):
     def circle(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
         """X(t) on its circle, shape (2,) or (k, 2) (notes eqs. 18, 19)."""
         x1, x2 = self._state(X0)
-        angle = self.omega * numbers(t, "t")
+        angle = self.omega * as_float_array(t, "t")
         c, s = np.cos(angle), np.sin(angle)
         return np.stack([c * x1 + s * x2, c * x2 - s * x1], axis=-1)
 
@@ -106,8 +107,9 @@ class HarmonicOscillator(DampedOscillator):
 class Pendulum(HamiltonianFlow):
     """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57)."""
 
-    def __init__(self, omega: float = 1.0) -> None:
-        self.omega = positive(omega, "omega")
+    @checked
+    def __init__(self, omega: Positive = 1.0) -> None:
+        self.omega = omega
         super().__init__(
             lambda q, p: float(self.omega * (0.5 * p[0] ** 2 + 2.0 * np.sin(0.5 * q[0]) ** 2)),
             1,
@@ -123,7 +125,7 @@ class Pendulum(HamiltonianFlow):
         1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
         """
         theta0, rate0 = self._state(X0)
-        times = numbers(t, "t")
+        times = as_float_array(t, "t")
         m = self.energy(X0) / (2.0 * self.omega)
         # 1 - m without its cancellation, and what rounding makes of a start on the separatrix.
         up, half, off = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0), 2.2e-16 * max(1.0, abs(theta0))
@@ -182,7 +184,7 @@ class ParticleOnSphere(Flow):
 
     def acceleration(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
         """The acceleration on the sphere, shape (3,) (notes eq. 110)."""
-        x, v = numbers(x, "x"), numbers(v, "v")
+        x, v = as_float_array(x, "x"), as_float_array(v, "v")
         a = -(v @ v) / self.radius**2 * x
         if self.force is not None:
             f = called("force", self.force, (3,), x) / self.mass
@@ -191,13 +193,15 @@ class ParticleOnSphere(Flow):
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
         """The free motion x(t), shape (3,) or (k, 3)."""
-        x0, v0 = np.split(self._state(np.concatenate([np.ravel(numbers(x0, "x0")), np.ravel(numbers(v0, "v0"))])), 2)
+        x0, v0 = np.split(
+            self._state(np.concatenate([np.ravel(as_float_array(x0, "x0")), np.ravel(as_float_array(v0, "v0"))])), 2
+        )
         speed = float(np.linalg.norm(v0))
         if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
             raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the center, not {self.radius:.9g}", item="x0")
         if abs(x0 @ v0) > 1e-9 * self.radius * speed:
             raise InputError("v0 leaves the sphere: give its part along it, v - x (x.v)/R^2", item="v0")
-        angle = numbers(t, "t")[..., None] * speed / self.radius
+        angle = as_float_array(t, "t")[..., None] * speed / self.radius
         return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))
 
 
@@ -233,7 +237,7 @@ class Thermostat(Flow):
     def __init__(
         self, masses: ArrayLike, force: Callable[[FloatArray], ArrayLike], *, momentum_removed: int = 0
     ) -> None:
-        m = numbers(masses, "masses").copy()
+        m = as_float_array(masses, "masses").copy()
         if m.ndim != 1 or m.size < 2 or not np.all(np.isfinite(m) & (m > 0)):
             raise InputError("masses are positive, one for each of at least two Cartesian components", item="masses")
         check_call("force", force, ("x",))
@@ -251,7 +255,7 @@ class Thermostat(Flow):
 
     def state(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
         """X of positions and velocities."""
-        x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
+        x, v = as_float_array(x, "x").ravel(), as_float_array(v, "v").ravel()
         if x.shape != self.masses.shape or v.shape != self.masses.shape:
             raise InputError(f"x and v have {self.masses.size} components each, as the masses", item="x")
         if not v @ (self.masses * v) > 1e-290:
@@ -271,7 +275,7 @@ class Thermostat(Flow):
 
     def friction(self, X: ArrayLike) -> float:
         """alpha = v.f/(v^T M v) (notes eq. 113)."""
-        X = numbers(X, "X")
+        X = as_float_array(X, "X")
         w = X[self.masses.size :]
         return float(w @ (self._force(self.positions(X)) / self.root) / (w @ w))
 
@@ -303,7 +307,7 @@ class Thermostat(Flow):
         """Measure the compression of phase space along a trajectory, and predict it from alpha."""
         X0 = self._state(X0)
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
-        wanted, pieces = np.atleast_1d(numbers(times, "times")), whole_number(pieces, "pieces")
+        wanted, pieces = np.atleast_1d(as_float_array(times, "times")), whole_number(pieces, "pieces")
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
         for a, b in pairwise(wanted):
             for c, d in pairwise(np.linspace(a, b, pieces + 1)):

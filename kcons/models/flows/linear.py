@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import root
 from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints.arguments import FloatArray, numbers, whole_number
+from kcons.constraints.arguments import FloatArray, Rng, as_float_array, generator_of, whole_number
 from kcons.errors import InputError
 from kcons.models.flows.flow import Flow
 
@@ -74,7 +74,7 @@ class LinearFlow(Flow):
 
     def exact(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
         """X(t) = exp(At) X(0), shape (n,) or (k, n) (notes eq. 8)."""
-        return np.asarray(scipy.linalg.expm(self.matrix * numbers(t, "t")[..., None, None]) @ self._state(X0))
+        return np.asarray(scipy.linalg.expm(self.matrix * as_float_array(t, "t")[..., None, None]) @ self._state(X0))
 
     def jordan_form(self) -> JordanForm:
         """T and J with A = T J T^-1, as far as double precision allows (notes eqs. 10-13)."""
@@ -105,7 +105,7 @@ class Spectrum(NamedTuple):
 
 def spectrum(matrix: ArrayLike, error: ArrayLike = 0.0) -> Spectrum:
     """The eigenvalues of a real matrix and what is known about them; arguments as of `classify`."""
-    A, E = _square(matrix), numbers(error, "error")
+    A, E = _square(matrix), as_float_array(error, "error")
     if E.ndim and E.shape != A.shape:
         raise InputError(f"errors are a number or of the shape of the matrix, {A.shape}, not {E.shape}", item="error")
     if not np.all(np.isfinite(E) & (E >= 0)):
@@ -142,7 +142,7 @@ def spectrum(matrix: ArrayLike, error: ArrayLike = 0.0) -> Spectrum:
 
 
 def _square(matrix: ArrayLike) -> FloatArray:
-    A = numbers(matrix, "matrix")
+    A = as_float_array(matrix, "matrix")
     if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
         raise InputError(f"the matrix of a linear flow is square, not of shape {A.shape}", item="matrix")
     if not np.all(np.isfinite(A)):
@@ -540,7 +540,7 @@ class Equilibrium(NamedTuple):
 
 
 def find_equilibria(
-    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, seed: int = 0, tolerance: float = 1e-10
+    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, rng: Rng = 0, tolerance: float = 1e-10
 ) -> list[Equilibrium]:
     """Search for equilibria within a box, by Powell's method from many starts.
 
@@ -555,17 +555,17 @@ def find_equilibria(
         Starts: the corners and the middle of the box, the rest spread at random.
     time : float
         V is taken at this time.
-    seed : int
+    rng : int, numpy.random.Generator or None
     tolerance : float
         |V| counts as zero below this part of its size in the box.
     """
-    edges, starts, n = numbers(box, "box"), whole_number(starts, "starts"), flow.n
+    edges, starts, n = as_float_array(box, "box"), whole_number(starts, "starts"), flow.n
     if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
         raise InputError(f"the box has shape ({n}, 2), its lower edges first", item="box")
     low, width = edges[:, 0], edges[:, 1] - edges[:, 0]
     corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * n), axis=-1).reshape(-1, n) if n <= 6 else np.zeros((0, n))
     fixed = np.vstack([np.full((1, n), 0.5), corners])
-    spread = np.random.default_rng(seed).random((max(starts - len(fixed), 0), n))
+    spread = generator_of(rng).random((max(starts - len(fixed), 0), n))
     points = low + width * np.vstack([fixed, spread])[:starts]
     found: list[FloatArray] = []
     with np.errstate(all="ignore"):
@@ -596,7 +596,7 @@ def equilibrium_at(flow: Flow, position: ArrayLike, time: float = 0.0) -> Equili
     The Jacobian counts as known to the accuracy of its differences and of the point. So a center of a flow that is
     given without its Jacobian is a center whose stability cannot be told.
     """
-    X = numbers(position, "position")
+    X = as_float_array(position, "position")
     A, V = flow.jacobian(time, X), flow.velocity(time, X)
     # One more Newton step says how far the point may be off, and that what the Jacobian would be there; at a root of
     # order k it goes only a k-th part of the way.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
-from kcons.constraints.arguments import FloatArray, check_call, numbers, read_only_view, whole_number
+from kcons.constraints.arguments import FloatArray, as_float_array, check_call, read_only_view, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows.flow import Flow
 from kcons.models.integration import STEP, called, check_derivative, jacobian_by_differences
@@ -103,7 +103,7 @@ def action(lagrangian: Lagrangian, times: ArrayLike, path: ArrayLike) -> float:
     The velocity of a piece is its difference quotient and L is taken at its middle, so that the path of least S obeys
     Lagrange's equations to second order in the time step.
     """
-    t, q = numbers(times, "times"), numbers(path, "path")
+    t, q = as_float_array(times, "times"), as_float_array(path, "path")
     if t.ndim != 1 or not np.all(np.diff(t) > 0) or q.shape[:1] != t.shape:
         raise InputError("times increase, and the path has a place for each of them", item="times")
     q = q.reshape(len(t), -1)
@@ -115,7 +115,7 @@ def action(lagrangian: Lagrangian, times: ArrayLike, path: ArrayLike) -> float:
 
 def momentum(lagrangian: Lagrangian, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> FloatArray:
     """p = dL/dv, shape (f,) (notes eq. 45)."""
-    q = numbers(q, "q")
+    q = as_float_array(q, "q")
     return jacobian_by_differences(lambda s, w: lagrangian(q, w, t), t, v)
 
 
@@ -123,7 +123,7 @@ def lagrange_residual(
     lagrangian: Lagrangian, q: ArrayLike, v: ArrayLike, a: ArrayLike, t: float = 0.0, step: float = 1e-2
 ) -> FloatArray:
     """d/dt dL/dv - dL/dq along q, v, a, shape (f,); zero on a true motion (notes eq. 44)."""
-    q, v, a = numbers(q, "q"), numbers(v, "v"), numbers(a, "a")
+    q, v, a = as_float_array(q, "q"), as_float_array(v, "v"), as_float_array(a, "a")
 
     def along(h: float) -> FloatArray:
         return momentum(lagrangian, q + h * v + 0.5 * h * h * a, v + h * a, t + h)
@@ -142,8 +142,8 @@ def velocity_of_momentum(
     ConvergenceError
         If there is none near the guess.
     """
-    p = numbers(p, "p")
-    start = p if guess is None else numbers(guess, "guess")
+    p = as_float_array(p, "p")
+    start = p if guess is None else as_float_array(guess, "guess")
     found = root(lambda v: momentum(lagrangian, q, v, t) - p, start, options={"xtol": 1e-13})
     if not np.all(np.abs(found.fun) <= 1e-9 * np.maximum(1.0, np.abs(p))):
         left = float(np.max(np.abs(found.fun)))
@@ -153,6 +153,6 @@ def velocity_of_momentum(
 
 def hamiltonian(lagrangian: Lagrangian, q: ArrayLike, p: ArrayLike, t: float = 0.0) -> float:
     """H(q, p, t) = v . p - L with v the velocity of this momentum (notes eqs. 47, 48)."""
-    q = numbers(q, "q")
+    q = as_float_array(q, "q")
     v = velocity_of_momentum(lagrangian, q, p, t)
-    return float(v @ numbers(p, "p") - lagrangian(q, v, t))
+    return float(v @ as_float_array(p, "p") - lagrangian(q, v, t))

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import OptimizeResult
 
 from kcons.constraints import projection
-from kcons.constraints.arguments import FloatArray, check_call, numbers, refuse_other
+from kcons.constraints.arguments import FloatArray, as_float_array, check_call, refuse_other
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
@@ -393,7 +393,7 @@ def solve(
     """
     options = {"rtol": 1e-9, "atol": 1e-11} | {name: value for name, value in options.items() if value is not None}
     solver, span, times = check_run(t_span, t_eval, method, options, system.n)
-    options |= {name: numbers(options[name], name) for name in ("rtol", "atol")}
+    options |= {name: as_float_array(options[name], name) for name in ("rtol", "atol")}
     tolerance = max(float(np.min(options["rtol"] + options["atol"])), 1e-13)
     p0 = Populations.start(span[0], system.n, x0, log_x0)
     bound = system.bind(p0)
@@ -441,7 +441,7 @@ def _of_logarithms(events: Event | Sequence[Event] | None) -> list[Event] | None
         check_call("event", event, ("t", "x"))
 
         def of_logarithms(t: float, y: FloatArray, event: Event = event) -> float:
-            value = numbers(event(t, np.exp(y)), "event")
+            value = as_float_array(event(t, np.exp(y)), "event")
             if value.size != 1:
                 raise InputError(f"an event returned shape {value.shape}; it must return a number", item="event")
             return float(value.item())

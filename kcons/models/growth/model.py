@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import log_softmax, logsumexp
 
-from kcons.constraints.arguments import FloatArray, check_call, finite_number, numbers, positive, whole_number
+from kcons.constraints.arguments import FloatArray, as_float_array, check_call, finite_number, positive, whole_number
 from kcons.errors import InputError, NonFiniteError
 from kcons.models.integration import called
 
@@ -46,7 +46,7 @@ class Populations(NamedTuple):
     @classmethod
     def from_values(cls, time: float, x: ArrayLike) -> Self:
         """Populations from x."""
-        array = numbers(x, "x0").copy()
+        array = as_float_array(x, "x0").copy()
         if array.ndim not in (1, 2) or array.size == 0:
             raise InputError(f"populations have shape (n,) or (n, k), not {array.shape}", item="x0")
         for bad, said in (
@@ -68,7 +68,11 @@ class Populations(NamedTuple):
         """The start of a run with n species, given as populations or as their logarithms."""
         if (x0 is None) == (log_x0 is None):
             raise InputError("give the start either as x0 or as log_x0", item="x0")
-        p = cls.from_logarithms(time, numbers(log_x0, "log_x0").copy()) if x0 is None else cls.from_values(time, x0)
+        p = (
+            cls.from_logarithms(time, as_float_array(log_x0, "log_x0").copy())
+            if x0 is None
+            else cls.from_values(time, x0)
+        )
         if p.log_x.shape != (n,):
             raise InputError(f"the start has shape {p.log_x.shape}, not ({n},)", item="x0")
         if not np.all(np.isfinite(p.log_x)):
@@ -135,7 +139,7 @@ class GrowthModel:
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:
         """dx/dt without constraints, for any x (negative ones included), shape (n,) or (n, k): the field of a phase
         portrait."""
-        x = numbers(x, "x")
+        x = as_float_array(x, "x")
         if x.ndim == 2:
             return np.stack([self.velocity(t, column) for column in x.T], axis=1)
         return self.drift(Populations(t, x, np.full_like(x, np.nan)))
@@ -155,7 +159,7 @@ class Logistic(GrowthModel):
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
         """x(t) (notes eq. 66), written so that no exponential overflows."""
-        exponent, x0 = -self.alpha * numbers(t, "t"), finite_number(x0, "x0")
+        exponent, x0 = -self.alpha * as_float_array(t, "t"), finite_number(x0, "x0")
         if x0 < 0:
             raise InputError(f"x0 is {x0:g}; populations are not negative", item="x0")
         if x0 > self.plateau and np.any(exponent >= -np.log1p(-self.plateau / x0)):
@@ -168,7 +172,7 @@ class Logistic(GrowthModel):
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (1, 1)."""
-        return np.asarray([[self.alpha - 2.0 * self.beta * numbers(x, "x")[0]]])
+        return np.asarray([[self.alpha - 2.0 * self.beta * as_float_array(x, "x")[0]]])
 
 
 class LotkaVolterra(GrowthModel):
@@ -189,20 +193,20 @@ class LotkaVolterra(GrowthModel):
 
     def invariant(self, x: ArrayLike) -> FloatArray:
         """G, constant along every solution (notes eq. 73); x of shape (2,) or (2, k)."""
-        x = numbers(x, "x")
+        x = as_float_array(x, "x")
         prey, predators = x[0] / self.equilibrium[0], x[1] / self.equilibrium[1]
         return np.asarray(self.alpha1 * (predators - np.log(predators)) + self.beta2 * (prey - np.log(prey)))
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (2, 2) (notes eq. 75)."""
-        x1, x2 = numbers(x, "x")
+        x1, x2 = as_float_array(x, "x")
         return np.array(
             [[self.alpha1 - self.beta1 * x2, -self.beta1 * x1], [self.alpha2 * x2, self.alpha2 * x1 - self.beta2]]
         )
 
     def divergence(self, x: ArrayLike) -> FloatArray:
         """div V = (alpha_1 - beta_1 x_2) - (beta_2 - alpha_2 x_1) (notes eq. 72)."""
-        x = numbers(x, "x")
+        x = as_float_array(x, "x")
         return np.asarray((self.alpha1 - self.beta1 * x[1]) - (self.beta2 - self.alpha2 * x[0]))
 
 
@@ -226,7 +230,7 @@ class Mixture:
     """
 
     def __init__(self, mu0: ArrayLike, kT: float = 1.0) -> None:
-        self.mu0: FloatArray = numbers(mu0, "mu0").copy()
+        self.mu0: FloatArray = as_float_array(mu0, "mu0").copy()
         self.kT = positive(kT, "kT")
         if self.mu0.ndim != 1 or not self.mu0.size or not np.all(np.isfinite(self.mu0)):
             raise InputError("mu0 has shape (n,) and is finite", item="mu0")

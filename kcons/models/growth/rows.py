@@ -23,10 +23,12 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import (
     FloatArray,
+    NotNegative,
+    Positive,
+    as_float_array,
     check_call,
+    checked,
     finite_number,
-    numbers,
-    positive,
     refuse_other,
     whole_number,
 )
@@ -191,7 +193,7 @@ class LinearRow(HolonomicRow):
         *,
         name: str = "linear row",
     ) -> None:
-        c = numbers(coefficients, "coefficients").copy()
+        c = as_float_array(coefficients, "coefficients").copy()
         if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
             raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
         self.coefficients: FloatArray = c
@@ -207,7 +209,7 @@ class LinearRow(HolonomicRow):
     def _moved(self, t: float) -> FloatArray:
         """Target and rate."""
         given = self.moving(t)
-        pair = numbers(given, "target")
+        pair = as_float_array(given, "target")
         if pair.shape != (2,):
             raise InputError(
                 f"the target of {self.name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
@@ -253,7 +255,9 @@ class VelocityRow(Row):
         for what, given in (("coefficients", coefficients), ("rate", rate)):
             if callable(given):
                 check_call(f"{name}: {what}", given, ("t", "x"))
-        self._coefficients = coefficients if callable(coefficients) else numbers(coefficients, "coefficients").copy()
+        self._coefficients = (
+            coefficients if callable(coefficients) else as_float_array(coefficients, "coefficients").copy()
+        )
         self._rate = rate if callable(rate) else finite_number(rate, "rate")
         self.name = name
 
@@ -316,12 +320,9 @@ class Relaxation(EntropyLaw):
         Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
     """
 
-    def __init__(self, tau: float, budget: float | None = None, *, partial: bool = False) -> None:
-        self.tau = positive(tau, "tau")
-        self.budget = None if budget is None else finite_number(budget, "budget")
-        if self.budget is not None and self.budget < 0:
-            raise InputError(f"the budget T(s_eq - s_0) is not negative, so it cannot be {budget}", item="budget")
-        self.partial = partial
+    @checked
+    def __init__(self, tau: Positive, budget: NotNegative | None = None, *, partial: bool = False) -> None:
+        self.tau, self.budget, self.partial = tau, budget, partial
         self.relaxation_rate = None if partial else 1.0 / (2.0 * self.tau)
 
     def _budget(self, excess0: float) -> float:

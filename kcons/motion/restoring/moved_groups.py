@@ -5,11 +5,9 @@ target wrecks the bonds around them. So where rows are far off, or the nearest p
 
 1. every row with a motion of its own makes it: a dihedral turns what lies beyond its bond, an angle turns what lies
    beyond one of its legs, a bond shifts what lies beyond it, a distance between molecules shifts one of them;
-2. rows that are still off are reached by turns about all bonds between their atoms and by motions of whole molecules,
-   with damped Newton steps;
-3. where this does not do, in rings and between fixed atoms, all atoms of the molecules give way together, by least
-   squares of what changes in bonds and angles;
-4. what is left, mostly rounding, is done by the search for the nearest point.
+2. where this does not do, in rings, between fixed atoms and for distances along a chain, all atoms of the molecules
+   give way together, by least squares of what changes in bonds and angles;
+3. what is left, mostly rounding, is done by the search for the nearest point.
 
 Of the two sides of a bond the lighter one moves, or the one without fixed atoms.
 """
@@ -31,7 +29,7 @@ from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
 from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
-from kcons.motion.restoring.rigid_pieces import Move, bend, free_motions, stretch, torsion
+from kcons.motion.restoring.rigid_pieces import Move, bend, stretch, torsion
 from kcons.plan.plan import Plan
 from kcons.solvers import tolerances
 
@@ -40,15 +38,9 @@ from kcons.solvers import tolerances
 NEAR = 0.25
 #: Rounds in which every row makes its own motion, and how many motions there may be in all.
 SWEEPS, MOST_MOVES = 40, 15_000
-#: Rows and motions beyond which no Newton steps among them are tried; steps, and starts from turned bonds.
-MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 30, 2
-#: Steps in which all atoms give way, the weight of rows against that of a change which is just allowed, and atoms up to
-#: which this is tried.
-EASING, HEAVY, MOST_EASED = 60, 1e4, 2000
-#: Sum of squares of the misfits, in units of the rows' scales, that the search for the nearest point may be left with.
-CLOSE = 1e-6
-#: Largest turn of one step, in radian.
-_LONGEST_TURN = 0.5
+#: Steps in which all atoms give way, the weight of rows against that of a change which is just allowed, and rows and
+#: atoms up to which this is tried.
+EASING, HEAVY, MOST_ROWS, MOST_EASED = 60, 1e4, 400, 20_000
 
 
 def restored(
@@ -199,15 +191,13 @@ class _Motions:
         self.time, self.pinned = geometry.time, geometry.pinned
         self._whole = self.pieces.whole(geometry.start, self.held.lattice)
         self._images = self._whole - geometry.start
-        self._left = MOST_MOVES
 
     def moved(self) -> FloatArray | None:
         """See the function of this name."""
         held, y = self.held, self._whole.copy()
         self._follow_fixed(y)
         with np.errstate(all="ignore"):
-            if not self._sweep(y):
-                self._newton(y)
+            self._sweep(y)
             left = np.abs(held.value(y - self._images, self.time)) / held.scale
         if not np.all(left[held.holonomic] <= NEAR):
             return None
@@ -337,11 +327,11 @@ class _Motions:
 
         return self._shifted(atoms[:split], atoms[split:], axis)
 
-    def _sweep(self, y: FloatArray) -> bool:
-        """Let every row that is off make its motion, over and over, in place; whether all rows are fulfilled then."""
+    def _sweep(self, y: FloatArray) -> None:
+        """Let every row that is off make its motion, over and over, in place."""
         held, time = self.held, self.time
         owns = self._owns()
-        last = np.inf
+        last, made = np.inf, 0
         for _ in range(SWEEPS):
             largest = 0.0
             for own in owns:
@@ -351,14 +341,12 @@ class _Motions:
                     continue
                 largest = max(largest, size)
                 amount = -sigma if own.across is None else self._opening(y, own.across, -sigma)
-                self._left -= 1
-                if self._left < 0 or not own.move.make(y, amount):
-                    return False
+                made += 1
+                if made > MOST_MOVES or not own.move.make(y, amount):
+                    return
             if largest < 1e-12 or (largest > 0.9 * last and largest < 1e-9):
                 break
             last = min(last, largest)
-        left = np.abs(held.value(y - self._images, time)) / held.scale
-        return bool(np.all(left[held.holonomic] < 1e-8))
 
     def _opening(self, y: FloatArray, across: tuple[int, int, int], change: float) -> float:
         """By how much the angle i-j-k must grow for the distance i-k to grow by `change`."""
@@ -369,112 +357,6 @@ class _Motions:
         goal = float(np.linalg.norm(y[k] - y[i])) + change
         cosine = (a * a + b * b - goal * goal) / (2 * a * b)
         return float(np.arccos(np.clip(cosine, -1.0, 1.0))) - now
-
-    # -- Newton steps ---------------------------------------------------------------------------
-
-    def _motions(self) -> list[Move]:
-        """Turns about bonds that some row sees, and motions of whole molecules that rows hold."""
-        held, pieces = self.held, self.pieces
-        indptr, indices = held.incidence.indptr, held.incidence.indices
-        width = np.diff(indptr)
-        moves: list[Move] = []
-        mark = np.zeros(held.n_atoms, dtype=bool)
-        for j, k in pieces.bridges():
-            side, rest = pieces.beyond(j, k), pieces.beyond(k, j)
-            assert side is not None and rest is not None
-            options = [(atoms, a, b) for atoms, a, b in ((side, j, k), (rest, k, j)) if not self.pinned[atoms].any()]
-            if not options or min(len(side), len(rest)) < 2:
-                continue
-            atoms, a, b = min(options, key=lambda option: float(held.masses[option[0]].sum()))
-            mark[:] = False
-            mark[atoms] = True
-            mark[b] = False
-            inside = np.add.reduceat(mark[indices].astype(np.int64), indptr[:-1]) if len(indices) else np.zeros(0)
-            if np.any((inside > 0) & (inside < width)):
-                moves.append(torsion(atoms, a, b))
-        for molecule in pieces.molecules:
-            moves += free_motions(molecule, molecule[self.pinned[molecule]])
-        return moves + [own.move for own in self._owns()]
-
-    def _newton(self, y: FloatArray) -> None:
-        """Damped Newton steps in the parameters of all motions, from the present place and from turned ones."""
-        held = self.held
-        if held.n_rows > MOST_ROWS:
-            return
-        moves = self._motions()
-        if not moves or len(moves) > MOST_MOTIONS:
-            return
-        masses = held.masses[self.pieces.atoms]
-        usual = float(np.median(masses[masses > 0])) if np.any(masses > 0) else 1.0
-        heavy = np.clip(held.masses / usual, 1e-3, 1e3)
-        begin, best = y.copy(), (4 * self._error(y), y.copy())
-        rng = np.random.default_rng(0)
-        for kick in range(KICKS + 1):
-            here = begin.copy()
-            if kick:
-                for move in moves:
-                    if move.turns:
-                        move.make(here, float(rng.uniform(-0.3, 0.3)) * kick)
-            error = self._descend(here, moves, heavy)
-            if error < 0.25 * best[0]:  # a little better is no reason to go far
-                best = error, here
-            if best[0] < CLOSE or self._left < 0:
-                break
-        y[:] = best[1]
-
-    def _error(self, y: FloatArray) -> float:
-        value = self.held.value(y - self._images, self.time) / self.held.scale
-        return float(value @ value) if np.isfinite(value).all() else np.inf
-
-    def _descend(self, y: FloatArray, moves: list[Move], heavy: FloatArray) -> float:
-        """Levenberg-Marquardt steps in place; the sum of squares of the misfits where they end."""
-        held, time, atoms = self.held, self.time, self.pieces.atoms
-        place = np.full(held.n_atoms, -1)
-        place[atoms] = np.arange(len(atoms))
-        columns = (3 * atoms[:, None] + np.arange(3)).ravel()
-        rows = np.flatnonzero(held.holonomic)
-        error, damping = self._error(y), 1e-4
-        for _ in range(STEPS):
-            self._left -= len(moves)
-            if error < 1e-24 or not np.isfinite(error) or self._left < 0:
-                break
-            x = y - self._images
-            sigma = (held.value(x, time) / held.scale)[rows]
-            fields = np.zeros((len(atoms), 3, len(moves)))
-            size = np.empty(len(moves))
-            for n, move in enumerate(moves):
-                field = move.field(y)
-                fields[place[move.atoms], :, n] = field
-                size[n] = np.sqrt(np.sum(heavy[move.atoms, None] * field**2))
-            weight = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
-            jacobian = sp.csr_array(held.jacobian(x, time))[rows][:, columns]
-            slope = (jacobian @ fields.reshape(-1, len(moves))) * weight / held.scale[rows, None]
-            gram = slope @ slope.T
-            trace = float(np.trace(gram))
-            if not np.isfinite(trace) or trace == 0:
-                break
-            for _ in range(8):
-                step = np.linalg.solve(gram + (damping * trace / len(rows) + 1e-300) * np.eye(len(rows)), sigma)
-                amounts = -weight * (slope.T @ step)
-                longest = max((abs(a) for a, move in zip(amounts, moves, strict=True) if move.turns), default=0.0)
-                if longest > _LONGEST_TURN:
-                    amounts *= _LONGEST_TURN / longest
-                trial = y.copy()
-                self._left -= len(moves)
-                for amount, move in zip(amounts, moves, strict=True):
-                    if amount:
-                        move.make(trial, float(amount))
-                new = self._error(trial)
-                if new < error:
-                    break
-                damping *= 8
-            else:
-                break
-            slow = new > 0.999 * error
-            y[:], error, damping = trial, new, max(damping / 10, 1e-12)
-            if slow and error > 1e-20:
-                break
-        return error
 
 
 def _turn_of_line(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -87,11 +87,6 @@ class MoleculeGraph:
             atom = int(self._parent[atom])
         return self._hanging(atom)
 
-    def bridges(self) -> list[tuple[int, int]]:
-        """Bonds that are in no ring."""
-        far = self.atoms[self._bridge[self.atoms]]
-        return list(zip(self._parent[far].tolist(), far.tolist(), strict=True))
-
     def bonded(self, j: int, k: int) -> bool:
         """Whether two atoms are."""
         return bool(np.any(self.neighbors(j) == k))
@@ -129,16 +124,6 @@ class Move:
     frame: Frame
     turns: bool
     share: FloatArray | float = 1.0
-
-    def field(self, x: FloatArray) -> FloatArray:
-        """Displacement of `atoms` a unit of the parameter, shape (len(atoms), 3)."""
-        placed = self.frame(x)
-        if placed is None:
-            return np.zeros((len(self.atoms), 3))
-        origin, axis = placed
-        if self.turns:
-            return cross(axis, x[self.atoms] - origin)
-        return self.share * np.broadcast_to(axis, (len(self.atoms), 3))
 
     def make(self, x: FloatArray, amount: float) -> bool:
         """Move the atoms in place; False if there is no axis here."""
@@ -202,23 +187,6 @@ def stretch(atoms: IntArray, others: IntArray, masses: FloatArray, axis: Callabl
         return _line(np.zeros(3), axis(x))
 
     return Move(np.concatenate([atoms, others]), frame, False, share)
-
-
-def free_motions(atoms: IntArray, pinned: IntArray) -> list[Move]:
-    """Shifts and turns of a whole molecule; about its fixed atom if it has one, none if it has more."""
-    if len(pinned) > 1:
-        return []
-    moves = []
-    for axis in np.eye(3):
-
-        def frame(x: FloatArray, axis: FloatArray = axis) -> tuple[FloatArray, FloatArray]:
-            return (x[pinned[0]] if len(pinned) else x[atoms].mean(axis=0)), axis
-
-        if len(atoms) > 1:
-            moves.append(Move(atoms, frame, True))
-        if not len(pinned):
-            moves.append(Move(atoms, frame, False))
-    return moves
 
 
 def _line(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray] | None:

@@ -12,11 +12,11 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraints import Constraint, FixedAtoms
+from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
+from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.callback_rows.callbacks import (
@@ -33,12 +33,12 @@ from kcons.openmm.callback_rows.callbacks import (
     hands_over_all,
 )
 from kcons.openmm.collective.coordinates import free_groups
-from kcons.openmm.integrator.part import NEAR, Part, Violation
+from kcons.openmm.integrator.part import NEAR, Part, Solver, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import groups_in, refuse_agents, require_context, virtual_sites
-from kcons.openmm.quantities import accepted, masses_of, nanometers
-from kcons.openmm.states import forces_at
+from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
+from kcons.openmm.states import forces_at, positions_of
 from kcons.openmm.topology import bonds_of
 
 #: Rounding of positions, relative to the shortest row, that a run begins to show.
@@ -164,9 +164,9 @@ class CarriedConstraints(Part):
         """Whether rows demand velocities that are not zero."""
         return self.motion.plan.driven
 
-    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
-        """The engine, and the positions it takes."""
-        return self.motion, self._state(context)[0]
+    def solver_at(self, context: openmm.Context) -> Solver:
+        """The engine at the time of the context."""
+        return Solver(self.motion, time=self._state(context)[2])
 
     @property
     def atoms(self) -> IntArray:
@@ -230,7 +230,7 @@ class CarriedConstraints(Part):
             if touched & {i, j}:
                 raise UnsupportedError(
                     f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
-                    "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+                    "kcons hold it too: hold(system, ...) moves such constraints, or add move_constraints(system)"
                 )
 
     def attach(self, program: Program, context: openmm.Context) -> None:
@@ -249,8 +249,7 @@ class CarriedConstraints(Part):
         allowed = np.maximum(near * held.scale, found.allowed)
         reach = np.abs(x[held.touched]).max(initial=0.0)
         if self._slopes is None:
-            gradients = held.jacobian(x, time)
-            self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+            self._slopes = found.norms
         if self._engine.rounded(x):
             allowed += 2.0**-22 * reach * self._slopes
         miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
@@ -286,30 +285,9 @@ class CarriedConstraints(Part):
         InfeasibleError, InputError
             As `Motion.restore_positions`; nothing was changed.
         """
-        x, _, time = self._state(context)
-        bonds = bonds_of(context.getSystem(), x)
-        brought = self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None)
-        miss = self._worst(brought, None, time)
-        if miss is not None:
-            raise InfeasibleError(
-                f"the rows cannot be reached from here: {miss}; nothing was changed. Start nearer to the targets",
-                residual=abs(miss.off),
-                row=miss.row,
-                atoms=miss.atoms,
-            )
-        context.setPositions(brought)
-        context.computeVirtualSites()
-
-    def apply_velocities(self, context: openmm.Context) -> None:
-        """Make velocities tangent to the rows: the nearest ones in the mass metric.
-
-        Raises
-        ------
-        ConvergenceError, InputError
-            As `Motion.project_velocities`; nothing was changed.
-        """
-        x, v, time = self._state(context)
-        context.setVelocities(self.motion.project_velocities(x, v, time=time))
+        solver = self.solver_at(context)
+        bonds = bonds_of(context.getSystem(), positions_of(context))
+        self.restore_by(solver, context, bonds if len(bonds) else None)
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         require_context(context)
@@ -443,19 +421,6 @@ class CarriedConstraints(Part):
 
 
 # -- what a System must be like -------------------------------------------------------------------
-
-
-def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
-    """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
-    if not all(isinstance(item, Constraint) for item in given):
-        return given  # ConstraintSet says what is wrong
-    used = [item.atoms.ravel() for item in given]
-    touched = np.unique(np.concatenate(used))
-    still = touched[touched < len(masses)]
-    still = still[masses[still] == 0]
-    fixed = [item.atoms.ravel() for item in given if item.fixes_atoms]
-    still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
-    return (*given, FixedAtoms(still)) if len(still) else given
 
 
 def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatArray) -> None:

@@ -37,7 +37,7 @@ _BONDING = (openmm.HarmonicBondForce, openmm.CustomBondForce, openmm.CustomCentr
 Choice = Literal["all", "hbonds", "touched"] | Iterable[int]
 
 
-def take_constraints(
+def move_constraints(
     system: openmm.System,
     which: Choice = "all",
     *,
@@ -110,7 +110,7 @@ def hold(
     take : 'touched', 'all', 'hbonds' or iterable of int
         Which clusters of the System's constraints move over besides those that a row touches.
     keep_water, angles
-        As for `take_constraints`; water that a row touches moves over.
+        As for `move_constraints`; water that a row touches moves over.
     periodic, degenerate, time
         As for `CarriedConstraints`.
     join : bool

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +13,9 @@ from openmm import unit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints import Distance, Formula
+from kcons.constraints import Constraint, Custom, Distance, Formula, MovingTarget
 from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.internal import MOST_TURNED
 from kcons.constraints.target import FloatArray
@@ -44,33 +44,31 @@ from kcons.openmm.collective.coordinates import (
     unit_of,
 )
 from kcons.openmm.collective.row_program import GroupRows, owner, require_holder, variables_of
-from kcons.openmm.integrator.part import BOND, NEAR, Violation
+from kcons.openmm.integrator.part import BOND, NEAR, Solver, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
+    forces_alone,
     groups_in,
     refuse_agents,
     require_context,
     virtual_sites,
 )
-from kcons.openmm.quantities import masses_of
-from kcons.openmm.states import energy_of, forces_at, motion_of, positions_of, velocities_of, width_of
+from kcons.openmm.quantities import masses_of, with_massless_atoms
+from kcons.openmm.states import box_of, energy_of, forces_at, motion_of, positions_of, velocities_of, width_of
 from kcons.openmm.topology import bonds_of
 from kcons.steppers.splitting import Composition, Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
 
-#: Rows whose part beside the others is smaller than this (of their own norm) are dependent.
-DEPENDENT = 1e-5
-#: Relative tolerance of rows, and of the System's constraints where differences are taken, in double precision.
+#: Relative tolerance of rows in double precision.
 TOLERANCE = 1e-13
 #: Off the rows by more than this (relative to the scale of a row, or to its rate): not on them.
 START_TOLERANCE = 1e-9
 #: Two values of one coordinate, by OpenMM and by kcons, differ by less.
 SAME = 1e-5
-_MAX_NEWTON = 60
 
 
 class CollectiveRows(GroupRows):
@@ -90,7 +88,7 @@ class CollectiveRows(GroupRows):
     system : openmm.System
         The Forces that are not part of it are added, each in a free group. Make the Simulation or Context afterwards.
     rows : Row, openmm.Force or Formula, or a sequence of them
-        What to hold. A Force alone is held at the value found at `positions`; `each_term` makes one Force of each
+        What to hold. A Force alone is held at the value found at `positions`; `forces_by_term` makes one Force of each
         term or variable of a larger one; a `kcons.constraints.Formula` is one of each of its rows.
     positions : array_like or Quantity, shape (n_particles, 3), optional
         In nm if without unit. Needed where a target is to be found.
@@ -270,108 +268,97 @@ class CollectiveRows(GroupRows):
 
     # -- restoring and checking -----------------------------------------------------------------
 
-    def apply_positions(
-        self, context: openmm.Context, tolerance: float | None = None, *, bonds: ArrayLike | None = None
-    ) -> int:
-        """Bring the positions of the context onto the rows and the System's constraints; returns the iterations.
+    def solver_at(self, context: openmm.Context, *, plain: bool = False) -> Solver:
+        """The engine with these rows at their targets, and with the constraints of the System that they meet.
 
-        Newton with step control. Where rows are distances, angles or dihedrals of particles or distances of
-        centers of mass and the targets are far, groups are moved whole first, by the same code as `hold`
-        (`Motion.restore_positions`): bonds and angles stay as they are. Velocities stay as they are.
+        OpenMM computes the rows, in double precision.
 
         Parameters
         ----------
         context : openmm.Context
-        tolerance : float, optional
-            That of the rows at the precision of the context unless given.
-        bonds : array_like of int, shape (n, 2), optional
-            The bonds of the molecules; those of the System's forces and constraints unless given. An empty list:
-            Newton's method alone, whatever becomes of bonds and angles.
+        plain : bool
+            Whether distances, angles and dihedrals are those of kcons: groups are moved whole towards these.
 
         Raises
         ------
-        ConvergenceError
-            No solution; the positions are unchanged.
-        InfeasibleError
-            Rows that are plain coordinates cannot be reached with bonds and angles as they are; likewise.
+        InputError
+            The context was made before the rows were added to its System.
+        SingularGeometryError
+            A row has no gradient.
         """
         require_context(context)
-        scales, velocities = np.array(self.scales), velocities_of(context)
-        start, system = positions_of(context), context.getSystem()
-        if tolerance is None:
-            tolerance = self.finest(context) if self.asked_tolerance is None else self.asked_tolerance
-        system_tolerance = context.getIntegrator().getConstraintTolerance()
+        x, masses = positions_of(context), masses_of(context.getSystem())
+        given = (*self._in_engine(context, x, masses, plain), *self._beside(context))
+        return Solver(Motion(ConstraintSet(with_massless_atoms(given, masses), x, masses), x))
 
-        def size_at(x: FloatArray) -> tuple[float, FloatArray]:
-            context.setPositions(x)
-            if system.getNumConstraints():
-                context.applyConstraints(system_tolerance)
-            off = self.residuals(context)
-            return float(np.linalg.norm(off / scales)), off
+    def _in_engine(self, context: openmm.Context, x: FloatArray, masses: FloatArray, plain: bool) -> list[Constraint]:
+        system = context.getSystem()
+        forces = [forces_in(system, group) for group in self._groups]
+        missing = next((k for k, found in enumerate(forces) if not found), None)
+        if missing is not None:
+            raise InputError(
+                f"row {self._named(missing)} is no part of this System; make the context from the System that the rows "
+                "were added to",
+                item="context",
+            )
+        alone, values = forces_alone(system, forces, box_of(context), context.getParameters()), self.values(context)
+        rows: list[Constraint] = []
+        for k, (target, rate) in enumerate(zip(*self._targets_and_rates(context), strict=True)):
+            atoms = np.array(self.atoms[k])
+            known = as_constraint(forces[k][0], target) if plain and len(forces[k]) == 1 else None
+            known = known and known.with_masses(masses[known.atoms])
+            # The engine may see other images of the particles.
+            if known is None or abs(known.measure(x[known.atoms], 0.0)[0] - values[k]) > SAME * max(1.0, abs(target)):
+                functions = _value_and_gradient(alone, k, atoms, x)
+                known = Custom(atoms, *functions, period=self.periods[k] or None, target=_moving(target, rate))
+            rows.append(known)
+        return rows
 
-        done, reached = 0, False
-        try:
-            size, off = size_at(self._led(context, start, bonds))
-            for done in range(_MAX_NEWTON):
-                if reached := size <= tolerance:
-                    return done
-                here = positions_of(context)
-                _, directions, gram = self.gram(context)
-                push = np.einsum("k,kai->ai", np.linalg.solve(gram, -off), directions)
-                share = 1.0
-                while share > 1e-4:
-                    new, new_off = size_at(here + share * push)
-                    # Close to the solution rounding decides; a step that does not help ends the iteration.
-                    if new < (1.0 - 0.1 * share) * size:
-                        break
-                    share *= 0.5
-                else:
-                    break
-                size, off = new, new_off
-        finally:
-            if not reached:
-                context.setPositions(start)
-            context.setVelocities(velocities)
-        row = int(np.argmax(np.abs(off / scales)))
-        raise ConvergenceError(
-            f"row {row} ({self.names[row]}) stays off by {abs(off[row]):.3g} after {done} iterations (tolerance "
-            f"{tolerance:.3g}); the positions are unchanged. Start closer to the target, or move it there over time",
-            residual=size,
-            tolerance=tolerance,
-            iterations=done,
-            row=row,
-        )
+    def _beside(self, context: openmm.Context) -> list[Constraint]:
+        """The constraints of the System in the clusters that the rows touch."""
+        held = SystemRows.of(context.getSystem())
+        if not (self.meets_system and held.n_rows):
+            return []
+        body = _components(len(held.masses), held.pairs)
+        met = np.isin(body[held.pairs[:, 0]], body[[atom for atoms in self.atoms for atom in atoms]])
+        return [Distance(held.pairs[met], held.lengths[met])] if met.any() else []
 
-    def _led(self, context: openmm.Context, start: FloatArray, bonds: ArrayLike | None) -> FloatArray:
-        """Where Newton's method begins: for far targets of plain rows, groups are moved whole first.
+    def apply_positions(self, context: openmm.Context, bonds: ArrayLike | None = None) -> None:
+        """Bring the positions of the context onto the rows and the System's constraints; velocities stay as they are.
+
+        Where all rows are distances, angles or dihedrals of particles or distances of centers of mass, other bonds
+        and angles stay as they are, as with `hold` (`Motion.restore_positions`).
+
+        Parameters
+        ----------
+        context : openmm.Context
+        bonds : array_like of int, shape (n, 2), optional
+            The bonds of the molecules; those of the System's forces and constraints unless given. An empty list:
+            the nearest point, whatever becomes of bonds and angles.
 
         Raises
         ------
-        InfeasibleError
-            There is no way, or other bonds and angles would change.
+        ConvergenceError, InfeasibleError, SingularGeometryError
+            The rows cannot be reached, or not with bonds and angles as they are; the positions are unchanged.
         """
-        system, found = context.getSystem(), self.worst_violation(context, velocities=False)
-        pairs = bonds_of(system, start) if bonds is None else np.asarray(bonds)
-        if found is None or found.near or not len(pairs):
-            return start
-        off, targets = self.residuals(context), self.targets(context)
-        forces = [forces_in(system, group) for group in self._groups]
-        plain = [as_constraint(f[0], t) if len(f) == 1 else None for f, t in zip(forces, targets.tolist(), strict=True)]
-        rows = [row for row in plain if row is not None]
-        if len(rows) < len(plain):
-            return start
-        held = SystemRows.of(system)
-        if held.n_rows:
-            rows.append(Distance(held.pairs, held.lengths))
+        require_context(context)
+        start, velocities = positions_of(context), velocities_of(context)
         try:
-            motion = Motion(ConstraintSet(rows, start, held.masses), start)
-        except KconsError:
-            # Rows that contradict each other or massless particles: what is wrong Newton's method is to say.
-            return start
-        ours = motion.sources[0].residuals(start, None, 0.0).sigma[: len(off)]
-        if not np.all(np.abs(ours - off) < SAME * np.maximum(1.0, np.abs(targets))):  # other images of particles
-            return start
-        return motion.restore_positions(start, bonds=pairs)
+            if context.getSystem().getNumConstraints():
+                context.applyConstraints(context.getIntegrator().getConstraintTolerance())
+            solver = self.solver_at(context, plain=True)
+            if bonds is None:
+                any_function = any(isinstance(row, Custom) for row in solver.motion.sources[0].constraints)
+                bonds = [] if any_function else bonds_of(context.getSystem(), start)
+            self.restore_by(solver, context, bonds)
+        except KconsError as error:
+            context.setPositions(start)
+            row = getattr(error, "row", -1)
+            if row in range(self.n_rows):
+                error.args = (f"row {self._named(row)}: {error}", *error.args[1:])
+            raise
+        finally:
+            context.setVelocities(velocities)
 
     def apply_velocities(self, context: openmm.Context) -> None:
         """Make the velocities of the context tangent to the rows and to the System's constraints.
@@ -379,17 +366,14 @@ class CollectiveRows(GroupRows):
         Raises
         ------
         SingularGeometryError
-            Rows that vanish or depend on others.
+            A row has no gradient.
         """
+        require_context(context)
         if context.getSystem().getNumConstraints():
             context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
-        _, directions, gram = self.gram(context)
-        change = np.einsum("k,kai->ai", np.linalg.solve(gram, self.rates(context)), directions)
-        context.setVelocities(velocities_of(context) - change)
+        super().apply_velocities(context)
 
-    def restore(
-        self, context: openmm.Context, tolerance: float | None = None, *, bonds: ArrayLike | None = None
-    ) -> None:
+    def restore(self, context: openmm.Context, *, bonds: ArrayLike | None = None) -> None:
         """`apply_positions`, then `apply_velocities`.
 
         Raises
@@ -399,7 +383,7 @@ class CollectiveRows(GroupRows):
         CertificateError
             The rows say that they are not fulfilled afterwards.
         """
-        self.apply_positions(context, tolerance, bonds=bonds)
+        self.apply_positions(context, bonds)
         self.apply_velocities(context)
         found = self.worst_violation(context)
         if found is not None:
@@ -422,15 +406,11 @@ class CollectiveRows(GroupRows):
             Positions or velocities are not on the rows; `restore` brings them there.
         """
         require_context(context)
-        system = context.getSystem()
-        for k, group in enumerate(self._groups):
-            if not forces_in(system, group):
-                raise InputError(
-                    f"row {self._named(k)} is no part of this System; make the context from the System that the rows "
-                    "were added to",
-                    item="context",
-                )
-        gradients, _, _ = self.gram(context)
+        system, independent = context.getSystem(), self._independent(context)
+        for k in range(self.n_rows):
+            if k not in independent:
+                raise SingularGeometryError(self._dependent(k), rows=[k])
+        gradients = self.gradients(context)
         # A row that knows where the origin is gives momentum to the whole.
         sizes, totals = np.linalg.norm(gradients, axis=(1, 2)), np.linalg.norm(gradients.sum(axis=1), axis=1)
         in_space = np.flatnonzero(totals > max(1e-9, 10 * Precision.of(context).forces) * sizes)
@@ -497,43 +477,27 @@ class CollectiveRows(GroupRows):
         across = np.einsum("kai,ai->k", self.gradients(context), velocities_of(context))
         return across - self._targets_and_rates(context)[1]
 
-    def gram(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(A, M_par^+ A^T, A M_par^+ A^T), M_par^+ that of the System's constraints.
-
-        Raises
-        ------
-        SingularGeometryError
-            Rows that vanish, or depend on others or on the System's constraints.
-        """
-        gradients, directions, gram, adding = self._grams(context)
-        for k in range(self.n_rows):
-            if k not in adding:
-                raise SingularGeometryError(self._dependent(k), rows=[k])
-        return gradients, directions, gram
-
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
-        return len(self._grams(context)[3])
+        return len(self._independent(context))
+
+    def _independent(self, context: openmm.Context) -> list[int]:
+        """The rows that add something to the rows before them and to the constraints of the System."""
+        solver, x = self.solver_at(context), positions_of(context)
+        held, n = solver.motion.sources[0].constraints, self.n_rows
+        parts = [(*held[:k], *held[n:]) for k in range(n + 1)]
+        ranks = [Motion(ConstraintSet(part, x, solver.motion.masses), x).rank for part in parts]
+        return [k for k in range(n) if ranks[k + 1] > ranks[k]]
 
     def multipliers_at(self, context: openmm.Context) -> FloatArray:
         """lambda at the positions and velocities of the context, as accurate as these; shape (n_rows,).
 
         (A M_par^+ A^T) lambda = target'' - d(A v)/dt - A M_par^+ f (notes, eq. 104), M_par^+ that of the System's
-        constraints. d(A v)/dt along their free flight by central differences; needs nine evaluations of every row.
+        constraints. d(A v)/dt by differences of the gradient along v.
         """
-        _, directions, gram = self.gram(context)
-        applied = forces_at(context, groups_in(context.getIntegrator()) - self.groups)
-        from_forces = np.einsum("kai,ai->k", directions, applied)
-        x, v = motion_of(context)
-        speed = float(np.linalg.norm(v, axis=1).max(initial=0.0))
-        from_motion = np.zeros(self.n_rows)
-        if speed > 0:
-            # Displacements of 1e-4 nm: the remainder of order four and rounding are both near 1e-11.
-            h = 1e-4 / speed
-            with _kept(context):
-                near, far = self._slope_change(context, x, v, h), self._slope_change(context, x, v, 2 * h)
-            from_motion = (4.0 * near - far) / 3.0
-        return np.linalg.solve(gram, -from_motion - from_forces)
+        solver, (x, v) = self.solver_at(context), motion_of(context)
+        f = forces_at(context, groups_in(context.getIntegrator()) - self.groups)
+        return solver.motion.multipliers(x, v, f)[: self.n_rows]
 
     def finest(self, context: openmm.Context) -> float:
         """The smallest relative residual that is held: what Forces tell, of coordinates as they see them.
@@ -568,43 +532,6 @@ class CollectiveRows(GroupRows):
         clock = 0.0 if holder is None else self._clock(holder)
         moves = [isinstance(target, float) for target in self._targets]
         return targets + np.where(moves, rates * clock, 0.0), rates
-
-    def _grams(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray, list[int]]:
-        """A, M_par^+ A^T, A M_par^+ A^T, and the rows that add something to those before them."""
-        require_context(context)
-        masses, precision = masses_of(context.getSystem()), Precision.of(context)
-        weights = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
-        gradients = self.gradients(context)
-        directions = gradients * weights[:, None]
-        if self.meets_system:
-            with _kept(context, positions=False):
-                directions = np.array([_tangent(context, row) for row in directions])
-        gram = np.einsum("jai,kai->jk", gradients, directions)
-        gram = 0.5 * (gram + gram.T)
-        own = np.einsum("kai,a->k", gradients**2, weights)
-        good = np.isfinite(own) & (own > 0)
-        size = np.sqrt(np.where(good, own, 1.0))
-        scaled = gram / (size[:, None] * size)
-        # Squares of parts beside other rows that are rounding.
-        small = max(DEPENDENT**2, 10 * precision.forces)
-        adding: list[int] = []
-        for k in np.flatnonzero(good).tolist():
-            before = scaled[np.ix_(adding, adding)], scaled[adding, k]
-            left = scaled[k, k] - (before[1] @ np.linalg.lstsq(*before, rcond=None)[0] if adding else 0.0)
-            if left > small:
-                adding.append(k)
-        return gradients, directions, gram, adding
-
-    def _slope_change(self, context: openmm.Context, x: FloatArray, v: FloatArray, h: float) -> FloatArray:
-        """d(A v)/dt in free flight along the System's constraints, by the difference over +-h."""
-        change = np.zeros(self.n_rows)
-        for side in (1.0, -1.0):
-            context.setPositions(x + side * h * v)
-            if self.meets_system:
-                context.applyConstraints(_tight(context))
-            there = _tangent(context, v) if self.meets_system else v
-            change += side * np.einsum("kai,ai->k", self.gradients(context), there) / (2 * h)
-        return change
 
     # -- of an integrator, after its last step --------------------------------------------------
 
@@ -701,32 +628,33 @@ class CollectiveRows(GroupRows):
         return f"CollectiveRows({', '.join(self.names)})"
 
 
-def _tight(context: openmm.Context) -> float:
-    """Tolerance of the System's constraints where differences are taken."""
-    precision = Precision.of(context)
-    return TOLERANCE if precision.name == "double" else max(TOLERANCE, precision.solvers)
+def _moving(target: float, rate: float) -> float | MovingTarget:
+    """A target that moves from here on."""
+    return MovingTarget(lambda t: target + rate * t, lambda t: rate, lambda t: 0.0) if rate else target
 
 
-def _tangent(context: openmm.Context, v: FloatArray) -> FloatArray:
-    """v along the System's constraints at the context's positions; its velocities are overwritten."""
-    context.setVelocities(v)
-    context.applyVelocityConstraints(_tight(context))
-    return velocities_of(context)
+def _value_and_gradient(
+    alone: openmm.Context, group: int, atoms: IntArray, x: FloatArray
+) -> tuple[Callable[[FloatArray], float], Callable[[FloatArray], FloatArray]]:
+    """The coordinate that a force group is, as functions of the positions of its particles."""
+
+    def place(r: FloatArray) -> None:
+        y = x.copy()
+        y[atoms] = r
+        alone.setPositions(y)
+
+    def value(r: FloatArray) -> float:
+        place(r)
+        return energy_of(alone, {group})
+
+    def gradient(r: FloatArray) -> FloatArray:
+        place(r)
+        return -forces_at(alone, {group})[atoms]
+
+    return value, gradient
 
 
-@contextmanager
-def _kept(context: openmm.Context, positions: bool = True) -> Iterator[None]:
-    """Put the state of the context back afterwards."""
-    x, v = motion_of(context)
-    try:
-        yield
-    finally:
-        if positions:
-            context.setPositions(x)
-        context.setVelocities(v)
-
-
-def _components(n: int, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+def _components(n: int, pairs: ArrayLike) -> np.ndarray:
     """Number of the component of each of n things that pairs join."""
     i, j = np.array(pairs, dtype=np.int32).reshape(-1, 2).T
     links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))

@@ -18,7 +18,7 @@ from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.system_checks import ROW_NAME, groups_of
+from kcons.openmm.integrator.system_checks import ROW_NAME, forces_alone, groups_of
 from kcons.openmm.quantities import nanometers
 from kcons.openmm.states import energy_of
 
@@ -185,7 +185,7 @@ def _variables(force: openmm.CustomCVForce) -> list[openmm.Force]:
     return [force.getCollectiveVariable(k) for k in range(force.getNumCollectiveVariables())]
 
 
-def each_term(force: openmm.Force) -> list[openmm.Force]:
+def forces_by_term(force: openmm.Force) -> list[openmm.Force]:
     """One Force for each variable of a CustomCVForce, or for each term of a Force made of terms.
 
     So a CustomBondForce with three bonds becomes three rows.
@@ -413,17 +413,7 @@ def found_values(
         Positions of the wrong shape, or at which a row is not a number.
     """
     x = nanometers(positions, system.getNumParticles())  # type: ignore[arg-type]
-    alone = openmm.System()
-    for k in range(system.getNumParticles()):
-        alone.addParticle(system.getParticleMass(k))
-    a, b, c = system.getDefaultPeriodicBoxVectors() if box is None else box
-    alone.setDefaultPeriodicBoxVectors(a, b, c)
-    for group, forces in enumerate(rows):
-        for force in forces:
-            copy = deepcopy(force)
-            copy.setForceGroup(group)
-            alone.addForce(copy)
-    context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    context = forces_alone(system, rows, box)
     context.setPositions(x)
     values = np.array([energy_of(context, {group}) for group in range(len(rows))])
     for k, value in enumerate(values):

@@ -4,9 +4,8 @@ Positions: from where free motion led, x moves along the gradients at the start 
 quasi-Newton iteration finds; it begins with the inverse of the Gram matrix G = A M_par^+ A^T there, and Broyden's
 update makes it explain what each push did to sigma. Velocities: one push with the same inverse where the drift ends.
 
-In steps at whose end nobody looks, pushes begin with the line through those of the last two steps, G is computed again
-only where the iteration has become slow, and a last push that is good enough for sure is not measured: numbers are what
-the host of a GPU waits for.
+In steps at whose end nobody looks, G is computed again only where the iteration has become slow, and a last push that
+is good enough for sure is not measured: numbers are what the host of a GPU waits for.
 """
 
 from __future__ import annotations
@@ -120,7 +119,6 @@ class GroupRows(Part):
             ("lambda", "multiplier at the start of the last step, to second order", math.nan),
             ("end", "multiplier of the last velocity projection", 0.0),
             ("work", "work done by moving the target", 0.0),
-            *[("last", "L of the last step", 0.0), ("older", "L of the step before it", 0.0)] * self.lean,
         ]
         for k, name in enumerate(self.names):
             p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
@@ -157,7 +155,6 @@ class GroupRows(Part):
             p.number(f"began{c}", "good_steps when it began")
         if self.lean:
             p.number(f"renew{c}", "1 if G is to be computed", 1.0)
-            p.number(f"follows{c}", "whether the last steps tell the next push")
         self._base = "xu" if alone else p.vector(f"base{c}", "positions as other parts leave them")
         self._start = "x_last"
         if self.meets_system:
@@ -196,11 +193,8 @@ class GroupRows(Part):
             self._gradients(p)
         if self._start == f"start{c}":
             p.each(self._start, "x", "to start again from")
-        if self.lean:
-            p.let(f"follows{c}", f"led*follows{c}", "do the last steps tell the first push?")
         for k in range(self.n_rows):
-            line = f"select(follows{c}, 2*{self._of('last', k)}-{self._of('older', k)}, 0)" if self.lean else "0"
-            p.let(self._of("push", k), line, "on the line through the last ones" if self.lean else "first without")
+            p.let(self._of("push", k), "0", "first without")
 
     def _gradients(self, p: Program, sizes: bool = True) -> None:
         """Rows, their Gram matrix and its inverse at x; v stays."""
@@ -278,8 +272,6 @@ class GroupRows(Part):
             p.let(f"flown{c}", f"flown{c}+{h}", "targets at the end of the drift")
         if self._base != "xu":
             p.each(self._base, "x", "positions as other parts leave them")
-        if self.lean:  # joined with the passes before it
-            p.each("x", f"x+{self._pushes}", "where pushes of the last steps lead")
         p.let(f"iterations{c}", f"select(failed, iterations{c}, 0)", "a new solve")
         p.let(f"state{c}", "select(failed, 2, 1)", "after a failure only fly")
         # The first pass is written apart: a block within the loop makes the set-up of OpenMM take 15 times as long.
@@ -334,15 +326,13 @@ class GroupRows(Part):
         if not first:
             self._update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
         p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")
-        going, again = f"(1-held{c})", "1"
+        again = "1"
         if self.lean:
             sure = f"between*step(tolerance{c}-{_LEFT!r}*residual{c})"
             again = f"select({sure}, 3, 1)"
-            if first:  # of what is extrapolated, sigma within the tolerance is taken away, too
-                going = f"max({going}, follows{c}*{sure})"
         p.let(
             f"state{c}",
-            f"select(delta(state{c}-1)*{going}, select(step(1e10-residual{c})"
+            f"select(delta(state{c}-1)*(1-held{c}), select(step(1e10-residual{c})"
             f"*step({self.max_iterations - 1}-iterations{c}), {again}, 2), 0)",
             "done, or once more, or give up",
         )
@@ -390,11 +380,6 @@ class GroupRows(Part):
             p.let(multiplier, f"select({begins}, {at}, {multiplier})", "multiplier where the step began")
         if self.lean:
             p.let(f"renew{c}", f"max(step(iterations{c}-2.5), 1-led)", "has it become slow?")
-            for k in range(self.n_rows):
-                older, last, push = (self._of(name, k) for name in ("older", "last", "push"))
-                p.let(older, f"select(follows{c}, {last}, {push})", "of the step before")
-                p.let(last, push, "of this step")
-            p.let(f"follows{c}", "1-step(failed-0.5)", "this step tells the next push")
         p.let(f"known{c}", "0", "further drifts begin elsewhere")
 
     # -- velocities -----------------------------------------------------------------------------

@@ -6,8 +6,9 @@ whose code or tables are written once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,12 +27,12 @@ ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
 STORED, RELATIVE, NEAREST, IN_CELLS = range(4)
 
 
-def refusal(parts: Sequence[Any]) -> str:
+def refusal(parts: Any) -> str:
     """Why parts of an integrator cannot be held on the device; '' if they can.
 
     Parameters
     ----------
-    parts : sequence of Part or Constraint
+    parts : Part, Constraint or sequence of such
         Of the integrator.
     """
     try:
@@ -42,7 +43,7 @@ def refusal(parts: Sequence[Any]) -> str:
     return ""
 
 
-def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
+def constraints_of(parts: Any) -> list[Constraint]:
     """The constraint objects of parts as they were given, targets that were found included.
 
     Raises
@@ -51,7 +52,7 @@ def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
         Rows of another kind.
     """
     found: list[Constraint] = []
-    for part in parts:
+    for part in parts if isinstance(parts, Iterable) else (parts,):
         if isinstance(part, Constraint):
             found.append(part)
         elif hasattr(part, "given"):  # all of an integrator, as it has them
@@ -66,7 +67,7 @@ def constraints_of(parts: Sequence[Any]) -> list[Constraint]:
     return found
 
 
-def molecules_of(pairs: IntArray, parts: Sequence[Any]) -> list[IntArray]:
+def molecules_of(pairs: IntArray, parts: Any) -> list[IntArray]:
     """Atoms that OpenMM has to keep together, row by row: `pairs` of the System, shape (n, 2), and rows of parts."""
     return [
         row for table in [pairs, *(item.atoms for item in constraints_of(parts) if item.width > 1)] for row in table
@@ -79,32 +80,39 @@ def molecules_of(pairs: IntArray, parts: Sequence[Any]) -> list[IntArray]:
 class Function(NamedTuple):
     """What rows are computed by. Rows of objects with the same function share its code.
 
-    `known` are parameters that are the same in all rows, `second` gives the rate of formulas in which the time is.
+    `known` are the first parameters where they are the same in all rows; a formula is a function of `numbers` (how
+    many of positions, and of parameters), and `second` gives its rate, if the time is in it.
     """
 
     row: Callable[..., Any]
-    width: int
-    known: tuple[float, ...]
-    second: Callable[..., Any] | None
-    parameters: int
+    known: tuple[float, ...] = ()
+    second: Callable[..., Any] | None = None
+    numbers: tuple[int, int] = (0, 0)
     is_distance: bool = False
 
     def text(self, name: str, space: str = "") -> str:
         """Its C function; with the time in it, also ``NAME_rate``."""
-        known, names = dict(enumerate(self.known)), {"SIZE": 3 * self.width}
-        rate = ""
+        places, parameters = self.numbers
+
+        def formula(r: Any, p: Any, t: Any, out: Any) -> None:
+            given = [*(r[k] for k in range(places)), t, *(p[k] for k in range(parameters))]
+            out.update(enumerate(self.row(*given)))
+
+        text = c_function(name, formula if places else self.row, space, self.known)
         if self.second is not None:
-            rate = c_rate(f"{name}_rate", self.second, self.width, self.parameters, space)
-        return c_function(name, self.row, space, known=known, names=names) + rate
+            text += c_rate(f"{name}_rate", self.second, places // 3, parameters, space)
+        return text
 
 
-def _linear(r: Any, p: Any, t: Any, out: Any) -> None:
+@cache
+def _linear(size: int) -> Callable[..., None]:
     """The row of `LinearRows`, whose coefficients are their parameters."""
-    value = 0.0
-    for k in range(SIZE):  # type: ignore[name-defined] # noqa: F821
-        value += p[k] * r[k]
-        out[1 + k] = p[k]
-    out[0] = value
+
+    def row(r: Any, p: Any, t: Any, out: Any) -> None:
+        out[0] = sum((p[k] * r[k] for k in range(size)), 0.0)
+        out.update({1 + k: p[k] for k in range(size)})
+
+    return row
 
 
 def function_of(item: Constraint) -> Function:
@@ -120,15 +128,15 @@ def function_of(item: Constraint) -> Function:
             f"{item!r} is a function of Python, which no device can call; write it as a Formula, or leave it to the "
             "host (device=False)"
         )
-    if item.row is None:
-        return Function(_linear, item.width, (), None, 3 * item.width)
-    code: Any = item.code() if isinstance(item, Formula) and item.holonomic else None
-    second = code.plain_second if code is not None and code.moving else None
-    known = (float(item.width),) if item.uses_masses else ()
-    if item.alike and not known:
-        known = tuple(item.parameters()[0, : item.alike].tolist())
-    size = len(item.names) if isinstance(item, Formula) else 0
-    found = Function(getattr(item.row, "py_func", item.row), item.width, known, second, size, item.holds_length)
+    if isinstance(item, Formula):
+        code = item.code()
+        numbers = (3 if item.holonomic else 6) * item.width, len(item.names)
+        found = Function(code.first, (), code.second if item.holonomic and code.moving else None, numbers)
+    elif item.row is None:
+        found = Function(_linear(3 * item.width))
+    else:
+        known = [float(item.width)] if item.uses_masses else item.parameters()[0, : item.alike].tolist()
+        found = Function(item.row, tuple(known), is_distance=item.holds_length)
     found.text("looked_at")
     return found
 

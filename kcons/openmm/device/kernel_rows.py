@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import weakref
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,7 @@ class KernelRows(CarriedConstraints):
         self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
         self._bound: tuple[DeviceRows, _Engine] | None = None
         self._of: tuple[Any, ...] = ()
+        self._context: Callable[[], openmm.Context | None] = lambda: None
         self.code = 0
         #: Time at which sums of multipliers began, ps.
         self._since = 0.0
@@ -101,6 +103,9 @@ class KernelRows(CarriedConstraints):
 
     def bind(self, context: openmm.Context) -> DeviceRows:
         """The rows for a Context, at its positions."""
+        if self._bound is not None and self._context() is context:
+            return self._bound[0]
+        self._context = weakref.ref(context)
         system = context.getSystem()
         known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
         pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
@@ -141,7 +146,11 @@ class KernelRows(CarriedConstraints):
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         self.bind(context)
+
+    def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+        self.bind(context)
         self._engine.passage.precision = Precision.of(context)
+        return super()._state(context)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""

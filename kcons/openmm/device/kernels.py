@@ -571,9 +571,11 @@ class Kernels:
             f"  gaussians(g, ORDER(AT), step+({op.begun}), {op.use}, seed[0]);\n"
             "  for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+s*g[c];\n }}\n"
         )
+        # What the drift before has left across the rows is an impulse of theirs; what noise adds is none.
+        along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, {}, time, x, v, w);\n"
+        self._add("", along.format(1) * self.tidy)
         self._add(noise)
-        if self.tidy:
-            self._add("", " SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, v, w);\n")
+        self._add("", along.format(0) * self.tidy)
 
     def _stir(self, op: Op) -> None:
         """Friction and noise on spheres, the noise along the rows; auxiliary variables have noise of their own."""

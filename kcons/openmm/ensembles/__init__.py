@@ -1,10 +1,8 @@
 """Ensembles for the integrators.
 
 - `conserved_momenta`: momenta that a thermostat leaves alone
-- `langevin_ensemble`: Langevin dynamics
+- `langevin_ensemble`: Langevin dynamics, also with several time steps
 - `isokinetic_ensemble`: constant kinetic energy
 - `nose_hoover_ensemble`: Nosé-Hoover chains
-- `molecular_pressure`: the pressure of molecules as points
-- `respa_ensemble`: several time steps
 - `monte_carlo_sampler`: Monte Carlo without any error of the time step
 """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,9 +10,10 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import OverdeterminedError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Ensemble, Integrator
 from kcons.openmm.integrator.system_checks import (
+    forces_alone,
     forces_of,
     groups_in,
     groups_of,
@@ -65,13 +65,6 @@ class CountsMomenta(Ensemble):
 
     momentum: Momentum
     temperature: float | None
-
-    @staticmethod
-    def checked(momentum: Momentum) -> Momentum:
-        """Raise `InputError` for a word that is none of `Momentum`."""
-        if momentum not in ("auto", "conserved", "free"):
-            raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
-        return momentum
 
     def masses(self, integrator: Integrator) -> FloatArray:
         """Masses of the particles that it acts on; 0 for others."""
@@ -170,21 +163,18 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
             broken.append(np.eye(3))
         turns.keep(turns.fields(x[fixed]))
     for part in integrator.parts:
-        engine = part.engine_at(context)
-        if engine is not None:
-            motion, places = engine
-            open_ones = open_directions(motion, places)
+        solver = part.solver_at(context)
+        if solver is not None:
+            motion, atoms, time = solver
+            open_ones = open_directions(motion, x[atoms], time)
             broken.append(np.eye(3) - open_ones.T @ open_ones)
-            turns.keep_rows(motion, places)
+            turns.keep_rows(motion, x[atoms], time)
     acting = groups_in(integrator)
     for force in forces_of(system):
-        if force.getForceGroup() in integrator.row_groups:
-            if not _carries(force):
-                broken.append(_totals(context, force, x, fixed, turns))
-        elif momentum == "auto" and groups_of(force) & acting and knows_a_place(force):
+        if momentum == "auto" and groups_of(force) & acting and knows_a_place(force):
             if not removed:
                 broken.append(_totals(context, force, x, fixed, turns))
-            elif turns.found and not _carries(force):  # what Python computes is taken for forces between particles
+            elif turns.found and not isinstance(force, openmm.PythonForce):  # taken for forces between particles
                 _totals(context, force, x, fixed, turns)
     if removed:  # the center of mass rests
         turns.keep(np.tensordot(masses, turns.fields(x).reshape(-1, 3, 6), 1) / masses.sum())
@@ -197,24 +187,11 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     return Momenta(directions, turns.found)
 
 
-def _carries(force: openmm.Force) -> bool:
-    """Whether a force is a messenger to the engine of kcons, no row itself."""
-    return isinstance(force, openmm.PythonForce)
-
-
 def _totals(
     given: openmm.Context, force: openmm.Force, x: FloatArray, fixed: list[int], turns: RigidMotions
 ) -> FloatArray:
     """Sum of one force over the particles, at a few places and as shares of its size; `turns` sees them, too."""
-    system, alone = given.getSystem(), openmm.System()
-    for k in range(system.getNumParticles()):
-        alone.addParticle(1.0 if system.isVirtualSite(k) else system.getParticleMass(k))
-    alone.setDefaultPeriodicBoxVectors(*box_of(given))
-    alone.addForce(copy.deepcopy(force))
-    clock = openmm.VerletIntegrator(1e-3)
-    context = openmm.Context(alone, clock, openmm.Platform.getPlatformByName("Reference"))
-    for name in context.getParameters():
-        context.setParameter(name, given.getParameter(name))
+    context = forces_alone(given.getSystem(), [[force]], box_of(given), given.getParameters())
     rng = np.random.default_rng(0)
     size = extent(x) or 1.0
     found: list[FloatArray] = []

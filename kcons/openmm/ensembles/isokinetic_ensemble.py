@@ -11,7 +11,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import checked, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
@@ -84,6 +84,7 @@ class Isokinetic(CountsMomenta):
     atoms: Atoms
     momentum: Momentum
 
+    @checked
     def __init__(
         self,
         temperature: unit.Quantity | float | None = None,
@@ -93,8 +94,6 @@ class Isokinetic(CountsMomenta):
         atoms: ArrayLike | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        if convention not in ("exact", "notes"):
-            raise InputError(f"convention is {convention!r}; choose 'exact' or 'notes'", item="convention")
         if temperature is not None and kinetic_energy is not None:
             raise InputError("give temperature or kinetic_energy, not both", item="temperature")
         plain = 0.0 if kinetic_energy is None else number(kinetic_energy, unit.kilojoule_per_mole, "kinetic_energy")
@@ -103,7 +102,7 @@ class Isokinetic(CountsMomenta):
             kinetic_energy=None if kinetic_energy is None else positive(plain, "kinetic_energy"),
             convention=convention,
             atoms=None if atoms is None else tuple(np.asarray(atoms).tolist()),
-            momentum=self.checked(momentum),
+            momentum=momentum,
         )
 
     def __repr__(self) -> str:

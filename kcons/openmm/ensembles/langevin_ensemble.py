@@ -1,13 +1,28 @@
-"""Geodesic Langevin dynamics in OpenMM: friction and noise in the tangent plane, in the middle of the drift."""
+"""Geodesic Langevin dynamics in OpenMM: friction and noise in the tangent plane, in the middle of the drift.
+
+`LangevinRespa` makes several time steps: force groups at steps of their own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import Any, Self
+
+import openmm
 from openmm import unit
 
-from kcons.errors import InputError
-from kcons.openmm.integrator.ensemble import BetweenHalves, Step
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import groups_in, groups_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
+from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
+from kcons.steppers.splitting import Splitting
+from kcons.thermostats.multistep.nesting import SlowKicks, levels_of, middle_of, nested
+
+#: Operations of an inner step: a kick, half a drift, the bath, half a drift, forces, a kick.
+_INNER = 6
 
 
 class Langevin(BetweenHalves):
@@ -82,3 +97,166 @@ def friction_and_noise(program: Program, u: str, h: str) -> None:
     # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
     program.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{h}))", "noise")
     program.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
+
+
+# -- several time steps -----------------------------------------------------------------------------
+
+
+def _loops(operations: Sequence[Operation], fastest: str) -> Iterator[tuple[Sequence[Operation], int]]:
+    """Blocks of operations, and how often each comes in a row: inner steps, and single operations between them."""
+    blocks: list[tuple[Operation, ...]] = []
+    at = 0
+    while at < len(operations):
+        first = operations[at]
+        size = _INNER if isinstance(first, Kick) and first.group == fastest else 1
+        blocks.append(tuple(operations[at : at + size]))
+        at += size
+    for _, alike in groupby(blocks, key=lambda block: [str(operation) for operation in block]):
+        row = list(alike)
+        if len(row[0]) == _INNER:
+            yield row[0], len(row)
+        else:
+            for block in row:
+                yield block, 1
+
+
+class LangevinRespa(Langevin):
+    """Langevin dynamics with several time steps, for `ProjectedIntegrator(timestep, ensemble=...)`.
+
+    The System's constraints are held in each inner step. As `kcons.thermostats.LangevinRespa`, with force groups of
+    OpenMM in place of functions; friction and noise act in the middle of each inner step.
+
+    Parameters
+    ----------
+    temperature : Quantity or float
+        In K if a float.
+    friction : Quantity or float
+        In 1/ps if a float; 0 for none.
+    steps : mapping of int to int
+        Steps of each force group in a step of the integrator, ``{0: 1, 1: 4}``; each divides the next. All forces of
+        the System belong to one of these groups.
+    slow_kicks : {'ends', 'middle'}
+        See `kcons.thermostats.LangevinRespa`.
+
+    Raises
+    ------
+    InputError
+        Groups that are no numbers from 0 to 31; numbers of steps that do not divide each other.
+
+    Notes
+    -----
+    Scheme 'rattle', without parts. Fast forces are evaluated once more after each kick of slower ones, since OpenMM
+    keeps those of one group only.
+    """
+
+    adds_up = False
+    groups: tuple[int, ...]
+    counts: tuple[int, ...]
+    slow_kicks: SlowKicks
+
+    def __init__(
+        self,
+        temperature: unit.Quantity | float,
+        friction: unit.Quantity | float,
+        steps: Mapping[int, int],
+        slow_kicks: SlowKicks = "ends",
+    ) -> None:
+        super().__init__(temperature, friction)
+        if not isinstance(steps, Mapping):
+            raise InputError("steps must name each force group, as {0: 1, 1: 4}", item="steps")
+        for group in steps:
+            if isinstance(group, bool) or not isinstance(group, int) or not 0 <= group < 32:
+                raise InputError(f"force group {group!r} is no number from 0 to 31", item="steps")
+        levels = levels_of({str(group): count for group, count in steps.items()})
+        if len(levels) < 2:
+            raise InputError(f"steps are of {len(levels)} force group; give two or more, or use Langevin", item="steps")
+        middle_of(levels, slow_kicks)
+        counts = tuple(level.steps for level in levels)
+        self._keep(groups=tuple(int(level.group) for level in levels), counts=counts, slow_kicks=slow_kicks)
+
+    def __repr__(self) -> str:
+        steps = dict(zip(self.groups, self.counts, strict=True))
+        middle = ", slow kicks in the middle" if self.slow_kicks == "middle" else ""
+        return f"{type(self).__name__}({self.temperature:g} K, {self.friction:g}/ps, steps {steps}{middle})"
+
+    @property
+    def levels(self) -> tuple:  # type: ignore[type-arg]
+        """Groups from the slowest to the fastest, see `kcons.thermostats.multistep.nesting`."""
+        return levels_of({str(group): count for group, count in zip(self.groups, self.counts, strict=True)})
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        return nested(self.levels, 2, (1.0,), middle=self.slow_kicks == "middle")
+
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
+        idle = set(self.groups) - groups_in(integrator)
+        if idle:
+            raise InputError(
+                f"force group {min(idle)} is left out by setIntegrationForceGroups, and steps give it "
+                f"{dict(zip(self.groups, self.counts, strict=True))[min(idle)]}: all groups in steps act; take those "
+                "forces out of the System",
+                item="steps",
+            )
+        system = context.getSystem()
+        for force in system.getForces():
+            left = groups_of(force) - set(self.groups)
+            if left:
+                raise InputError(
+                    f"{type(force).__name__} is in force group {min(left)}, which has no number of steps; "
+                    f"there are {', '.join(map(str, self.groups))}",
+                    item="steps",
+                )
+        if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
+            raise UnsupportedError(f"{self!r} has no virtual sites: they are placed at the end of a step; use Langevin")
+
+    # -- program --------------------------------------------------------------------------------
+
+    def write(self, step: Step) -> bool:
+        """The operations of a step, inner steps alike as loops."""
+        if step.parts:
+            raise UnsupportedError(
+                f"{self!r} holds the constraints of the System only, and no parts: use one time step, or "
+                "kcons.thermostats.LangevinRespa with forces from OpenMM"
+            )
+        p = step.program
+        step.filtered = False
+        p.number("inner_left", "inner steps that are left")
+        p.let_others_act()
+        done = step.operations
+        last = max(k for k, operation in enumerate(done) if isinstance(operation, Fly)) - (_INNER - 3)
+        for block, times in _loops(done[:last], self.levels[-1].group):
+            if times == 1:
+                _write_all(step, block)
+                continue
+            p.let("inner_left", str(times), "inner steps alike follow")
+            with p.loop("inner_left > 0", "inner steps"):
+                _write_all(step, block)
+                p.let("inner_left", "inner_left-1", "one is made")
+        ends = last + _INNER - 2
+        _write_all(step, done[last:ends])
+        step.note_middle("v")
+        _write_all(step, done[ends:])
+        step.note_end()
+        return True
+
+    def replaced(self, **changes: Any) -> Self:
+        steps = dict(zip(self.groups, self.counts, strict=True))
+        kept = {"temperature": self.temperature, "friction": self.friction, "slow_kicks": self.slow_kicks}
+        return type(self)(**{**kept, "steps": steps, **changes})
+
+
+def _write_all(step: Step, operations: Sequence[Operation]) -> None:
+    p = step.program
+    for operation in operations:
+        if isinstance(operation, Kick):
+            force, h = f"f{operation.group}", f"{operation.fraction!r}*dt"
+            p.each("v", f"v+{h}*{force}/m", f"forces of group {operation.group} act (kick)")
+        elif isinstance(operation, Fly):
+            for length in operation.flights:
+                impulse = step.drift(f"({length!r}*dt)")
+                p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        elif isinstance(operation, Exchange):
+            # The drift that follows absorbs what noise has across constraints.
+            friction_and_noise(p, "v", f"{operation.fraction!r}*dt")
+        elif isinstance(operation, Project):
+            step.project()

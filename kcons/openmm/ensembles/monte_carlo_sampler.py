@@ -10,7 +10,7 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from kcons.constraints.arguments import positive, seed_number, whole_number
+from kcons.constraints.arguments import Positive, Rng, Share, checked, positive, seed_from, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -29,7 +29,7 @@ from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats import Counts, best_share
+from kcons.thermostats import Counts, best_acceptance
 from kcons.thermostats.freedom import drift_velocity
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     ACCEPTED,
@@ -44,11 +44,10 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     SQUARES,
     SUM,
     UNSOLVED,
-    kept_part,
     step_range,
     stream,
 )
-from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals
+from kcons.thermostats.monte_carlo.tuning import DualAveraging, Proposals
 
 #: What acts on a state between steps and knows no way back.
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
@@ -122,8 +121,9 @@ class HamiltonianMonteCarlo:
         In K if a float.
     steps : int or (int, int)
         Time steps of a proposal; with two numbers drawn between them, both included.
-    seed : int
-        Random numbers are a function of it and of the number of the proposal.
+    rng : int, numpy.random.Generator or None
+        A seed, or what one is drawn from, which `seed` then tells: random numbers are a function of it and of the
+        number of the proposal.
     keep : float
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     conserve_momentum : bool
@@ -146,26 +146,26 @@ class HamiltonianMonteCarlo:
     Energies decide, so they have to be good to a part of kT: in single precision those of large systems are not.
     """
 
+    @checked
     def __init__(
         self,
         simulation: app.Simulation | openmm.Context,
         temperature: unit.Quantity | float,
         steps: int | tuple[int, int],
-        seed: int,
+        rng: Rng,
         *,
-        keep: float = 0.0,
+        keep: Share = 0.0,
         conserve_momentum: bool = False,
-        tolerance: float = 1e-4,
+        tolerance: Positive = 1e-4,
         restart: str | PathLike[str] | None = None,
     ) -> None:
         self.simulation = simulation if isinstance(simulation, app.Simulation) else None
         self.context: openmm.Context = getattr(simulation, "context", simulation)
         self.setTemperature(temperature)
         self.steps = step_range(steps)
-        self.seed = seed_number(seed)
-        self.keep = kept_part(keep)
+        self.seed = seed_from(rng)
         self.conserve_momentum = bool(conserve_momentum)
-        self.tolerance = positive(tolerance, "tolerance")
+        self.keep, self.tolerance = keep, tolerance
         self.integrator = _integrator_of(self.context)
         self._masses = masses_of(self.context.getSystem())[:, None]
         with np.errstate(divide="ignore"):
@@ -253,7 +253,8 @@ class HamiltonianMonteCarlo:
                 )
                 reporter.report(self.simulation, found)
 
-    def tune(self, wanted: float | None = None, proposals: int = 80) -> float:
+    @checked
+    def tune(self, wanted: float | None = None, proposals: Proposals = 80) -> float:
         """Find the time step for a wanted share of accepted proposals, and use it from now on; returns it in ps.
 
         The proposals that it takes are no sample, and are not counted; see `kcons.thermostats.tune`.
@@ -269,9 +270,8 @@ class HamiltonianMonteCarlo:
         assert integrator.scheme is not None
         search = DualAveraging(
             integrator.getStepSize().value_in_unit(unit.picosecond),
-            best_share(integrator.scheme.order) if wanted is None else wanted,
+            best_acceptance(integrator.scheme.order) if wanted is None else wanted,
         )
-        check_proposals(proposals)
         begun = integrator.getStepSize()
         try:
             for number in range(proposals):

@@ -8,7 +8,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.arguments import Count, checked, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
@@ -19,7 +19,7 @@ from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.nose_hoover import HALF, chain_fractions
+from kcons.thermostats.nose_hoover import HALF, ChainOrder, chain_fractions
 
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
@@ -73,28 +73,28 @@ class NoseHoover(CountsMomenta):
     temperature: float
     frequency: float
     length: int
-    chain_order: int
+    chain_order: ChainOrder
     repeats: int
     momentum: Momentum
 
+    @checked
     def __init__(
         self,
         temperature: unit.Quantity | float,
         frequency: unit.Quantity | float,
         *,
-        length: int = 3,
-        chain_order: int = 4,
-        repeats: int = 1,
+        length: Count = 3,
+        chain_order: ChainOrder = 4,
+        repeats: Count = 1,
         momentum: Momentum = "auto",
     ) -> None:
-        chain_fractions(chain_order, repeats)
         self._keep(
             temperature=positive(kelvins(temperature), "temperature"),
             frequency=positive(_per_picosecond(frequency), "frequency"),
-            length=whole_number(length, "length"),
-            chain_order=int(chain_order),
-            repeats=int(repeats),
-            momentum=self.checked(momentum),
+            length=length,
+            chain_order=chain_order,
+            repeats=repeats,
+            momentum=momentum,
         )
 
     def __repr__(self) -> str:

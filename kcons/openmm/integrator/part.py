@@ -5,17 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import openmm
 from numpy.typing import ArrayLike
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import KconsError
+from kcons.errors import InfeasibleError, KconsError
 from kcons.motion.motion import Motion
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.states import motion_of, positions_of
 
 #: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
 NEAR = 0.1
@@ -72,6 +74,23 @@ class Violation:
     def __str__(self) -> str:
         rate = "" if self.what == "positions" else " per ps"
         return f"{self.what} are off row {self.name} by {abs(self.off):.3g}{rate}"
+
+
+class Solver(NamedTuple):
+    """The engine of kcons for the rows of a part.
+
+    Attributes
+    ----------
+    motion : Motion
+    atoms : ndarray of int or slice
+        The particles that it knows, in its order.
+    time : float
+        That of the targets now, ps.
+    """
+
+    motion: Motion
+    atoms: IntArray | slice = slice(None)
+    time: float = 0.0
 
 
 class Part(ABC):
@@ -203,13 +222,53 @@ class Part(ABC):
     def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
         """What the rows themselves say of the state of the context, whatever solvers believe; None if all hold."""
 
-    @abstractmethod
-    def apply_positions(self, context: openmm.Context) -> Any:
-        """Bring the positions of the context onto the rows; velocities stay as they are."""
+    def solver_at(self, context: openmm.Context) -> Solver | None:
+        """The engine for the rows, where there is one."""
+        return None
 
-    @abstractmethod
-    def apply_velocities(self, context: openmm.Context) -> Any:
-        """Make the velocities of the context tangent to the rows."""
+    def apply_positions(self, context: openmm.Context) -> None:
+        """Bring the positions of the context onto the rows; velocities stay as they are.
+
+        Raises
+        ------
+        KconsError
+            The rows cannot be reached; nothing was changed.
+        """
+        self.restore_by(self.solver_at(context), context)
+
+    def restore_by(self, solver: Solver | None, context: openmm.Context, bonds: ArrayLike | None = None) -> None:
+        """The same by `Motion.restore_positions` with these bonds; the rows themselves say whether they are reached."""
+        assert solver is not None
+        motion, atoms, time = solver
+        start = positions_of(context)
+        x = start.copy()
+        x[atoms] = motion.restore_positions(start[atoms], time=time, bonds=bonds)
+        context.setPositions(x)
+        miss = self.worst_violation(context, velocities=False)
+        if miss is not None:
+            context.setPositions(start)
+            raise InfeasibleError(
+                f"the rows cannot be reached from here: {miss}; nothing was changed. Start nearer to the targets",
+                residual=abs(miss.off),
+                row=miss.row,
+                atoms=miss.atoms,
+            )
+        context.computeVirtualSites()
+
+    def apply_velocities(self, context: openmm.Context) -> None:
+        """Make the velocities of the context tangent to the rows: the nearest ones in the mass metric.
+
+        Raises
+        ------
+        KconsError
+            There are none; nothing was changed.
+        """
+        solver = self.solver_at(context)
+        assert solver is not None
+        motion, atoms, time = solver
+        x, v = motion_of(context)
+        v[atoms] = motion.project_velocities(x[atoms], v[atoms], time=time)
+        context.setVelocities(v)
 
     @abstractmethod
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
@@ -218,7 +277,3 @@ class Part(ABC):
     @abstractmethod
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
-
-    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray] | None:
-        """The engine for the rows and the positions it takes, for what rows do to total momentum; None without one."""
-        return None

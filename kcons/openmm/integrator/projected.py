@@ -14,7 +14,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
 from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
@@ -474,7 +474,7 @@ class ProjectedIntegrator(Integrator):
         return relative_tolerance(self.getConstraintTolerance() if given is None else given)
 
     def setVelocitiesToTemperature(
-        self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None
+        self, context: openmm.Context, temperature: unit.Quantity | float, rng: Rng = None
     ) -> None:
         """Draw velocities for a temperature (K if a float) and make them tangent to all constraints.
 
@@ -483,12 +483,11 @@ class ProjectedIntegrator(Integrator):
         Raises
         ------
         InputError
-            A temperature below zero, a seed that is none.
+            A temperature below zero; a number for `rng` outside 0 to 2^31 - 1.
         """
         temperature = kelvins(temperature)
         self._watch(context)  # refuses before velocities are changed
-        arguments = (temperature,) if seed is None else (temperature, whole_number(seed, "seed", -(2**31), 2**31 - 1))
-        context.setVelocitiesToTemperature(*arguments)
+        context.setVelocitiesToTemperature(temperature, seed_from(rng, bits=31))
         self.applyVelocityConstraints(context)
 
     def minimizeEnergy(

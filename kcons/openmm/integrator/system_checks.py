@@ -6,8 +6,9 @@ velocities, independently of it.
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Integrator
-from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 
@@ -80,11 +80,6 @@ class SystemRows:
         Which constraint of the System each row is. OpenMM ignores those between massless particles.
     settled : ndarray of bool, shape (n_rows,)
         Rows that SETTLE holds.
-    others : ndarray, shape (n_rows,)
-        What a GPU's SHAKE holds instead where it is responsible, which stores squares of lengths in single precision.
-    slack : ndarray, shape (n_rows,)
-        By how much a relative distance may differ from `lengths` although it is held exactly: what a GPU's SETTLE
-        makes of its distances in single precision.
     """
 
     masses: FloatArray
@@ -92,12 +87,10 @@ class SystemRows:
     lengths: FloatArray
     numbers: IntArray
     settled: NDArray[np.bool_]
-    others: FloatArray
-    slack: FloatArray
 
     @classmethod
-    def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
-        """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`.
+    def of(cls, system: openmm.System) -> SystemRows:
+        """Those of a System.
 
         Raises
         ------
@@ -124,9 +117,7 @@ class SystemRows:
         given = np.array(lengths, dtype=float)
         settled = _settled(table, given, len(masses))
         held = np.where(settled, given.astype(np.float32).astype(float), given)
-        shaken = np.sqrt((given**2).astype(np.float32).astype(float)) if rounded else held
-        slack = np.where(settled & rounded, 2.0**-23, 0.0)
-        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled, shaken, slack)
+        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled)
 
     @property
     def n_rows(self) -> int:
@@ -144,11 +135,9 @@ class SystemRows:
         return bool((2 * rows == particles * (particles - 1)).all())
 
     def stretches(self, x: FloatArray) -> FloatArray:
-        """(d - d0)/d0 of each row at positions x, shape (n_rows,), d0 being the nearer of what may be held."""
+        """(d - d0)/d0 of each row at positions x, shape (n_rows,)."""
         r = x[self.pairs[:, 0]] - x[self.pairs[:, 1]]
-        d = np.sqrt(np.einsum("ij,ij->i", r, r))
-        first, second = d / self.lengths - 1, d / self.others - 1
-        return np.where(np.abs(second) < np.abs(first), second, first)
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", r, r)) / self.lengths - 1)
 
     def speeds(self, x: FloatArray, v: FloatArray) -> FloatArray:
         """A v of each row, the rate of its distance, shape (n_rows,)."""
@@ -203,7 +192,7 @@ def worst_length(context: openmm.Context) -> tuple[str, float]:
         No Context.
     """
     require_context(context)
-    rows = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
+    rows = SystemRows.of(context.getSystem())
     if not rows.n_rows:
         return "no constraint of the System", 0.0
     off = np.abs(rows.stretches(np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)))
@@ -252,6 +241,48 @@ def groups_in(integrator: openmm.Integrator) -> set[int]:
     """The force groups that act on what an integrator moves."""
     groups = integrator.getIntegrationForceGroups()
     return {group for group in range(32) if groups >> group & 1}
+
+
+def forces_alone(
+    system: openmm.System,
+    rows: Sequence[Sequence[openmm.Force]],
+    box: Sequence | None = None,
+    parameters: Mapping[str, float] | None = None,
+) -> openmm.Context:
+    """A Context of copies of some Forces alone, each row of them in the group of its number, in double precision.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Of its particles.
+    rows : sequence of sequences of Force
+    box : sequence of three vectors, optional
+        In place of the System's default.
+    parameters : mapping of str to float, optional
+        Those of a Context.
+
+    Raises
+    ------
+    UnsupportedError
+        A PythonForce whose function cannot be copied.
+    """
+    alone = openmm.System()
+    for k in range(system.getNumParticles()):
+        alone.addParticle(system.getParticleMass(k))
+    alone.setDefaultPeriodicBoxVectors(*(system.getDefaultPeriodicBoxVectors() if box is None else box))
+    for group, forces in enumerate(rows):
+        for force in forces:
+            try:
+                taken = copy.deepcopy(force)
+            except openmm.OpenMMException as error:
+                raise UnsupportedError(f"{force.getName()}: {error} Define the function in a module") from error
+            taken.setForceGroup(group)
+            alone.addForce(taken)
+    context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    for name in context.getParameters():
+        if parameters is not None:
+            context.setParameter(name, parameters[name])
+    return context
 
 
 def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
@@ -335,7 +366,7 @@ def _refuse_lopsided(rows: SystemRows) -> None:
             raise UnsupportedError(
                 f"particles {i}, {j} and {k} are a rigid triangle, of which {first} and {second} have the masses "
                 f"{rows.masses[first]:g} and {rows.masses[second]:g}: OpenMM's SETTLE needs equal ones, and moves "
-                "others wildly. Hold it with kcons: take_constraints(system, keep_water=False), then hold"
+                "others wildly. Hold it with kcons: move_constraints(system, keep_water=False), then hold"
             )
 
 

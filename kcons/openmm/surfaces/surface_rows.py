@@ -15,7 +15,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.integrator.part import BOND, NEAR, Part, Violation
+from kcons.openmm.integrator.part import BOND, NEAR, Part, Solver, Violation
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import refuse_agents, require_context
 from kcons.openmm.quantities import masses_of
@@ -164,39 +164,10 @@ class SurfaceRows(Part):
     def _atoms_of(self, row: int) -> list[int]:
         return [int(self.atoms[row])]
 
-    def apply_positions(self, context: openmm.Context) -> None:
-        """Move each atom to the nearest point of its surface.
-
-        Raises
-        ------
-        ConvergenceError
-            An atom finds no surface; nothing was moved.
-        """
+    def solver_at(self, context: openmm.Context) -> Solver:
+        """The engine for these atoms."""
         require_context(context)
-        x = positions_of(context)
-        x[self.atoms] = engine(context, [self], x).restore_positions(x[self.atoms])
-        miss = self._worst(x, None)
-        if miss is not None:
-            raise ConvergenceError(
-                f"particle {miss.atoms[0]} finds no place on its surface, {miss.name}; nothing was moved",
-                residual=abs(miss.off),
-                row=miss.row,
-                atoms=miss.atoms,
-            )
-        context.setPositions(x)
-
-    def apply_velocities(self, context: openmm.Context) -> None:
-        """Take away what velocities have across the surfaces."""
-        require_context(context)
-        x, v = motion_of(context)
-        v[self.atoms] = engine(context, [self], x).project_velocities(x[self.atoms], v[self.atoms])
-        context.setVelocities(v)
-
-    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
-        """The engine for these atoms, and their positions."""
-        require_context(context)
-        x = positions_of(context)
-        return engine(context, [self], x), x[self.atoms]
+        return Solver(engine(context, [self], positions_of(context)), self.atoms)
 
     def rank(self, context: openmm.Context) -> int:
         """One for each atom: rows on different atoms are independent."""

@@ -25,6 +25,7 @@ import scipy.sparse as sp
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.vectors import row_norms
 from kcons.errors import SingularGeometryError
 from kcons.plan.independent_blocks import fixed_atoms, row_blocks
 from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody, find_flat_bodies, refusal, with_flat_bodies
@@ -292,9 +293,10 @@ def _check_large(constraint_set: ConstraintSet, rows: IntArray, positions: Float
 
 def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float) -> int:
     """Rows less rank: eigenvalues of A A^T below LOST^2, counted by Sylvester's law of inertia."""
-    a = part.jacobian(x, time).multiply(np.repeat(free, 3)[None, :].astype(float)).tocsr()
-    norms = np.sqrt(np.asarray(a.multiply(a).sum(axis=1)).ravel())
-    a = sp.diags_array(1.0 / np.where(norms > 0, norms, 1.0)) @ a
+    a = part.jacobian(x, time)
+    a.data *= np.repeat(free, 3)[a.indices]
+    norms = row_norms(a)
+    a.data *= np.repeat(1.0 / np.where(norms > 0, norms, 1.0), np.diff(a.indptr))
     shifted = (a @ a.T - LOST**2 * sp.eye_array(part.n_rows)).tocsc()
     from scipy.sparse.linalg import splu  # slow to import, seldom needed
 

@@ -11,7 +11,7 @@ from kcons.solvers.chains.sweeps import BONDS, LENGTHS, SLOT, project
 from kcons.solvers.cluster_solver import Outcome, Request, resume
 from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver, resolved
 from kcons.solvers.kernels.aligned_memory import aligned, copied, in_one_array, part_of, room
-from kcons.solvers.kernels.array_views import halves, integers, none_of, piece
+from kcons.solvers.kernels.array_views import halves, integers, none_of, table_array
 from kcons.solvers.kernels.eight_wide import WIDTH
 from kcons.solvers.tolerances import MAX_ROUNDS
 
@@ -19,7 +19,7 @@ from kcons.solvers.tolerances import MAX_ROUNDS
 @njit(cache=True, nogil=True)
 def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """This and the next two as `kcons.solvers.addressable_solvers` says."""
-    lengths = wanted if wanted.size else piece(tables, integers(tables), LENGTHS)
+    lengths = wanted if wanted.size else table_array(tables, integers(tables), LENGTHS)
     return project(None, x, x_ref, v, inv_dt, lengths, lattice, kind, none_of(tables), tables)
 
 
@@ -32,7 +32,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):
 @njit(cache=True, nogil=True)
 def _resolved(x, lattice, kind, tables):
     h = integers(tables)
-    return resolved(x, piece(halves(tables), h, BONDS), piece(tables, h, LENGTHS), lattice, kind)
+    return resolved(x, table_array(halves(tables), h, BONDS), table_array(tables, h, LENGTHS), lattice, kind)
 
 
 class Chains(SimdClusterSolver):

@@ -12,7 +12,7 @@ for the next Newton step in the opposite direction: a Newton step reads the chai
 import numpy as np
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, piece
+from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -454,9 +454,10 @@ def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
 def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
     """Project one strip after another; `SimdClusterSolver` says what the arguments are."""
     t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
-    starts, atoms, owned, full = piece(h, h, 0), piece(u, h, 1), piece(b, h, 2), piece(b, h, 3)
-    rows, present, weights, wholes = piece(u, h, 4), piece(t, h, 5), piece(t, h, 6), piece(h, h, 7)
-    work, undo = piece(t, h, 10), piece(t, h, 11)
+    starts, atoms, owned, full = table_array(h, h, 0), table_array(u, h, 1), table_array(b, h, 2), table_array(b, h, 3)
+    rows, present = table_array(u, h, 4), table_array(t, h, 5)
+    weights, wholes = table_array(t, h, 6), table_array(h, h, 7)
+    work, undo = table_array(t, h, 10), table_array(t, h, 11)
     small = np.empty(8 * WIDTH)
     cell = lattice_numbers(lattice)
     worst, worst_row, most = 0.0, -1, 0

@@ -27,7 +27,7 @@ def in_one_array(pieces: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
     """Flat arrays of float64, int64, uint32 or uint8 as one, which is passed to a kernel in a part of the time.
 
     It begins with where each piece starts and ends, counted in the piece's own numbers; kernels take them out by
-    `array_views.piece`. Each has cache lines of its own.
+    `array_views.table_array`. Each has cache lines of its own.
     """
     cuts = np.zeros((len(pieces), 2), dtype=np.int64)
     end = 2 * len(pieces)

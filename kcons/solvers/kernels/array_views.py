@@ -31,7 +31,7 @@ def view(context: Any, builder: Any, kind: Any, data: Any, *shape: Any) -> Any:
 
 
 @intrinsic
-def _piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
+def _table_array(typingctx, room, header, k):  # type: ignore[no-untyped-def]
     kind = types.Array(room.dtype, 1, "C")
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -47,7 +47,7 @@ def _piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
 
 
 #: ``room[header[2 k] : header[2 k + 1]]`` of flat contiguous arrays, `header` of int64.
-piece: Any = _piece
+table_array: Any = _table_array
 
 
 @intrinsic

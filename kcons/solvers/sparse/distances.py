@@ -16,7 +16,7 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
-from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, piece
+from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, table_array
 from kcons.solvers.kernels.lattices import OPEN, nearest_image
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
@@ -35,7 +35,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_line,
     store_quad,
 )
-from kcons.solvers.sparse.elimination import FAST, make_pattern
+from kcons.solvers.sparse.elimination import FAST, make_pattern, number_atoms
 from kcons.solvers.sparse.step_control import factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 from kcons.solvers.tolerances import (
@@ -87,9 +87,10 @@ class SparseDistances(AddressableSolver):
         pattern = make_pattern(row_start, local[keep].astype(np.int64), len(atoms), eliminate_last)
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
-        numbered, atom_start, ends = plain_if_small(_number_atoms, len(pairs))(
-            pairs, pattern.clusters, len(inverse_masses)
+        numbered, atom_start, numbers = number_atoms(
+            pairs.ravel(), np.arange(0, 2 * len(rows) + 1, 2), pattern.clusters, len(inverse_masses)
         )
+        ends = numbers.reshape(-1, 2)
         w = inverse_masses[numbered]
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:-1, 2:] = pattern.start, pattern.target_start, ends
@@ -138,30 +139,6 @@ def sparse_distances(
     """The sparse solver, which has step control, for distance rows."""
     pairs = np.array([constraint_set.row_atoms(int(row)) for row in rows], dtype=np.int64)
     return SparseDistances(rows, pairs, constraint_set.target(time)[rows], inverse_masses)
-
-
-@njit(cache=True)
-def _number_atoms(pairs, clusters, n_atoms):  # type: ignore[no-untyped-def]
-    """Atoms of each cluster in the order in which its rows meet them, and the rows' ends in that count."""
-    n = len(pairs)
-    place = np.full(n_atoms, -1, np.int64)
-    atoms = np.empty(2 * n, np.uint32)
-    ends = np.empty((n, 2), np.uint32)
-    atom_start = np.zeros(len(clusters), np.int64)
-    used = 0
-    for c in range(len(clusters) - 1):
-        base = used
-        for k in range(clusters[c], clusters[c + 1]):
-            for side in range(2):
-                a = pairs[k, side]
-                # An atom of infinite mass may stand in several clusters; each has its own copy.
-                if place[a] < base:
-                    place[a] = used
-                    atoms[used] = a
-                    used += 1
-                ends[k, side] = place[a]
-        atom_start[c + 1] = used
-    return atoms[:used].copy(), atom_start, ends
 
 
 @njit(cache=True)
@@ -440,4 +417,4 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 def _resolved(x, lattice, kind, tables):  # type: ignore[no-untyped-def]
     """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
-    return resolved(x, piece(halves(tables), h, _PAIRS), piece(tables, h, _LENGTHS), lattice, kind)
+    return resolved(x, table_array(halves(tables), h, _PAIRS), table_array(tables, h, _LENGTHS), lattice, kind)

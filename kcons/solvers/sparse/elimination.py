@@ -374,6 +374,38 @@ def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
     return result, clusters[: n_clusters + 1].copy()
 
 
+def number_atoms(
+    flat: IntArray, slots: IntArray, clusters: IntArray, n_atoms: int
+) -> tuple[UIntArray, IntArray, UIntArray]:
+    """Atoms cluster by cluster in the order in which rows meet them, where clusters begin, and the slots' atoms so.
+
+    Row k has the atoms ``flat[slots[k]:slots[k + 1]]``; an atom of infinite mass that stands in several clusters has a
+    copy for each.
+    """
+    found = plain_if_small(_number_atoms, len(flat))(flat, slots, clusters, n_atoms)
+    return found  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-def]
+    place = np.full(n_atoms, -1, np.int64)
+    atoms = np.empty(len(flat), np.uint32)
+    numbers = np.empty(len(flat), np.uint32)
+    atom_start = np.zeros(len(clusters), np.int64)
+    used = 0
+    for c in range(len(clusters) - 1):
+        base = used
+        for p in range(slots[clusters[c]], slots[clusters[c + 1]]):
+            a = flat[p]
+            if place[a] < base:
+                place[a] = used
+                atoms[used] = a
+                used += 1
+            numbers[p] = place[a]
+        atom_start[c + 1] = used
+    return atoms[:used].copy(), atom_start, numbers
+
+
 def make_triples(
     start: IntArray, columns: UIntArray, slots: IntArray, slot_atoms: UIntArray, w: NDArray[np.float64]
 ) -> tuple[UIntArray, UIntArray, NDArray[np.float64]]:

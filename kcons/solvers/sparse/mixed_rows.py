@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from kcons.constraints.compilation import njit, plain_if_small
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -39,7 +39,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
-from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples
+from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples, number_atoms
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, first_flat, miss
 from kcons.solvers.sparse.step_control import factor_serves, go_back, hopeless, keep, overshot, refines, stalled
@@ -103,9 +103,7 @@ class SparseRows(AddressableSolver):
         widths = np.diff(start)[order]
         slots = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         flat = np.concatenate([atoms[start[k] : start[k + 1]] for k in order]) if len(order) else atoms
-        atom_numbers, atom_start, slot_atoms = plain_if_small(_number_atoms, len(flat))(
-            flat, slots, pattern.clusters, len(inverse_masses)
-        )
+        atom_numbers, atom_start, slot_atoms = number_atoms(flat, slots, pattern.clusters, len(inverse_masses))
         w = inverse_masses[atom_numbers]
         triple, sides, masses = make_triples(pattern.start, pattern.columns, slots, slot_atoms, w)
         # Row by row: its first entry, its first target, its first slot, its first parameter.
@@ -154,27 +152,6 @@ class SparseRows(AddressableSolver):
 def _addresses(kinds: NDArray[np.uint32]) -> IntArray:
     kernels = (_factor, _FACTOR), (_forward, _FORWARD), (_backward, _BACKWARD)
     return np.array([*addresses_for(kinds), *(address_of(*each) for each in kernels)], dtype=np.int64)
-
-
-@njit(cache=True)
-def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-def]
-    """Atoms cluster by cluster in the order in which rows meet them, and the slots' atoms in that count."""
-    place = np.full(n_atoms, -1, np.int64)
-    atoms = np.empty(len(flat), np.uint32)
-    numbers = np.empty(len(flat), np.uint32)
-    atom_start = np.zeros(len(clusters), np.int64)
-    used = 0
-    for c in range(len(clusters) - 1):
-        base = used
-        for p in range(slots[clusters[c]], slots[clusters[c + 1]]):
-            a = flat[p]
-            if place[a] < base:
-                place[a] = used
-                atoms[used] = a
-                used += 1
-            numbers[p] = place[a]
-        atom_start[c + 1] = used
-    return atoms[:used].copy(), atom_start, numbers
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")

@@ -24,7 +24,7 @@ from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
 from kcons.solvers.addressable_solvers import MORE, caller_of, packed_positions, packed_tangents
-from kcons.solvers.kernels.array_views import bits, flat, integers, piece, view
+from kcons.solvers.kernels.array_views import bits, flat, integers, table_array, view
 from kcons.solvers.tolerances import MANY_ITERATIONS
 
 #: What a row tells the kernel to do: nothing, since it is for Python; take the kick, which all do; fly; fly along great
@@ -93,7 +93,7 @@ def perform(at, more, dt, x, out, v, forces, room, tables):  # type: ignore[no-u
         forces that are not finite; -1 less this where only its solve is left: kick and flight are done.
     """
     header, n = integers(tables), v.size
-    weights, held = piece(tables, header, MORE), piece(header, header, MORE + 1)
+    weights, held = table_array(tables, header, MORE), table_array(header, header, MORE + 1)
     forces, room = flat(forces), flat(room)
     x, out, v = _points(flat(x), 0, n), _points(flat(out), 0, n), _points(flat(v), 0, n)
     first = ROOM + WIDTH * int(room[COUNT])
@@ -107,7 +107,7 @@ def perform(at, more, dt, x, out, v, forces, room, tables):  # type: ignore[no-u
         verb = int(program[row])
         here = _place(program[row + HERE], x, out, spare)
         if verb == END:
-            far = held.size and beyond(here, held, held[0], piece(tables, header, MORE + 2)[0])
+            far = held.size and beyond(here, held, held[0], table_array(tables, header, MORE + 2)[0])
             room[FAR] = 1.0 if far else 0.0
             if far or not more or program[row + HERE] != 0.0:
                 return k
@@ -120,7 +120,7 @@ def perform(at, more, dt, x, out, v, forces, room, tables):  # type: ignore[no-u
         if verb in (FLY, CIRCLE):
             there = _place(program[row + THERE], x, out, spare)
             if verb == CIRCLE:
-                given = (here, low, v, push, kick, f, weights, h, there, piece(tables, header, MORE + 3))
+                given = (here, low, v, push, kick, f, weights, h, there, table_array(tables, header, MORE + 3))
                 sound = _fly_circles(int(program[row + ADDRESS]), given) != 0
             elif pairs:
                 sound = fly(here, low, v, push, kick, f, weights, h, there)

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import FloatArray, numbers
+from kcons.constraints.arguments import FloatArray, as_float_array
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
 
@@ -57,7 +57,7 @@ class Friction:
 
     def __init__(self, rates: ArrayLike, motion: Motion, inverse_masses: FloatArray) -> None:
         n_atoms = motion.n_atoms
-        given = numbers(rates, "friction")
+        given = as_float_array(rates, "friction")
         if given.shape not in ((), (n_atoms,)):
             raise InputError(
                 f"friction has shape {given.shape}; give one rate, or one for each of {n_atoms} atoms", item="friction"

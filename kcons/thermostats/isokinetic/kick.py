@@ -17,7 +17,7 @@ import numpy as np
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import MORE, packed_tangents
-from kcons.solvers.kernels.array_views import flat, integers, piece
+from kcons.solvers.kernels.array_views import flat, integers, table_array
 from kcons.steppers.stages.compiled_operations import all_finite
 
 #: Sums may be taken in any order, so that they are compiled to vector instructions; NaN stays NaN.
@@ -33,19 +33,9 @@ TWICE, INTEGRAL, SQUARE, COUNT, SIZE = range(5)
 
 @njit(cache=True, nogil=True)
 def weights_of(aligned, square, twice, t):  # type: ignore[no-untyped-def]
-    """What of the velocities becomes of the kick over a time t, which may be negative: u' = keep u + push F.
+    """Keep, push and log of the growth of the kick over a time t, which may be negative: u' = keep u + push F.
 
-    Parameters
-    ----------
-    aligned, square, twice : float
-        u.f, f.F and 2K.
-
-    Returns
-    -------
-    keep, push, log_growth : float
-        The last is how much u was scaled.
-    cancels : bool
-        Whether digits were lost, or c^2 is too large a number, so that u' must be found by `turned`.
+    Of u.f, f.F and 2K. Last, whether digits were lost, or c^2 is too large a number, so that `turned` must find u'.
     """
     a = aligned / twice
     c2 = square / twice if square > 0 else 0.0
@@ -71,12 +61,7 @@ def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t:
 
         u(t) = (q e^{-z} + e |u| [(1 + p) - (1 - p) e^{-2z}]/2)/g,    g = [(1 + p) + (1 - p) e^{-2z}]/2.
 
-    Parameters
-    ----------
-    u, pace, masses : ndarray, shape (n_atoms, 3)
-        Velocities, F and masses; masses are 0 for atoms that do not take part.
-    twice, t : float
-        As for `weights_of`.
+    Masses, shape (n_atoms, 3), are 0 for atoms that do not take part.
     """
     inside = np.where(masses > 0, pace, 0.0)
     largest = float(np.abs(inside).max())
@@ -190,7 +175,7 @@ def after_drift(u, pace, masses, twice, t):  # type: ignore[no-untyped-def]
 def first_turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
     """`before_drift`, from velocities on the constraints."""
     n = v.size
-    weights, masses = piece(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    weights, masses = table_array(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
     if not all_finite(forces):
         return 1
     growth, done = before_drift(v, forces, weights, masses, numbers[SQUARE], numbers[TWICE], time)
@@ -204,7 +189,7 @@ def first_turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-
 def turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
     """`after_drift`, from velocities on the constraints and forces, which are projected first."""
     n = v.size
-    weights, masses = piece(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    weights, masses = table_array(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
     if not all_finite(forces):
         return 1
     pace = numbers[SIZE + n : SIZE + 2 * n]

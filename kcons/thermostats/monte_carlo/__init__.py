@@ -1,6 +1,5 @@
 """Monte Carlo on constraints: averages without any error of the time step.
 
-- `reversed_steps`: steps that can be taken back
 - `hamiltonian_monte_carlo`: proposals by dynamics, accepted or rejected
 - `tuning`: the time step for a wanted share of accepted proposals
 - `replica_exchange`: configurations exchanged between temperatures

@@ -8,10 +8,11 @@ from operator import is_
 from weakref import ref
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import finite_number, positive, seed_number
+from kcons.constraints.arguments import Positive, Rng, Share, checked, seed_from
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import (
     ConvergenceError,
     InputError,
@@ -20,10 +21,9 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
-from kcons.steppers import Rattle, State, Stepper, System
+from kcons.steppers import Rattle, ReversibilityCheck, State, Stepper, System
 from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
-from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
 POTENTIAL, ACCEPTED, ENERGY, IRREVERSIBLE, UNSOLVED, NOT_FINITE, CHANGE, SUM, SQUARES, LAST = range(10)
@@ -79,13 +79,7 @@ class Counts:
 
     @classmethod
     def of(cls, state: State) -> Counts:
-        """Those of a state; all 0 before the first proposal.
-
-        Raises
-        ------
-        InputError
-            The state carries variables of another thermostat.
-        """
+        """Those of a state; all 0 before the first proposal."""
         carried(state, SIZE, "HamiltonianMonteCarlo")
         held = np.zeros(SIZE) if state.thermostat is None else state.thermostat
         accepted, energy, irreversible, unsolved, not_finite = (
@@ -95,6 +89,53 @@ class Counts:
         change = float(held[CHANGE]) if held[LAST] else math.nan
         square = float(held[SQUARES]) / told if told else math.nan
         return cls(accepted, energy, irreversible, unsolved, not_finite, change, square)
+
+
+class ReversedSteps(ReversibilityCheck):
+    """A check of reversibility that costs projections and no force.
+
+    A step and the step back ask for forces at the same places. Those of the step are remembered for the way back; only
+    where the way back leads elsewhere are forces asked for again. So the whole map is checked, whatever it consists of,
+    and one step at a time, so that chaos does not hide what is wrong and a bad proposal ends early.
+    """
+
+    def __init__(self, system: System, stepper: Stepper, tolerance: float) -> None:
+        super().__init__(stepper, tolerance)
+        self.force_evaluations = stepper.force_evaluations
+        self.system = system
+        force = None if system.force is None else self._force
+        #: The same system, which remembers.
+        self.watched = System(system.motion, force, potential=system.potential, far=system.far)
+        self._known: list[tuple[FloatArray, FloatArray]] = []
+        self._near = 0.0
+        self._back = False
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`, and see that the step back ends at `state`; errors as of `ReversibilityCheck`."""
+        state = replace(state, origin=None)  # forces of the system are those of the watched one
+        self._known = [] if state.forces is None else [(state.positions, state.forces)]
+        self._back = False
+        after = self.stepper.step(self.watched, state, dt)
+        x = state.positions
+        self._near = self.tolerance * extent(x) + 8 * float(np.spacing(np.abs(x).max(initial=0.0)))
+        self._back = True
+        try:
+            self.take_back(self.watched, state, after, dt, lambda: [forces for _, forces in self._known])
+        finally:
+            self._back = False
+        return after
+
+    def _force(self, x: FloatArray, time: float) -> ArrayLike:
+        if self._back:
+            for place, forces in reversed(self._known):
+                if float(np.abs(x - place).max(initial=0.0)) <= self._near:
+                    return forces
+        force = self.system.force
+        assert force is not None
+        forces = self.system.accepted(force(x, time), 0, True)
+        if not self._back:
+            self._known.append((x.copy(), forces))
+        return forces
 
 
 class HamiltonianMonteCarlo(DropsSystemCaches):
@@ -119,7 +160,8 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     steps : int or (int, int)
         Time steps of a proposal; with two numbers drawn between them, both included, which keeps trajectories from
         coming back to where they began.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`.
     stepper : Stepper, optional
         A reversible and symplectic one: `Rattle` by default, `Geodesic`, a `Composition`, `BlanesMoan4`, ...
     keep : float
@@ -134,7 +176,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     Raises
     ------
     InputError
-        Temperature not positive, fewer than one step, `keep` not in [0, 1), a seed that is none.
+        Temperature not positive, fewer than one step, `keep` not in [0, 1).
     UnsupportedError
         A stepper that is not reversible and symplectic, such as a thermostat.
 
@@ -152,21 +194,20 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     reversible = False
     symplectic = False
 
+    @checked
     def __init__(
         self,
-        thermal_energy: float,
+        thermal_energy: Positive,
         steps: int | tuple[int, int],
-        seed: int,
+        rng: Rng,
         *,
         stepper: Stepper | None = None,
-        keep: float = 0.0,
+        keep: Share = 0.0,
         conserve_momentum: bool = False,
-        tolerance: float = 1e-9,
+        tolerance: Positive = 1e-9,
     ) -> None:
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        self.steps = step_range(steps)
-        self.seed = seed_number(seed)
-        self.keep = kept_part(keep)
+        self.thermal_energy, self.keep, self.tolerance = thermal_energy, keep, tolerance
+        self.steps, self.seed = step_range(steps), seed_from(rng)
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
         if not (getattr(self.stepper, "reversible", False) and getattr(self.stepper, "symplectic", False)):
@@ -175,13 +216,12 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
                 "Rattle, Geodesic, a Composition or a RungeKuttaNystrom stepper"
             )
         self.conserve_momentum = bool(conserve_momentum)
-        self.tolerance = positive(tolerance, "tolerance")
         self._known: tuple[System, ReversedSteps, FloatArray] | None = None
 
     def __repr__(self) -> str:
         few, most = self.steps
         steps = few if few == most else self.steps
-        return f"HamiltonianMonteCarlo({self.thermal_energy!r}, {steps!r}, seed={self.seed}, stepper={self.stepper!r})"
+        return f"HamiltonianMonteCarlo({self.thermal_energy!r}, {steps!r}, rng={self.seed}, stepper={self.stepper!r})"
 
     @property
     def order(self) -> int:
@@ -193,15 +233,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         return round(self.stepper.force_evaluations * sum(self.steps) / 2)
 
     def check(self, system: System) -> None:
-        """Raise where there is no such density.
-
-        Raises
-        ------
-        InputError
-            Forces without a potential.
-        UnsupportedError
-            Rows that move with time, or hold velocities; forces that depend on velocities; friction.
-        """
+        """Raise where there is no such density: for forces without a potential, rows that move or hold velocities."""
         refuse_dissipation(system, "energy to accept or reject by")
         if system.motion.plan.driven:
             raise UnsupportedError(
@@ -220,13 +252,10 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
 
         Raises
         ------
-        InputError
-            A time step that is not positive; the state carries variables of another thermostat; whatever is wrong with
-            the forces.
         NonFiniteError
             The energy of the state itself is not finite.
         InputError, UnsupportedError
-            As `check`.
+            As `check`; a negative time step; the state carries variables of another thermostat.
         """
         self.check(system)
         still = stays(state, dt)
@@ -252,10 +281,8 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         random = stream(self.seed, state.step + 1, PROPOSAL)
         count, threshold = int(random.integers(self.steps[0], self.steps[1] + 1)), math.log1p(-random.random())
         begin = replace(system.with_forces(state), velocities=self._refreshed(system, state, random))
-        length = count * dt
         end, reason, change, potential = self._judged(system, begin, dt, count, threshold, held[POTENTIAL])
-        held[CHANGE] = change
-        held[LAST] = reason
+        held[CHANGE], held[LAST] = change, reason
         held[reason] += 1
         if reason in (ACCEPTED, ENERGY):
             held[SQUARES] += change * change
@@ -264,24 +291,16 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
             end = replace(begin, velocities=-begin.velocities)
         else:
             held[POTENTIAL] = potential
-        time, left_over = state.later(length)
+        time, left_over = state.later(count * dt)
         number, origin = state.step + 1, (ref(system), end.positions, end.velocities, time)
         self._left = held, end.positions
         return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 
     def trajectory(self, system: System, state: State, dt: float, count: int) -> State:
-        """The end of so many steps from `state`, each of which was taken back.
-
-        Raises
-        ------
-        ReversibilityError
-            One of them could not be.
-        KconsError
-            As the stepper.
-        """
+        """The end of so many steps from `state`, each of which was taken back, or `ReversibilityError`."""
         steps = self._found(system, state)[1]
         for _ in range(count):
-            state = steps.step(self.stepper, state, dt)
+            state = steps.step(system, state, dt)
         return state
 
     # -- inner ----------------------------------------------------------------------------------
@@ -324,18 +343,12 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
             directions = np.zeros((0, 3))
             if self.conserve_momentum:
                 directions = open_directions(system.motion, state.positions, state.time)
-            known = self._known = system, ReversedSteps(system, self.tolerance), directions
+            known = self._known = system, ReversedSteps(system, self.stepper, self.tolerance), directions
         return known
 
 
 def energy_at(system: System, state: State) -> float:
-    """The potential energy; 0 without forces.
-
-    Raises
-    ------
-    InputError
-        It is not one real number.
-    """
+    """The potential energy, 0 without forces; `InputError` if it is not one real number."""
     if system.potential is None:
         return 0.0
     x = state.positions.view()
@@ -350,13 +363,7 @@ def energy_at(system: System, state: State) -> float:
 
 
 def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
-    """Fewest and most steps of a proposal.
-
-    Raises
-    ------
-    InputError
-        Not whole numbers from 1 on, or in the wrong order.
-    """
+    """Fewest and most steps of a proposal."""
     given = np.asarray(steps)
     both = np.broadcast_to(given, 2) if given.shape in ((), (2,)) else np.zeros(2)
     if given.dtype.kind not in "iu" or not 1 <= both[0] <= both[1]:
@@ -364,17 +371,3 @@ def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
             f"steps is {steps!r}; give a whole number, 1 or more, or the fewest and the most", item="steps"
         )
     return int(both[0]), int(both[1])
-
-
-def kept_part(keep: float) -> float:
-    """`keep` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number in [0, 1).
-    """
-    part = finite_number(keep, "keep")
-    if not 0 <= part < 1:
-        raise InputError(f"keep is {keep!r}; give a number from 0 (new velocities) to less than 1", item="keep")
-    return part

@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.errors import InputError
 from kcons.steppers import State
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTENTIAL, SIZE, seed_number, stream
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTENTIAL, SIZE, stream
 
 
 def exchange(
-    states: Sequence[State], thermal_energies: Sequence[float], seed: int, number: int
+    states: Sequence[State], thermal_energies: Sequence[float], rng: Rng, number: int
 ) -> tuple[list[State], list[bool | None]]:
     """Offer neighbors an exchange: with probability min(1, exp((1/kT_i - 1/kT_j) (U_i - U_j))) it is made.
 
@@ -31,9 +31,9 @@ def exchange(
         their potential energies.
     thermal_energies : sequence of float
         k_B T of each.
-    seed : int
+    rng : int, numpy.random.Generator or None
     number : int
-        Of the round: random numbers are a function of it and of the seed.
+        Of the round: random numbers are a function of it and of the integer given as `rng`.
 
     Returns
     -------
@@ -44,8 +44,7 @@ def exchange(
     Raises
     ------
     InputError
-        Fewer than two states, not as many temperatures; temperatures that are not positive; a state without a potential
-        energy; states of Systems of other masses or constraints.
+        A state without a potential energy; states of Systems of other masses or constraints.
     """
     if not all(isinstance(given, Sequence | np.ndarray) for given in (states, thermal_energies)):
         raise InputError("give a sequence of states, and of as many temperatures", item="states")
@@ -69,7 +68,7 @@ def exchange(
         if state.positions.shape != states[0].positions.shape:
             raise InputError(f"state {k} has another number of atoms than state 0", item="states")
         _refuse_others(states[0], state, k)
-    chances = np.log1p(-stream(seed_number(seed), int(number), EXCHANGE).random(len(states)))
+    chances = np.log1p(-stream(seed_from(rng), int(number), EXCHANGE).random(len(states)))
     after = list(states)
     told: list[bool | None] = [None] * (len(states) - 1)
     for k in range(int(number) % 2, len(states) - 1, 2):

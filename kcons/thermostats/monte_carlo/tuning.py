@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from kcons.constraints.arguments import finite_number, positive, whole_number
-from kcons.errors import ConvergenceError, InputError
+from kcons.constraints.arguments import Positive, checked, positive, share, whole_number
+from kcons.errors import ConvergenceError
 from kcons.steppers import State, System
 from kcons.thermostats.freedom import carried
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
@@ -23,26 +25,16 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
 #: forgotten.
 PULL, BEFORE, FORGET = 0.2, 10, 0.75
 
+Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
+
 
 class DualAveraging:
-    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5).
+    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5)."""
 
-    Parameters
-    ----------
-    dt : float
-        To begin with.
-    wanted : float
-        Between 0 and 1.
-
-    Raises
-    ------
-    InputError
-        `dt` is not positive, or `wanted` not between 0 and 1.
-    """
-
-    def __init__(self, dt: float, wanted: float) -> None:
-        self.wanted = wanted_share(wanted)
-        self._center = self._log = math.log(positive(dt, "dt"))
+    @checked
+    def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
+        self.wanted = wanted
+        self._center = self._log = math.log(dt)
         self._sum = self._mean = 0.0
         self._told: list[float] = []
         self.made = 0
@@ -99,7 +91,7 @@ class Tuned:
     state: State
 
 
-def best_share(order: int) -> float:
+def best_acceptance(order: int) -> float:
     """The share of accepted proposals that costs least, p/(p + 1) for order p.
 
     For many degrees of freedom dH is normal, its deviation s is proportional to dt^p and its mean s^2/2, and
@@ -109,6 +101,7 @@ def best_share(order: int) -> float:
     return order / (order + 1)
 
 
+@checked
 def tune(
     system: System,
     state: State,
@@ -116,7 +109,7 @@ def tune(
     sampler: HamiltonianMonteCarlo,
     *,
     wanted: float | None = None,
-    proposals: int = 80,
+    proposals: Proposals = 80,
 ) -> Tuned:
     """Find the time step for a share of accepted proposals, by proposals with steps that differ.
 
@@ -132,7 +125,7 @@ def tune(
     sampler : HamiltonianMonteCarlo
         Its number of steps stays, so that trajectories become longer or shorter with the step.
     wanted : float, optional
-        Between 0 and 1; by default what costs least for the order of the stepper, see `best_share`.
+        Between 0 and 1; by default what costs least for the order of the stepper, see `best_acceptance`.
     proposals : int
 
     Raises
@@ -144,46 +137,16 @@ def tune(
     KconsError
         As `HamiltonianMonteCarlo.step`.
     """
-    search = DualAveraging(dt, best_share(sampler.order) if wanted is None else wanted)
-    check_proposals(proposals)
+    search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
     sampler.check(system)
+    known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
+    held = np.zeros(SIZE) if known is None else known
     for _ in range(proposals):
-        before = sum_of(state)
+        before = held[SUM]
         state = sampler.step(system, state, search.dt)
-        search.learn(sum_of(state) - before)
+        held = np.asarray(state.thermostat)
+        search.learn(float(held[SUM] - before))
     search.refuse_failure(system.shown_time)
-    assert state.thermostat is not None
-    held = np.zeros(SIZE)
-    held[POTENTIAL] = state.thermostat[POTENTIAL]
+    potential, held = held[POTENTIAL], np.zeros(SIZE)
+    held[POTENTIAL] = potential
     return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
-
-
-def sum_of(state: State) -> float:
-    """Probabilities of acceptance of all proposals so far, added up.
-
-    Raises
-    ------
-    InputError
-        The state carries variables of another thermostat.
-    """
-    held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
-    return 0.0 if held is None else float(held[SUM])
-
-
-def wanted_share(wanted: float) -> float:
-    """`wanted` as a float.
-
-    Raises
-    ------
-    InputError
-        Not a number between 0 and 1.
-    """
-    share = finite_number(wanted, "wanted")
-    if not 0 < share < 1:
-        raise InputError(f"wanted is {wanted!r}; give a share between 0 and 1", item="wanted")
-    return share
-
-
-def check_proposals(proposals: int) -> None:
-    """Raise `InputError` for fewer than 20."""
-    whole_number(proposals, "proposals", 20)

@@ -1,12 +1,10 @@
 """Several time steps on constraints: cheap forces often, expensive ones seldom.
 
-- `force_groups`: forces in groups, and how often each was asked for
+- `force_groups`: forces in groups, and those of each group on the way through a step
 - `nesting`: the operations of a step
-- `grouped_forces`: the forces of each group on the way through a step
 - `respa`: Langevin dynamics with several time steps
-- `sphere_layout`: which velocities share a sphere
 - `sphere_kernels`: what happens on spheres, compiled
-- `spheres`: stochastic isokinetic baths
+- `spheres`: stochastic isokinetic baths, and which velocities share a sphere
 """
 
 from kcons.thermostats.multistep.force_groups import ForceGroups

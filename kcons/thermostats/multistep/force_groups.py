@@ -1,17 +1,25 @@
-"""Forces in groups that are asked for at steps of their own."""
+"""Forces in groups that are asked for at steps of their own, on the way through a step and in states."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import check_call, numbers
+from kcons.constraints.arguments import as_float_array, check_call, read_only_view
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import State, System
+from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.thermostats.freedom import carried
 
 ForceFunction = Callable[[FloatArray, float], ArrayLike]
+
+#: Difference of the forces of a state from the sum of those of its groups, relative to these, that is their rounding.
+SAME = 1e-12
 
 
 class ForceGroups:
@@ -69,14 +77,13 @@ class ForceGroups:
         Raises
         ------
         InputError
-            Both are the same function, or both groups have one name. While they run: their arrays differ in shape, so
-            that they are of different systems.
+            Both are the same function, or both groups have one name.
         """
         if cheap == expensive:
             raise InputError("cheap and expensive forces are the same function; nothing is left to be slow", item=slow)
         if fast == slow:
             raise InputError(f"fast and slow forces are both called {fast!r}; give them two names", item="slow")
-        return cls({fast: cheap, slow: Difference(cheap, expensive)})
+        return cls({fast: cheap, slow: _difference(cheap, expensive)})
 
     def __repr__(self) -> str:
         return f"ForceGroups({', '.join(self.groups)})"
@@ -101,21 +108,18 @@ class ForceGroups:
 
     def of(self, name: str, x: FloatArray, time: float) -> FloatArray:
         """Forces of one group."""
-        f = numbers(self.groups[name](x, time), f"forces of group {name!r}")
+        f = as_float_array(self.groups[name](x, time), f"forces of group {name!r}")
         self.evaluations[name] += 1
         return f
 
 
-class Difference:
+def _difference(cheap: ForceFunction, expensive: ForceFunction) -> ForceFunction:
     """Expensive forces less cheap ones at the same place."""
 
-    def __init__(self, cheap: ForceFunction, expensive: ForceFunction) -> None:
-        self.cheap, self.expensive = cheap, expensive
-
-    def __call__(self, x: FloatArray, time: float) -> FloatArray:
+    def force(x: FloatArray, time: float) -> FloatArray:
         # A function may use its array again, also where both share it.
-        less = np.array(numbers(self.cheap(x, time), "cheap forces"))
-        whole = numbers(self.expensive(x, time), "expensive forces")
+        less = np.array(as_float_array(cheap(x, time), "cheap forces"))
+        whole = as_float_array(expensive(x, time), "expensive forces")
         if less.shape != whole.shape:
             raise InputError(
                 f"cheap forces have shape {less.shape}, expensive ones {whole.shape}: they are of different systems, "
@@ -124,17 +128,11 @@ class Difference:
             )
         return whole - less
 
+    return force
+
 
 def group_names(force: object, names: tuple[str, ...]) -> None:
-    """Refuse forces whose groups are not those that a stepper has steps for.
-
-    Raises
-    ------
-    UnsupportedError
-        The forces are not in groups.
-    InputError
-        A group without a number of steps, or steps of a group that is not there.
-    """
+    """Refuse forces that are in no groups (`UnsupportedError`), or not in those that a stepper has steps for."""
     if names == ("",):
         return
     if not isinstance(force, ForceGroups):
@@ -148,3 +146,93 @@ def group_names(force: object, names: tuple[str, ...]) -> None:
     for name in force.groups:
         if name not in names:
             raise InputError(f"group {name!r} of the forces has no number of steps; add it to steps", item="steps")
+
+
+@dataclass
+class GroupedForces:
+    """Forces that were last evaluated, by the names of their groups; one empty name where they come in no groups.
+
+    A state carries them, if there are two or more, in the order of their names behind the variables of its thermostat
+    and a number that stands for the names, so that a run that is continued evaluates nothing anew. Where the slowest
+    group, the first, kicks in the middle of steps it carries none, and each step begins with an evaluation of the
+    others.
+    """
+
+    system: System
+    names: tuple[str, ...]
+    now: dict[str, FloatArray]
+    middle: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        state: State,
+        names: tuple[str, ...],
+        variables: int,
+        name: str,
+        *,
+        marked: bool = False,
+        middle: bool = False,
+    ) -> tuple[GroupedForces, FloatArray | None]:
+        """Forces at a state, evaluated where it has none, and the variables of its thermostat (see `carried`)."""
+        size = 3 * system.n_atoms
+        stored = len(names) * size + 1 if len(names) > 1 and not middle else 0
+        known = carried(state, variables + stored, name, marked=marked)
+        x, _, forces = system.kernel_arrays(state)
+        found = cls(system, names, {}, middle)
+        if forces is not None and not stored and not middle:
+            found.now[names[0]] = forces
+        elif forces is not None and known and stored:
+            assert state.thermostat is not None
+            if state.thermostat[variables] != _number_of(names):
+                raise InputError(
+                    f"the state carries forces of groups of other names than {', '.join(names)}; name the groups as "
+                    "they were, or begin from its positions and velocities: State(state.positions, state.velocities)",
+                    item="groups",
+                )
+            parts = state.thermostat[variables + 1 :].reshape(len(names), *x.shape)
+            found.now.update(zip(sorted(names), parts, strict=True))
+            # Positions and their forces may have been put together with variables of another place.
+            if not np.all(np.abs(parts.sum(axis=0) - forces) <= SAME * np.abs(parts).max()):
+                found.now.clear()
+        for group in names[1:] if middle else names:
+            if group not in found.now:
+                found.evaluate(group, x, state.time, state.step)
+        return found, None if state.thermostat is None else state.thermostat[:variables]
+
+    def evaluate(self, name: str, x: FloatArray, time: float, step: int) -> None:
+        """Forces of one group at positions as the force function sees them; errors have the number of the step."""
+        system = self.system
+        force = system.force
+        if not name or not isinstance(force, ForceGroups):
+            self.now[name] = system.forces(x, x, time, step)
+            return
+        f = system.accepted(force.of(name, read_only_view(x), time), step, True)
+        check_finite(f, "force", step)
+        self.now[name] = f
+
+    def stacked(self) -> FloatArray:
+        """Those of all groups one after another, shape (n_groups n_atoms, 3)."""
+        if len(self.names) == 1:
+            return self.now[self.names[0]]
+        none = np.zeros((self.system.n_atoms, 3))
+        return np.concatenate([self.now.get(name, none) for name in self.names])
+
+    def total(self) -> FloatArray | None:
+        """Their sum, None where the slowest ones are those of another place."""
+        if self.middle:
+            return None
+        first, *others = (self.now[name] for name in self.names)
+        return first if not others else first + sum(others[1:], start=others[0])
+
+    def closed(self, variables: FloatArray) -> FloatArray:
+        """What a state carries: the variables of the thermostat, and forces."""
+        if len(self.names) == 1 or self.middle:
+            return variables
+        forces = [self.now[name].ravel() for name in sorted(self.names)]
+        return np.concatenate([variables, [_number_of(self.names)], *forces])
+
+
+def _number_of(names: tuple[str, ...]) -> float:
+    return float(zlib.crc32("\n".join(sorted(names)).encode()))

@@ -8,13 +8,12 @@ that slow forces kick in the middle of a step, and states are those halfway betw
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import checked, whole_number
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.splitting import SUZUKI_4
@@ -22,6 +21,7 @@ from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
 SlowKicks = Literal["ends", "middle"]
+InnerOrder = Literal[2, 4]
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
     Raises
     ------
     InputError
-        Numbers of steps that are not whole, below 1, the same for two groups, or of which one does not divide the next;
-        the slowest group takes more than one.
+        Numbers of steps of which one does not divide the next, or of which the least is not 1.
     """
     if steps is None:
         return (Level("", 1),)
@@ -74,29 +73,8 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
     return tuple(levels)
 
 
-def inner_flight(order: int, substeps: int) -> tuple[float, ...]:
-    """What each drift of the innermost scheme is made of.
-
-    Raises
-    ------
-    InputError
-        An order that there is no scheme of.
-    """
-    if order not in (2, 4):
-        raise InputError(f"order is {order}; choose 2 or 4", item="order")
-    return (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
-
-
 def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
-    """Whether the slowest group kicks in the middle of the step.
-
-    Raises
-    ------
-    InputError
-        An unknown place; steps of the next group that have no middle.
-    """
-    if slow_kicks not in ("ends", "middle"):
-        raise InputError(f"slow_kicks is {slow_kicks!r}; choose 'ends' or 'middle'", item="slow_kicks")
+    """Whether the slowest group kicks in the middle of the step; `InputError` where that has none."""
     if slow_kicks == "ends":
         return False
     if len(levels) == 1:
@@ -119,13 +97,12 @@ def nested(
     exact: bool = False,
     middle: bool = False,
 ) -> tuple[Operation, ...]:
-    """A step.
+    """The operations of a step.
 
     Parameters
     ----------
-    levels : tuple of Level
-    order : {2, 4}
-        Of the innermost scheme.
+    levels, order
+        The groups, and the order of the innermost scheme.
     flight : tuple of float
         What each drift is made of, as fractions that add up to 1.
     turns : bool
@@ -154,16 +131,7 @@ def nested(
 
 
 class Nesting:
-    """Steps of all groups of forces, as steppers with several time steps make them.
-
-    Parameters
-    ----------
-    steps : mapping of str to int, optional
-    order : {2, 4}
-    substeps : int
-    slow_kicks : {'ends', 'middle'}
-    turns : bool
-        As for `nested`.
+    """Steps of all groups of forces, from the arguments of a stepper with several time steps.
 
     Attributes
     ----------
@@ -173,35 +141,31 @@ class Nesting:
         Whether the slowest kicks in the middle.
     in_flights, on_circles : tuple of Operation
         A step, and one whose flights are great circles.
-    evaluations : dict of str to int
-        How often a step evaluates each group.
+    evaluations : int
+        Of forces in a step, those of all groups.
     words : list of str
         Steps, and what else is not as by default, as arguments.
-
-    Raises
-    ------
-    InputError
-        As `levels_of`, `inner_flight` and `middle_of`.
     """
 
+    @checked
     def __init__(
-        self, steps: Mapping[str, int] | None, order: int, substeps: int, slow_kicks: SlowKicks, turns: bool = False
+        self,
+        steps: Mapping[str, int] | None,
+        order: InnerOrder,
+        substeps: int,
+        slow_kicks: SlowKicks,
+        turns: bool = False,
     ) -> None:
         levels = levels_of(steps)
-        flight = inner_flight(order, substeps)
+        flight = (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
         self.names = tuple(level.group for level in levels)
         self.middle = middle_of(levels, slow_kicks)
         self.in_flights = nested(levels, order, flight, turns=turns, middle=self.middle)
         self.on_circles = nested(levels, order, (1.0,), turns=turns, exact=True, middle=self.middle)
-        self.evaluations = evaluations(self.in_flights)
+        self.evaluations = sum(isinstance(operation, Evaluate) for operation in self.in_flights)
         counts = {level.group: level.steps for level in levels}
         self.words = ["" if steps is None else f", steps={counts}", "" if order == 2 else f", order={order}"]
         self.words[1] += ", slow_kicks='middle'" if self.middle else ""
-
-
-def evaluations(operations: tuple[Operation, ...]) -> dict[str, int]:
-    """How often a step evaluates each group."""
-    return dict(Counter(operation.group for operation in operations if isinstance(operation, Evaluate)))
 
 
 def _level(
@@ -213,6 +177,12 @@ def _level(
     turns: bool,
 ) -> Iterator[Operation]:
     """A step of one group, with those of the faster ones in it."""
+
+    def drift() -> Iterator[Operation]:
+        yield next(flights)
+        if turns:
+            yield Project()
+
     push = Turn if turns else Kick
     group, length = levels[at].group, 1.0 / levels[at].steps
     if at + 1 < len(levels):
@@ -230,14 +200,8 @@ def _level(
         else:
             yield push(fraction * length, group)
         if k < len(drifts):
-            yield from _drift(next(flights), turns)
+            yield from drift()
             if odd and k == center:
                 yield Exchange(length)
-                yield from _drift(next(flights), turns)
+                yield from drift()
             yield Evaluate(group)
-
-
-def _drift(flight: Fly, turns: bool) -> Iterator[Operation]:
-    yield flight
-    if turns:
-        yield Project()

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from kcons.constraints.arguments import Rng
 from kcons.constraints.target import FloatArray
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate
 from kcons.steppers.program import Row
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
-from kcons.thermostats.multistep.force_groups import group_names
-from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
+from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
+from kcons.thermostats.multistep.nesting import InnerOrder, Nesting, SlowKicks
 
 
 class LangevinRespa(Langevin):
@@ -31,7 +31,8 @@ class LangevinRespa(Langevin):
         k_B T in the units of energy in use.
     friction : float
         gamma, in inverse units of time; 0 for constant energy.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`.
     steps : mapping of str to int, optional
         Steps of each group of forces in one step, ``{"slow": 1, "medium": 4, "fast": 12}``; each divides the next. The
         System has the forces, as `ForceGroups`. Without it all forces are one group.
@@ -65,24 +66,24 @@ class LangevinRespa(Langevin):
         self,
         thermal_energy: float,
         friction: float,
-        seed: int,
+        rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
-        order: int = 2,
+        order: InnerOrder = 2,
         substeps: int = 3,
         conserve_momentum: bool = False,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
-        super().__init__(thermal_energy, friction, seed, substeps=substeps, conserve_momentum=conserve_momentum)
+        super().__init__(thermal_energy, friction, rng, substeps=substeps, conserve_momentum=conserve_momentum)
         self.nesting = Nesting(steps, order, self.substeps, slow_kicks)
         self.inner_order = order
         both = self.nesting.in_flights, self.nesting.on_circles
         self._in_flights, self._great_circles = (listed_and_made(each, self.nesting.names) for each in both)
-        self.force_evaluations = sum(self.nesting.evaluations.values())
+        self.force_evaluations = self.nesting.evaluations
 
     def __repr__(self) -> str:
         given = "".join(self.nesting.words)
-        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
+        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""

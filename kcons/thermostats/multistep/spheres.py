@@ -4,6 +4,9 @@ y = (u, w), the mass-weighted velocities of g degrees of freedom and L auxiliary
 (g + L - 1) k_B T. Kicks turn y, free flight keeps |u|, and the bath moves y on the sphere without changing the uniform
 distribution there. Configurations are then canonical, and no degree of freedom can take up more energy than its sphere
 has, so that resonances of slow kicks stay bounded.
+
+A cluster's kinetic energy is conserved in free flight, that of its center of mass alone as well unless a row knows a
+place in space. Each part that is conserved by itself may have a sphere of its own.
 """
 
 from __future__ import annotations
@@ -11,30 +14,165 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import FromZero, Positive, Rng, checked
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.solvers.rank_revealing import rank
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Operation, Project, Turn
 from kcons.steppers.program import Program, Row
 from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.thermostats.bodies import placed_rows
 from kcons.thermostats.freedom import MARK
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.force_groups import group_names
-from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Nesting, SlowKicks
-from kcons.thermostats.multistep.sphere_layout import KINDS, SphereLayout, Spheres, refuse_driven
+from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
+from kcons.thermostats.multistep.nesting import InnerOrder, Nesting, SlowKicks
+
+Spheres = Literal["split", "axes", "cluster", "global"]
 
 logger = logging.getLogger("kcons.thermostats")
 
 #: Part of a step whose noise is drawn for the auxiliary variables at the start of a run.
 _BEGIN = 2**63
+
+
+@dataclass(frozen=True, eq=False)
+class SphereLayout:
+    """The spheres of a system.
+
+    Attributes
+    ----------
+    cluster : ndarray of int, shape (n_atoms,)
+        Cluster of each atom, -1 for fixed ones.
+    spheres : ndarray of int, shape (n_clusters, 4)
+        Those of the center of mass along x, y and z, all -1 where it has none of its own; that of the rest, or -1.
+    masses : ndarray, shape (n_atoms,)
+        0 for fixed atoms.
+    totals : ndarray, shape (n_clusters,)
+        Masses of the clusters.
+    freedom : ndarray of int, shape (n_spheres,)
+        Degrees of freedom g on each sphere.
+    """
+
+    cluster: IntArray
+    spheres: IntArray
+    masses: FloatArray
+    totals: FloatArray
+    freedom: IntArray
+
+    @classmethod
+    def of(cls, system: System, positions: FloatArray, kind: Spheres) -> SphereLayout:
+        """The spheres of one kind; ranks of clusters with dependent rows are found at the positions.
+
+        Raises
+        ------
+        UnsupportedError
+            Targets move, or rows hold velocities; the ranks of the clusters do not add up.
+        OverdeterminedError
+            Nothing can move.
+        """
+        refuse_driven(system)
+        moving = system.inverse_masses[:, 0] > 0
+        if kind == "global":
+            cluster, tied = np.where(moving, 0, -1), np.ones(1, dtype=bool)
+            free = np.array([system.motion.degrees_of_freedom])
+        else:
+            cluster, tied, free = _clusters(system, moving, positions)
+        n = len(free)
+        spheres = np.full((n, 4), -1, dtype=np.int64)
+        counts = np.zeros((n, 4), dtype=np.int64)
+        open_ = ~tied & (kind in ("split", "axes"))
+        if kind == "axes":
+            counts[open_, :3] = 1
+        else:
+            counts[open_, 0] = 3
+        counts[:, 3] = free - 3 * open_
+        own = counts > 0
+        spheres[own] = np.arange(own.sum())
+        if kind == "split":
+            spheres[open_, 1:3] = spheres[open_, :1]
+        if not own.any():
+            raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows")
+        masses = np.where(moving, system.masses, 0.0)
+        totals = np.zeros(n)
+        np.add.at(totals, cluster[moving], masses[moving])
+        return cls(cluster.astype(np.int64), spheres, masses, totals, counts[own])
+
+    def squares(self, thermal_energy: float, auxiliary: int) -> FloatArray:
+        """R^2 = (g + L - 1) k_B T of each sphere; `InputError` where that is 0."""
+        sizes = self.freedom + auxiliary - 1
+        if (sizes < 1).any():
+            count = int((sizes < 1).sum())
+            raise InputError(
+                f"{count} spheres of one degree of freedom and no auxiliary variable have the radius 0; "
+                "give auxiliary=1 or more",
+                item="auxiliary",
+            )
+        return np.asarray(thermal_energy * sizes)
+
+
+def refuse_driven(system: System) -> None:
+    """Raise `UnsupportedError` for targets that move and rows that hold velocities."""
+    for item in system.motion.constraint_set.constraints:
+        if item.moving or not item.holonomic:
+            what = "has a target that moves" if item.holonomic else "holds velocities"
+            raise UnsupportedError(
+                f"{item.family} {what}: the spheres of an isokinetic bath go with constraints that rest. Use "
+                "Langevin or LangevinRespa"
+            )
+
+
+def _clusters(system: System, moving: BoolArray, positions: FloatArray) -> tuple[IntArray, BoolArray, IntArray]:
+    """Cluster of each atom (free atoms are their own), whether a row ties it to space, degrees of freedom."""
+    held, labels = system.motion.constraint_set, system.motion.plan.labels
+    incidence = held.incidence
+    row_of = np.repeat(np.arange(held.n_rows), np.diff(incidence.indptr))
+    inside = labels[row_of] >= 0
+    atoms, rows = incidence.indices[inside], row_of[inside]
+    found = np.full(held.n_atoms, -1, dtype=np.int64)
+    movable = moving[atoms]
+    found[atoms[movable]] = labels[rows[movable]]
+    count = int(labels.max(initial=-1)) + 1
+    placed = np.zeros(count, dtype=bool)
+    placed[labels[rows[~movable]]] = True
+    placed[labels[placed_rows(held) & (labels >= 0)]] = True
+    alone = np.flatnonzero(moving & (found < 0))
+    found[alone] = count + np.arange(len(alone))
+    free = 3 * np.bincount(found[found >= 0], minlength=count + len(alone))
+    free[:count] -= _ranks(system, count, positions)
+    return found, np.append(placed, np.zeros(len(alone), bool)), free
+
+
+def _ranks(system: System, count: int, positions: FloatArray) -> IntArray:
+    """Independent rows of each cluster."""
+    plan = system.motion.plan
+    ranks = np.bincount(plan.labels[plan.labels >= 0], minlength=count)
+    wanted = plan.rank - len(plan.pinned_rows)
+    if ranks.sum() == wanted:
+        return ranks
+    jacobian = system.motion.constraint_set.jacobian(positions)
+    weights = np.sqrt(system.weights.ravel())
+    for rows in plan.dependent:
+        part = jacobian[rows]
+        columns, place = np.unique(part.indices, return_inverse=True)
+        dense = np.zeros((1, len(rows), len(columns)))
+        dense[0, np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * weights[part.indices]
+        ranks[plan.labels[rows[0]]] = rank(dense)
+    if ranks.sum() != wanted:
+        raise UnsupportedError(
+            f"the ranks of the clusters add up to {ranks.sum()}, not to {wanted}: which of them has how many degrees "
+            "of freedom is unclear. Leave out dependent rows, or use one sphere for all, spheres='global'"
+        )
+    return ranks
 
 
 class IsokineticSpheres(SeededBath):
@@ -49,7 +187,8 @@ class IsokineticSpheres(SeededBath):
         k_B T in the units of energy in use.
     friction : float
         gamma, in inverse units of time, above 0: the rate at which the bath forgets.
-    seed : int
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`.
     steps : mapping of str to int, optional
         As for `LangevinRespa`.
     spheres : {'split', 'axes', 'cluster', 'global'}
@@ -64,15 +203,12 @@ class IsokineticSpheres(SeededBath):
     substeps : int
         RATTLE substeps in each drift, for order 2.
     slow_kicks : {'ends', 'middle'}
-        Where the slowest forces kick: half at each end of the step, or once in its middle. States halfway between two
-        slow kicks are nearer to the canonical distribution than those at the kicks; they know no slow forces, so that
-        each energy that is read costs an evaluation, and the other groups are evaluated once more a step.
+        As for `LangevinRespa`.
 
     Raises
     ------
     InputError
-        Temperature or friction not positive; numbers of steps that do not divide each other; unknown spheres; spheres
-        of radius 0 (g + L - 1 = 0), at the start of a run.
+        As for `LangevinRespa`; friction not positive; spheres of radius 0 (g + L - 1 = 0), at the start of a run.
 
     Notes
     -----
@@ -86,56 +222,38 @@ class IsokineticSpheres(SeededBath):
     3579 (2013).
     """
 
+    @checked
     def __init__(
         self,
         thermal_energy: float,
-        friction: float,
-        seed: int,
+        friction: Positive,
+        rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
         spheres: Spheres = "split",
-        auxiliary: int = 1,
-        order: int = 2,
+        auxiliary: FromZero = 1,
+        order: InnerOrder = 2,
         substeps: int = 3,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
-        super().__init__(thermal_energy, friction, seed, substeps)
-        if not self.friction > 0:
-            raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
-        if spheres not in KINDS:
-            raise InputError(f"spheres is {spheres!r}; choose one of {', '.join(KINDS)}", item="spheres")
+        super().__init__(thermal_energy, friction, rng, substeps)
         self.spheres: Spheres = spheres
-        self.auxiliary = whole_number(auxiliary, "auxiliary", 0)
+        self.auxiliary = auxiliary
         self.inner_order = order
         self.nesting = Nesting(steps, order, self.substeps, slow_kicks, turns=True)
         both = self.nesting.in_flights, self.nesting.on_circles
         self._in_flights, self._great_circles = (_listed_and_made(each, self.nesting.names) for each in both)
-        self.force_evaluations = sum(self.nesting.evaluations.values())
+        self.force_evaluations = self.nesting.evaluations
         self._known: tuple[System, SphereLayout, FloatArray, float] | None = None
         self._told = False
 
     def __repr__(self) -> str:
         steps, others = self.nesting.words
         given = f"{steps}, spheres={self.spheres!r}, auxiliary={self.auxiliary}{others}"
-        return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
-
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self.listed(system)[0]
-
-    def listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
-        """The operations, and as the interpreter goes through them."""
-        return self._in_flights if system is None or system.great_circles is None else self._great_circles
+        return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
 
     def check(self, system: System) -> None:
-        """Raise where there can be no spheres, or where the groups of forces are not those that have steps.
-
-        Raises
-        ------
-        UnsupportedError
-            Velocity-dependent forces, friction of the system, targets that move, rows that hold velocities.
-        InputError
-            Groups of forces.
-        """
+        """Raise where the groups of forces are not those that have steps, for targets that move and velocity rows."""
         super().check(system)
         if self._known is None or self._known[0] is not system:
             refuse_driven(system)

@@ -21,7 +21,7 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import check_pairs, finite_number, positive, seed_number, whole_number
+from kcons.constraints.arguments import Count, Finite, Positive, Rng, check_pairs, checked, finite_number, seed_from
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
@@ -63,30 +63,21 @@ MODES = 11
 
 
 class Strains:
-    """One of the kinds in which a cell changes.
+    """One of the kinds in which a cell changes, by k generators.
 
     Attributes
     ----------
-    kind : str
-    generators : ndarray, shape (k, 3, 3)
-    diagonals : ndarray, shape (k, 3)
-        Of the generators.
+    generators, diagonals : ndarray, shape (k, 3, 3) and (k, 3)
     traces, sizes : ndarray, shape (k,)
-        Their traces, and sums of squares of their entries.
+        Of the generators, and sums of squares of their entries.
     axes : ndarray of bool, shape (3,)
         Those along which lengths change.
     most : ndarray, shape (k,)
         Largest |e_k| of a trial.
-
-    Raises
-    ------
-    InputError
-        An unknown kind.
     """
 
+    @checked
     def __init__(self, kind: Kind) -> None:
-        if not isinstance(kind, str) or kind not in GENERATORS:
-            raise InputError(f"kind is {kind!r}; choose {', '.join(map(repr, GENERATORS))}", item="kind")
         self.kind, self.generators, self.flexible = kind, GENERATORS[kind], kind == "flexible"
         self.diagonals: FloatArray = np.ascontiguousarray(np.diagonal(self.generators, axis1=1, axis2=2))
         self.traces: FloatArray = self.diagonals.sum(axis=1)
@@ -133,8 +124,6 @@ def _exponential(a: FloatArray) -> FloatArray:
 #: Probability of acceptance that widths are adapted to, and how fast that fades: the mean change of ln(width) in trial
 #: n is n^-FADING.
 WANTED, FADING = 0.5, 0.6
-
-
 #: Standard deviations of the noise of a trial that fit into the largest change of a length, beside its mean of one.
 _WITHIN = 2.0
 
@@ -156,14 +145,7 @@ class Press(Operation):
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where the system is before or after a trial.
-
-    Attributes
-    ----------
-    cell, positions, energy
-    forces, stress : ndarray or None
-        Where the barostat asks for them.
-    """
+    """Where the system is before or after a trial, with forces and stress where the barostat asks for them."""
 
     cell: FloatArray
     positions: FloatArray
@@ -216,8 +198,8 @@ class Barostat:
     kind : {'isotropic', 'semi-isotropic', 'anisotropic', 'flexible', 'lateral', 'normal'}
         How the cell changes: as a whole; x and y together and z for itself (slabs, membranes); x, y and z; all lengths
         and angles, for crystals; x and y only; z only, at constant area.
-    seed : int
-        The same as that of a thermostat does no harm.
+    rng : int, numpy.random.Generator or None
+        As for `Langevin`; the same number as for the thermostat does no harm.
     tension : float
         Surface tension gamma, energy over area, of the face spanned by the first two cell vectors.
     molecules : array_like of int, shape (n, 2), optional
@@ -237,17 +219,18 @@ class Barostat:
     what = ""
     needs_stress = False
 
+    @checked
     def __init__(
         self,
         pressure: float,
         *,
-        every: int = 100,
+        every: Count = 100,
         kind: Kind = "isotropic",
-        seed: int = 0,
-        tension: float = 0.0,
+        rng: Rng = 0,
+        tension: Finite = 0.0,
         molecules: ArrayLike | None = None,
         held: Held = "refuse",
-        cutoff: float | None = None,
+        cutoff: Positive | None = None,
     ) -> None:
         if not isinstance(pressure, str) and np.ndim(pressure):
             raise InputError(
@@ -256,17 +239,13 @@ class Barostat:
                 "the pressure along them is less by tension over thickness",
                 item="pressure",
             )
-        self.pressure = finite_number(pressure, "pressure")
-        self.tension = finite_number(tension, "tension")
-        self.strains = Strains(kind)
+        self.pressure, self.tension, self.strains = finite_number(pressure, "pressure"), tension, Strains(kind)
         if self.tension and kind not in ("semi-isotropic", "lateral", "anisotropic"):
             raise InputError(f"kind={kind!r} has no surface tension; use 'semi-isotropic' or 'lateral'", item="tension")
-        if held not in ("refuse", "stay"):
-            raise InputError(f"held is {held!r}; choose 'refuse' or 'stay'", item="held")
-        self.every, self.seed = whole_number(every, "every"), seed_number(seed)
+        self.every, self.seed = every, seed_from(rng)
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
-        self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
+        self.cutoff = cutoff
         self._pieces: WeakKeyDictionary[CellSystem, BarostatBodies] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -283,13 +262,7 @@ class Barostat:
         return Press(self.every, f"{self.what} ({self.strains.kind})")
 
     def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
-        """What moves as one.
-
-        Raises
-        ------
-        UnsupportedError, InputError
-            As `find_pieces`.
-        """
+        """What moves as one; errors as of `find_pieces`."""
         known = self._pieces.get(system)
         if known is None:
             require_periodic(system, self.strains.axes, self.strains.kind)
@@ -305,13 +278,7 @@ class Barostat:
         return float(zlib.crc32(f"{type(self).__name__} {self.strains.kind}".encode()))
 
     def variables_of(self, state: State) -> FloatArray | None:
-        """Those that a state carries; None where no barostat has begun.
-
-        Raises
-        ------
-        InputError
-            They are those of a barostat of another class or kind.
-        """
+        """Those that a state carries, None where no barostat has begun; `InputError` for those of another one."""
         known = state.barostat
         if known is None or len(known) <= WORK:
             return None
@@ -331,13 +298,7 @@ class Barostat:
         return variables
 
     def acceptance(self, state: State) -> FloatArray:
-        """Mean probability of acceptance of each mode so far; NaN before the first trial.
-
-        Raises
-        ------
-        InputError
-            As `variables_of`.
-        """
+        """Mean probability of acceptance of each mode so far; NaN before the first trial."""
         known = self.variables_of(state)
         if known is None:
             return np.full(len(self.strains), np.nan)
@@ -379,7 +340,8 @@ class Barostat:
             positions, remainder = _added(state.positions, d, state.remainder)
             check_finite(positions, "position", state.step)
             try:
-                self._enter(system, before.cell @ matrix, positions)
+                self._check_width(system, before.cell @ matrix)
+                system.set_cell(before.cell @ matrix, positions)
                 there = replace(state, positions=positions, forces=None, barostat=None)
                 after = self._place(system, system.cell, positions, there)
                 log = self._log_chance(pieces, before, after, trial, thermal_energy)
@@ -398,10 +360,6 @@ class Barostat:
         variables[WORK] += after.energy - before.energy
         moved = replace(state, positions=positions, remainder=remainder, barostat=variables)
         return replace(moved, forces=after.forces, origin=(ref(system), positions, state.velocities, state.time))
-
-    def _enter(self, system: CellSystem, cell: FloatArray, positions: FloatArray) -> None:
-        self._check_width(system, cell)
-        system.set_cell(cell, positions)
 
     def _check_width(self, system: CellSystem, cell: FloatArray) -> None:
         if self.cutoff is not None:
@@ -485,9 +443,10 @@ class MonteCarloBarostat(Barostat):
 
     what = "scale cell and centers of pieces at random, accept by energy"
 
-    def __init__(self, pressure: float, *, width: float = 0.01, **kwargs: Any) -> None:
+    @checked
+    def __init__(self, pressure: float, *, width: Positive = 0.01, **kwargs: Any) -> None:
         super().__init__(pressure, **kwargs)
-        self.width = positive(width, "width")
+        self.width = width
 
     def begin(self, system: CellSystem) -> FloatArray:
         variables = super().begin(system)
@@ -534,10 +493,10 @@ class CellRescaling(Barostat):
     what = "scale cell and centers of pieces by the stress and by noise, accept by energy"
     needs_stress = True
 
-    def __init__(self, pressure: float, tau: float, compressibility: float, **kwargs: Any) -> None:
+    @checked
+    def __init__(self, pressure: float, tau: Positive, compressibility: Positive, **kwargs: Any) -> None:
         super().__init__(pressure, **kwargs)
-        self.tau = positive(tau, "tau")
-        self.compressibility = positive(compressibility, "compressibility")
+        self.tau, self.compressibility = tau, compressibility
 
     def _drift(self, attempt: Attempt, place: Place) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of each mode's change until the next trial."""
@@ -585,13 +544,7 @@ def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:
 
 
 def require_barostat(given: object) -> Barostat:
-    """What is given, if it is a barostat.
-
-    Raises
-    ------
-    InputError
-        It is not.
-    """
+    """What is given, if it is a barostat; `InputError` otherwise."""
     if isinstance(given, Barostat):
         return given
     raise InputError(f"barostat is {given!r}; give MonteCarloBarostat(pressure) or CellRescaling(...)", item="barostat")

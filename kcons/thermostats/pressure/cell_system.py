@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, check_call, numbers
+from kcons.constraints.arguments import as_array, as_float_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -81,13 +81,7 @@ class CellSystem(System):
 
     @property
     def volume(self) -> float:
-        """What the pressure acts on.
-
-        Raises
-        ------
-        InputError
-            A vector of the cell is zero.
-        """
+        """What the pressure acts on; `InputError` where a vector of the cell is zero."""
         found = float(abs(np.linalg.det(self.cell)))
         if not found > 0:
             raise InputError(
@@ -126,13 +120,7 @@ class CellSystem(System):
         return replace(state, barostat=self.cell.flatten())
 
     def enter(self, state: State) -> None:
-        """Take the cell of a state that knows one.
-
-        Raises
-        ------
-        InputError, ImageError
-            As `set_cell`.
-        """
+        """Take the cell of a state that knows one; errors as of `set_cell`."""
         cell = state.cell
         if cell is not None and not (cell == self.cell)[self.periodic].all():
             self.set_cell(cell.copy(), state.positions.copy())  # arrays of a state that is shown cannot be written to
@@ -148,15 +136,7 @@ class CellSystem(System):
         return super().total_energy(state)
 
     def energy(self, x: FloatArray, time: float, step: int) -> float:
-        """The potential energy; infinite where atoms overlap.
-
-        Raises
-        ------
-        NonFiniteError
-            It is NaN, or minus infinity.
-        InputError
-            It is no number.
-        """
+        """The potential energy, infinite where atoms overlap; `NonFiniteError` if it is NaN, or minus infinity."""
         found = 0.0 if self.potential is None else float(self.potential(x, time))
         if not found > -np.inf:
             error = NonFiniteError(
@@ -168,15 +148,7 @@ class CellSystem(System):
         return found
 
     def stress(self, x: FloatArray, time: float) -> FloatArray:
-        """Shape (3, 3), symmetric.
-
-        Raises
-        ------
-        UnsupportedError
-            Nobody knows it.
-        NonFiniteError
-            It is not finite.
-        """
+        """Shape (3, 3), symmetric; `UnsupportedError` where nobody knows it, `NonFiniteError` if it is not finite."""
         if self.stress_of is None:
             if self.force is None:
                 return np.zeros((3, 3))
@@ -190,7 +162,7 @@ class CellSystem(System):
 
 
 def _number(energy: ArrayLike) -> float:
-    found = numbers(energy, "potential")
+    found = as_float_array(energy, "potential")
     if found.ndim:
         raise InputError(
             f"the potential function returned shape {found.shape}; it must return one number", item="potential"

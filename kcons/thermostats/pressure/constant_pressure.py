@@ -81,13 +81,7 @@ class ConstantPressure(Listed):
             raise UnsupportedError("an isokinetic thermostat on some atoms gives the others no temperature; take all")
 
     def start(self, system: System, state: State) -> State:
-        """The state in its cell, with variables of the barostat.
-
-        Raises
-        ------
-        UnsupportedError, InputError
-            As `check`, `Barostat.pieces` and `Barostat.variables_of`.
-        """
+        """The state in its cell, with variables of the barostat."""
         self.check(system)
         assert isinstance(system, CellSystem)
         known = self.barostat.variables_of(state)

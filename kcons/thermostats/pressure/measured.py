@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.arguments import positive, refuse_other
+from kcons.constraints.arguments import checked, positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
@@ -47,15 +47,9 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
     return 0.5 * (virial + virial.T)
 
 
+@checked
 def refuse_virial(virial: Virial, thermal_energy: float | None) -> None:
-    """Refuse a virial that is unknown, and kT for the momenta of atoms.
-
-    Raises
-    ------
-    InputError
-    """
-    if virial not in get_args(Virial):
-        raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
+    """Raise `InputError` for a virial that is unknown, and for kT with the momenta of atoms."""
     if virial == "atomic" and thermal_energy is not None:
         # the virial of constraint forces has the present velocities as well, and only both together are right
         raise InputError(
@@ -95,7 +89,7 @@ def instantaneous_pressure(
     Raises
     ------
     InputError
-        An unknown virial; `thermal_energy` with 'atomic'; a cell without a volume; pieces of another system.
+        `thermal_energy` with 'atomic'; a cell without a volume; pieces of another system.
     UnsupportedError
         There is no stress, or a piece is held in space.
     NonFiniteError
@@ -173,11 +167,6 @@ class PressureObserver:
     ----------
     values : list of ndarray, shape (3, 3)
     volumes : list of float
-
-    Raises
-    ------
-    InputError
-        An unknown virial; `thermal_energy` with 'atomic'.
     """
 
     def __init__(

@@ -78,10 +78,7 @@ class BarostatBodies:
     def moved(self, x: FloatArray, change: FloatArray, lattice: FloatArray) -> FloatArray:
         """Displacements for a cell that becomes cell (1 + `change`), each atom in the image that it is stored in.
 
-        Raises
-        ------
-        UnsupportedError
-            What stays in its place is stored across a face of the cell that moves.
+        `UnsupportedError` where what stays in its place is stored across a face of the cell that moves.
         """
         d = np.empty_like(x)
         atom = displacements(x, self.label, self.weight, self.open, *self.tree, lattice, change, d)
@@ -109,11 +106,8 @@ def find_pieces(
     positions : ndarray, shape (n_atoms, 3)
     axes : ndarray of bool, shape (3,)
         The axes along which the cell changes.
-    molecules : array_like of int, shape (n, 2), optional
-        Bonds: what they join moves as one as well.
-    held : {'refuse', 'stay'}
-        What to do with pieces that a row holds in space along such an axis: refuse them, or leave them where they are,
-        as walls from outside.
+    molecules, held
+        As for `Barostat`.
 
     Raises
     ------
@@ -224,22 +218,9 @@ def require_periodic(system: CellSystem, axes: NDArray[np.bool_], kind: str) -> 
 
 @njit(cache=True, nogil=True)
 def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):  # type: ignore[no-untyped-def]
-    """By how much atoms move where the cell becomes cell (1 + `change`), each in the image that it is stored in.
+    """`BarostatBodies.moved`, written to d; atoms and parents are the tree.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_atoms, 3)
-    label, weight, opened, atoms, parents
-        Of `BarostatBodies`; the last two are its tree.
-    lattice : ndarray, shape (2, 3, 3)
-    change : ndarray, shape (3, 3)
-    d : ndarray, shape (n_atoms, 3)
-        Written to.
-
-    Returns
-    -------
-    int
-        An atom that stays in its place along an axis in which its image moves; -1 without one.
+    Returns an atom that stays in its place along an axis in which its image moves; -1 without one.
     """
     y = x.copy()
     follow_parents(y, atoms, parents, lattice)

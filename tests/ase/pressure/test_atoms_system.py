@@ -43,8 +43,8 @@ made = pytest.mark.parametrize("name", MADE)
 
 def barostats(**kwargs):
     return {
-        "monte carlo": MonteCarloBarostat(PRESSURE, **{"every": 1, "width": 0.25, "seed": 3, **kwargs}),
-        "rescaling": CellRescaling(PRESSURE, 4 * FS, 1 / PRESSURE, **{"every": 1, "seed": 3, **kwargs}),
+        "monte carlo": MonteCarloBarostat(PRESSURE, **{"every": 1, "width": 0.25, "rng": 3, **kwargs}),
+        "rescaling": CellRescaling(PRESSURE, 4 * FS, 1 / PRESSURE, **{"every": 1, "rng": 3, **kwargs}),
     }
 
 
@@ -54,7 +54,7 @@ def gas():
 
 def test_volumes_of_a_rigid_ideal_gas():
     atoms, held = gas()
-    dyn = MADE["isokinetic"](atoms, barostat=barostats(seed=4)["rescaling"])
+    dyn = MADE["isokinetic"](atoms, barostat=barostats(rng=4)["rescaling"])
     volumes = follow(dyn, atoms.get_volume, 400)[50:]
     exact = stats.gamma(N + 1, scale=KT / PRESSURE)
     assert p_value(volumes, exact) > 0.01
@@ -150,7 +150,7 @@ def test_trials_are_judged_by_the_energy_that_forces_belong_to():
     """They went by the energy that is extrapolated to cold electrons."""
     atoms, _ = gas()
     atoms.calc = WarmElectrons()
-    dyn = MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, every=1, width=0.01, seed=1))
+    dyn = MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, every=1, width=0.01, rng=1))
     volumes = follow(dyn, atoms.get_volume, 100)
     assert 0 < np.abs(volumes / SIDE**3 - 1).max() < 0.06
 

@@ -125,6 +125,18 @@ MUTANTS = {
             "test_nearest_point.py::test_the_nearest_point_is_found_where_the_surface_is_much_bent",
         ),
     ],
+    "motion/restoring/moved_groups.py": [
+        (
+            "«self._follow_fixed(y)→pass»",
+            "test_moved_groups.py::test_fixed_atoms_that_go_elsewhere_take_their_molecule_along",
+        ),
+    ],
+    "motion/restoring/kept_geometry.py": [
+        (
+            "if not «self._follows(x, entry[1])→False»]",
+            "test_moved_groups.py::test_bonds_and_angles_that_rows_hold_may_change_as_the_rows_ask",
+        ),
+    ],
     "constraints/internal.py": [
         (
             "hb = «→-»(hx * gx + hy * gy + hz * gz) / (b2 * size)",

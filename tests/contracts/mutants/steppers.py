@@ -99,10 +99,10 @@ MUTANTS = {
             "test_hamiltonian_monte_carlo.py::test_atoms_at_rest_stay_and_planes_keep_their_momentum",
         ),
     ],
-    "thermostats/monte_carlo/reversed_steps.py": [
+    "steppers/reversibility_check.py": [
         (
             "if not residual <«= self.tolerance→ 1e300»:",
-            "test_reversed_steps.py::test_what_cannot_be_taken_back_is_seen",
+            "test_hamiltonian_monte_carlo.py::test_what_cannot_be_taken_back_is_seen",
         ),
     ],
     "thermostats/monte_carlo/replica_exchange.py": [
@@ -187,16 +187,20 @@ MUTANTS = {
     ],
     "thermostats/correlated_series.py": [
         (
-            "        more = «np.expm1(log_r)→0.0 * log_r»",
+            "own = rule @ rule + «np.expm1(_LOG_R)→0.0 * _LOG_R» *",
             "test_correlated_series.py::test_errors_are_as_large_as_they_say[memory-3]",
         ),
         (
-            "«_ALIKE * →»float(blocks @ blocks)",
+            "<= «_SMOOTH * →»squares.sum()",
             "test_correlated_series.py::test_errors_are_as_large_as_they_say[smooth]",
         ),
         (
             "for turn in (0.0,« *_OSCILLATORS→»):",
             "test_correlated_series.py::test_errors_are_as_large_as_they_say[underdamped]",
+        ),
+        (
+            "max(«2 * len(values) // 3→len(values)», _FEWEST_COSINES)",
+            "test_correlated_series.py::test_errors_are_as_large_as_they_say[up-and-down]",
         ),
         ("if «carriers < FEW_INDEPENDENT→False» else", "test_correlated_series.py::test_heavy_tails_are_said"),
     ],

@@ -282,7 +282,7 @@ def test_bad_input(tmp_path):
             made(tmp_path, out="never", how={"workers": wrong})
     with pytest.raises(InputError, match="count is 4; give a whole number, 5 or more"):
         windows.pull(0, 1, 4)
-    for more in ({"approach": [1.0, 2.0]}, {"approach": np.nan}, {"approach": "x"}, {"seed": None}):
+    for more in ({"approach": [1.0, 2.0]}, {"approach": np.nan}, {"approach": "x"}, {"rng": "x"}):
         with pytest.raises(InputError, match=next(iter(more))):
             made(tmp_path, out="never", how=more)
     assert not (tmp_path / "never").exists()

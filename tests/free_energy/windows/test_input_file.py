@@ -40,7 +40,7 @@ temperature = 310
 timestep = 0.5
 thermostat = "nose-hoover"
 both_sides = false
-seed = 4
+rng = 4
 
 [improve]
 error = 0.5
@@ -70,7 +70,7 @@ def test_an_input_for_ase(folder):
     assert found.settings.temperature == 310 and found.settings.thermostat == "nose-hoover"
     assert found.settings.production == 20000
     np.testing.assert_allclose(found.targets[:, 0], np.radians(np.arange(-180, 180, 30)))
-    assert found.options == {"both_sides": False, "seed": 4} and found.improve == {
+    assert found.options == {"both_sides": False, "rng": 4} and found.improve == {
         "error": 0.5,
         "most": 20,
         "below": 40,
@@ -132,12 +132,12 @@ def test_an_input_for_openmm(folder):
 
 
 def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
-    assert read(folder, INPUT.replace("seed = 4", "approach = 6")).options["approach"] == pytest.approx(np.radians(6))
+    assert read(folder, INPUT.replace("rng = 4", "approach = 6")).options["approach"] == pytest.approx(np.radians(6))
     more = INPUT.replace("[held]", "[[coordinate]]\ndistance = [1, 4]\nvalues = [2.0]\n[held]").replace(IMPROVE, "")
-    found = read(folder, more.replace("seed = 4", "approach = [6, 0.2]")).options["approach"]
+    found = read(folder, more.replace("rng = 4", "approach = [6, 0.2]")).options["approach"]
     assert found == pytest.approx([np.radians(6), 0.2])
     with pytest.raises(InputError, match="approach has 3 values; give one for each of turn, distance-1-4"):
-        read(folder, more.replace("seed = 4", "approach = [6, 0.2, 1]"))
+        read(folder, more.replace("rng = 4", "approach = [6, 0.2, 1]"))
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
             "there is no atom 0; atoms are counted from 1",
         ),
         ("sigma = 1.0", "sgima = 1.0", r"lj has no setting 'sgima' .did you mean 'sigma'"),
-        ("seed = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
+        ("rng = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
         ("processes = 3", "processes = 0", r"processes of \[workers\] is 0"),
         ("[workers]", "[pull]\ncount = 5\n[workers]", r"unknown key 'pull' .did you mean 'pulls'"),
         (

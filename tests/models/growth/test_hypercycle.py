@@ -322,7 +322,7 @@ def test_entropy_produced_inside_and_exchanged(law):
     [
         (lambda: Relaxation(0.0), "tau is 0"),
         (lambda: Relaxation(np.nan), "tau is nan"),
-        (lambda: Relaxation(1.0, -0.1), "budget .* not negative"),
+        (lambda: Relaxation(1.0, -0.1), "budget is -0.1; give a number of 0 or more"),
         (lambda: Relaxation(3.0, "all"), "budget is 'all'"),
         (lambda: EntropyRow(3, Relaxation(1.0)), "mixture is 3"),
         (lambda: EntropyRow(Mixture([0.1, 0.2]), 3.0), "law is 3.0"),

@@ -5,6 +5,7 @@ Bonds and angles are measured here from the molecules' own tables, apart from th
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +18,9 @@ from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, KconsError
 from kcons.motion import Motion
+from kcons.motion.restoring.kept_geometry import bonds_of
+from kcons.motion.restoring.rigid_pieces import MoleculeGraph
+from kcons.topology.guessed_bonds import bonds_without_elements
 
 #: What may change: angstrom, degrees.
 BOND, ANGLE = 0.02, 2.0
@@ -338,3 +342,96 @@ def test_tangled_starts_end_soon_and_never_silently_off(monkeypatch: pytest.Monk
 
 
 # -- pieces and bonds -----------------------------------------------------------------------------------
+
+
+def test_fixed_atoms_that_go_elsewhere_take_their_molecule_along() -> None:
+    """Shifted by many times its size, and turned."""
+    atoms = molecule("trans-butane")
+    x = atoms.positions
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    for some in ([0], [0, 1], [0, 1, 2]):
+        places = x[some] @ turn + [30.0, 0.0, 0.0]
+        found = engine(atoms, [held.FixedAtoms(some, places)]).restore_positions(x, bonds=bond_table(atoms))
+        assert np.array_equal(found[some], places)
+        lengths = [np.linalg.norm(y[:, None] - y, axis=2) for y in (found, x)]
+        np.testing.assert_allclose(*lengths, rtol=0, atol=1e-9)
+
+
+def test_bonds_and_angles_that_rows_hold_may_change_as_the_rows_ask() -> None:
+    """No row names most bonds of a flat ring that three distances and linear relations hold rigid."""
+    atoms = molecule("C6H6")
+    flat = atoms.positions
+    bases, tied = [0, 2, 4], [1, 3, 5, 6, 7, 8, 9, 10, 11]
+    corners = np.vstack([flat[bases].T, np.ones(3)])
+    weights = [np.linalg.lstsq(corners, np.append(flat[k], 1.0), rcond=None)[0] for k in tied]
+    rows = [held.Distance([[0, 2], [2, 4], [0, 4]]), held.LinearRelation(tied, bases, weights)]
+    motion = engine(atoms, rows)
+    rough = flat + 0.1 * np.random.default_rng(0).normal(size=flat.shape)
+    found = motion.restore_positions(rough, bonds=bond_table(atoms))
+    kept(atoms, found)
+
+
+# -- bonds as they are given or found -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["CH3CH2OH", "C6H6", "PH3", "NF3", "CH2SCH2", "Si2H6", "CH3SH", "C2Cl4", "H2CCO"])
+@pytest.mark.parametrize("unit", [1.0, 0.1, 1.8897])
+def test_bonds_by_distances_alone_are_those_by_elements(name: str, unit: float) -> None:
+    atoms = molecule(name)
+    every = np.arange(len(atoms))
+    found = bonds_without_elements(unit * atoms.positions, None, every, every >= 0)
+    assert [tuple(b) for b in found.tolist()] == sorted(bond_table(atoms))
+
+
+def test_bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored() -> None:
+    """With the nearest neighbors as they are stored, 60 cells away, images of the whole cell took 24 GB."""
+    atoms = molecule("CH3CH2OH")
+    every = np.arange(len(atoms))
+    cell = np.array([[7.0, 0, 0], [1.0, 6.5, 0], [-0.8, 1.0, 7.5]])
+    lattice = np.stack([cell, np.linalg.inv(cell)])
+    shifts = np.random.default_rng(2).integers(-60, 61, (len(atoms), 3)) @ cell
+    tracemalloc.start()
+    found = bonds_without_elements(atoms.positions + shifts, lattice, every, every >= 0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert [tuple(b) for b in found.tolist()] == sorted(bond_table(atoms))
+    assert peak < 5e5  # 0.1 MB; with atoms as they are stored 1.7, without the bound of a cell vector 24 GB
+    # Two atoms in a flat cell: nothing is nearer than images of the atom itself.
+    flat = np.diag([1.0, 90.0, 90.0])
+    two = np.array([[0.0, 0, 0], [0.2, 44.0, 44.0]])
+    assert len(bonds_without_elements(two, np.stack([flat, np.linalg.inv(flat)]), every[:2], every[:2] >= 0)) == 0
+
+
+def test_no_bonds_are_guessed_where_there_are_no_molecules() -> None:
+    every = np.arange(60)
+    scattered = np.random.default_rng(0).uniform(0, 4, (60, 3))
+    cubic = np.stack(np.meshgrid(*3 * [np.arange(5.0)]), axis=-1).reshape(-1, 3)
+    faces = cubic[cubic.sum(axis=1) % 2 == 0][:60]
+    for x in (scattered, 3.8 * faces):
+        assert len(bonds_without_elements(x, None, every, every >= 0)) == 0
+
+
+def test_held_distances_that_are_no_bonds() -> None:
+    """The third side of water, and the ends of a chain."""
+    atoms = molecule("H2O")
+    motion = engine(atoms, [held.Distance([[0, 1], [0, 2], [1, 2]])])
+    assert bonds_of(motion.constraint_set, atoms.positions, 0.0, None).tolist() == [[0, 1], [0, 2]]
+    chain = molecule("trans-butane")
+    carbons = np.flatnonzero(chain.numbers == 6)
+    ends = max(combinations(carbons.tolist(), 2), key=lambda pair: chain.get_distance(*pair))
+    motion = engine(chain, [held.Distance([ends])])
+    found = bonds_of(motion.constraint_set, chain.positions, 0.0, None)
+    assert [tuple(b) for b in found.tolist()] == sorted(bond_table(chain))
+
+
+def test_pieces_of_a_ring_with_tails() -> None:
+    """0-1-2-3 is a ring, 3-4-5 a tail, 6-7 another molecule, 8 alone and not asked for."""
+    bonds = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (3, 4), (4, 5), (6, 7)])
+    pieces = MoleculeGraph(9, bonds, np.array([0, 6]))
+    for j, k, beyond in [(3, 4, {4, 5}), (4, 3, {0, 1, 2, 3}), (4, 5, {5}), (5, 4, {0, 1, 2, 3, 4}), (7, 6, {6})]:
+        found = pieces.beyond(j, k)
+        assert found is not None and set(found.tolist()) == beyond
+    assert pieces.beyond(0, 1) is None and pieces.beyond(0, 5) is None
+    assert set(pieces.molecule(5).tolist()) == {0, 1, 2, 3, 4, 5}
+    assert set(pieces.atoms.tolist()) == set(range(8))

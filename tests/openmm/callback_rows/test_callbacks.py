@@ -347,9 +347,3 @@ def test_gpus_must_carry_positions_of_more_than_single_numbers():
 def test_a_system_without_rows_is_said_so():
     with pytest.raises(InputError, match="no sets of rows"):
         CarriedConstraints.of(free([1.0]))
-
-
-def test_the_program_says_what_it_does():
-    listing = peptide()[1].listing()
-    for words in ("solve for positions", "solve for velocities", "positions whose gradients are taken"):
-        assert f"carried rows: {words}" in listing

@@ -49,14 +49,6 @@ def own_bonds(integrator):
     return context_of(system, integrator)
 
 
-def test_same_trajectory_as_openmm_with_its_own_constraints():
-    _, integrator, context = peptide(rows=False)
-    own = own_bonds(ProjectedIntegrator(0.001, tolerance=1e-12))
-    started(own, *state_of(context)).getIntegrator().step(100)
-    integrator.step(100)
-    assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
-
-
 def test_leapfrog_is_verlet_of_openmm():
     part, integrator, context = peptide(rows=False, scheme="leapfrog")
     verlet = openmm.VerletIntegrator(0.001)
@@ -69,42 +61,6 @@ def test_leapfrog_is_verlet_of_openmm():
         integrator.setStepSize(0.1 * unit.picosecond)
         integrator.step(1)
     assert part.step_multipliers.shape == (21,)
-
-
-@pytest.mark.parametrize(("steps", "bound"), [(100, 1e-12), (4000, 1e-9)])
-def test_one_bond_runs_as_openmms_own(steps, bound):
-    x = np.array([[-0.5, 0, 0], [0.5, 0, 0]])
-    v = np.array([[0.1, -0.5, 0.2], [0.1, 0.5, 0.1]])
-    part = hold(system := free([1.0, 3.0], pull(3.0, 1)), Distance([[0, 1]], 1.0), x)
-    built_in = free([1.0, 3.0], pull(3.0, 1))
-    built_in.addConstraint(0, 1, 1.0)
-    ends = []
-    for one, options in ((system, {"parts": [part]}), (built_in, {"tolerance": 1e-15})):
-        context = started(context_of(one, integrator := ProjectedIntegrator(0.002, **options)), x, v)
-        integrator.step(steps)
-        ends.append(state_of(context)[0])
-    assert np.abs(ends[0] - ends[1]).max() <= bound
-
-
-@pytest.mark.parametrize(
-    ("rows", "masses", "x", "v"),
-    [
-        (Sphere([[0]], [0.1, 0, 0], 0.5), [3.0], [[0.6, 0, 0]], [[0, 1.0, 0]]),
-        (Distance([[0, 1]]), [1.0, 1.0], [[0.6, 0, 0], [-0.4, 0, 0]], [[0, 1.0, 0], [0, -1.0, 0]]),
-    ],
-    ids=["great circle", "dumbbell"],
-)
-def test_free_bodies_turn_by_asin(rows, masses, x, v):
-    """RATTLE turns a radius by asin(w dt) a step, here with w = 2."""
-    dt, steps = 0.01, 200
-    part = hold(system := free(masses), rows, x)
-    context = started(context_of(system, ProjectedIntegrator(dt, parts=[part])), x, v)
-    part.check(context)
-    context.getIntegrator().step(steps)
-    angle = steps * np.arcsin(2.0 * dt)
-    x, v = state_of(context)
-    assert np.abs(x[0] - [0.1 + 0.5 * np.cos(angle), 0.5 * np.sin(angle), 0]).max() <= 1e-12
-    assert np.abs(v[0] - [-np.sin(angle), np.cos(angle), 0]).max() <= 1e-12
 
 
 @pytest.mark.parametrize("calls", [[40], [1, 2, 3]])

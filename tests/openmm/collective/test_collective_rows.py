@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
-import pickle
 
 import numpy as np
 import openmm
@@ -14,7 +12,6 @@ from collective_cases import (
     CHAIN,
     FORCES,
     MASSES,
-    angle,
     bond,
     chain_system,
     context_of,
@@ -41,7 +38,7 @@ from kcons.errors import (
 from kcons.motion import Motion
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.collective.coordinates import Row, each_term
+from kcons.openmm.collective.coordinates import Row, forces_by_term
 from kcons.steppers import System, run
 
 # -- held to rounding -----------------------------------------------------------------------------------
@@ -65,20 +62,6 @@ def test_rows_hold_in_positions_and_velocities(kind, constrained, platform):
 
 
 # -- the same trajectories as other solvers -------------------------------------------------------------
-
-
-def test_a_bond_as_row_moves_like_a_constraint_of_the_system():
-    d = float(np.linalg.norm(CHAIN[0] - CHAIN[3]))
-    builtin = chain_system()
-    builtin.addConstraint(0, 3, d)
-    reference = ProjectedIntegrator(0.002, tolerance=1e-14)
-    first = context_of(builtin, reference, CHAIN, some_velocities())
-    first.applyVelocityConstraints(1e-14)
-    context, integrator, _ = held_chain([bond(0, 3)])
-    context.setVelocities(first.getState(velocities=True).getVelocities())
-    reference.step(100)
-    integrator.step(100)
-    assert np.abs(state_of(context)[0] - state_of(first)[0]).max() < 1e-12
 
 
 CORE = {
@@ -186,7 +169,7 @@ def terms():
     several = openmm.CustomBondForce("r")
     for pair in ((0, 3), (1, 4), (2, 5)):
         several.addBond(*pair)
-    return [*each_term(several), each_term(with_variable("a+b", a=bond(0, 3), b=dihedral(0, 1, 2, 3)))[1]]
+    return [*forces_by_term(several), forces_by_term(with_variable("a+b", a=bond(0, 3), b=dihedral(0, 1, 2, 3)))[1]]
 
 
 @pytest.mark.parametrize(
@@ -233,45 +216,6 @@ def test_two_parts_of_rows_in_one_integrator():
 
 
 # -- as part of an integrator and its System ----------------------------------------------------------------
-
-
-def test_copies_and_pickles_go_on_alike():
-    rows = [Row(bond(0, 3), None, rate=0.2), angle(2, 3, 4)]
-    context, integrator, part = held_chain(rows, constrained=True)
-    integrator.step(20)
-    x, v = state_of(context)
-    ends = [state_of(context)]
-    for other in (copy.deepcopy(integrator), pickle.loads(pickle.dumps(integrator))):
-        again = context_of(context.getSystem(), other, x, v)
-        assert other.parts[0].targets(again) == pytest.approx(part.targets(context), abs=1e-14)
-        other.step(20)
-        ends.append(state_of(again))
-    integrator.step(20)
-    ends[0] = state_of(context)
-    for end in ends[1:]:
-        assert np.abs(end[0] - ends[0][0]).max() <= 1e-12
-
-
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_checkpoints_go_on_alike(platform):
-    context, integrator, _ = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True, platform=platform)
-    integrator.step(10)
-    saved = context.createCheckpoint()
-    integrator.step(10)
-    first = state_of(context)
-    context.loadCheckpoint(saved)
-    integrator.step(10)
-    again = state_of(context)
-    assert np.array_equal(first[0], again[0])
-    assert np.array_equal(first[1], again[1])
-
-
-def test_degrees_of_freedom_and_force_groups():
-    context, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True)
-    assert integrator.degrees_of_freedom(context) == 18 - 2 - 2
-    assert set(part.groups) == {1, 2}
-    groups = integrator.getIntegrationForceGroups()
-    assert {g for g in range(32) if groups >> g & 1} == set(range(32)) - {1, 2}
 
 
 def _pressed(system):

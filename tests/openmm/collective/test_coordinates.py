@@ -23,7 +23,7 @@ from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula, VelocityFormula
 from kcons.constraints.functions.expressions import FUNCTIONS, parsed
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, each_term, hold
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, forces_by_term, hold
 from kcons.openmm.collective.coordinates import (
     as_constraint,
     expression,
@@ -159,7 +159,7 @@ def many(kind):
 def test_the_energies_of_the_terms_add_up(kind):
     force = many(kind)
     whole = found_values(particles(), [[force]], X)
-    parts = found_values(particles(), [[term] for term in each_term(force)], X)
+    parts = found_values(particles(), [[term] for term in forces_by_term(force)], X)
     assert len(parts) == 2
     assert parts.sum() == pytest.approx(whole[0], rel=1e-14)
     assert np.all(parts != 0.0)
@@ -171,12 +171,12 @@ def test_terms_keep_their_parameters():
     force.setUsesPeriodicBoundaryConditions(True)
     force.addBond(0, 1, [2.0])
     force.addBond(2, 3, [3.0])
-    terms = each_term(force)
+    terms = forces_by_term(force)
     assert [term.getBondParameters(0) for term in terms] == [[0, 1, (2.0,)], [2, 3, (3.0,)]]
     assert all(term.usesPeriodicBoundaryConditions() and term.getNumBonds() == 1 for term in terms)
     assert force.getNumBonds() == 2
     with pytest.raises(UnsupportedError, match="no terms"):
-        each_term(openmm.RGForce([0, 1]))
+        forces_by_term(openmm.RGForce([0, 1]))
 
 
 def test_atoms_of_each_kind():

@@ -338,7 +338,7 @@ def test_frequency_or_relaxation_time():
             NoseHoover(*arguments)
     for options, match in (
         ({"length": 0}, "length is 0"),
-        ({"chain_order": 3}, "give 2, 4 or 6"),
+        ({"chain_order": 3}, "choose 2, 4 or 6"),
         ({"repeats": 0}, "repeats is 0"),
         ({"momentum": "maybe"}, "momentum"),
     ):

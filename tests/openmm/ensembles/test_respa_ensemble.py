@@ -101,29 +101,6 @@ def test_constraints_are_held_and_a_seed_repeats(platform):
     assert np.abs(ends[0][0] - x).max() > 1e-3
 
 
-def test_velocities_have_the_temperature():
-    system, x = water_box()
-    system.getForces()[0].setForceGroup(0)
-    weak = openmm.CustomExternalForce("1e-3*x^2")
-    for k in range(0, 81, 3):
-        weak.addParticle(k)
-    weak.setForceGroup(1)
-    system.addForce(weak)
-    for force in system.getForces()[:1]:
-        for k in range(81):
-            force.setParticleParameters(k, 0.0, 0.3, 0.0)
-    integrator = ProjectedIntegrator(8e-3, ensemble=LangevinRespa(300, 200.0, TWO))
-    integrator.setRandomNumberSeed(11)
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 7)
-    values = []
-    for _ in range(200):
-        integrator.step(1)
-        values.append(integrator.computeSystemTemperature()._value)
-    assert abs(np.mean(values) - 300) <= 3.5 * 300 * np.sqrt(2 / 162 / 200)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

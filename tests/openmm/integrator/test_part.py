@@ -46,7 +46,7 @@ def test_what_a_part_does_not_have_writes_nothing():
         method(program)
     part.begin_run()
     assert program.lines == []
-    assert part.engine_at(None) is None
+    assert part.solver_at(None) is None
     assert not part.driven
     assert not part.steered
 

@@ -72,16 +72,6 @@ def test_leapfrog_with_virtual_sites_is_verlet_integrator(water_with_sites, plat
     assert ours.computeSystemTemperature() / temperature == pytest.approx(1, abs=0.01)
 
 
-def test_drude_particles_are_refused():
-    system, x, v = dumbbell()
-    system.addForce(openmm.DrudeForce())
-    integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x, v)
-    with pytest.raises(UnsupportedError, match=r"DrudeForce.*DrudeLangevinIntegrator"):
-        integrator.step(1)
-    del context
-
-
 def test_rows_of_a_system():
     """Triangles with two equal sides go to SETTLE, and only if nothing else holds their atoms."""
     system = openmm.System()

@@ -60,7 +60,8 @@ def test_degrees_of_freedom_are_counted_by_rank(make):
     [
         ("setVelocitiesToTemperature", {"temperature": -5}),
         ("setVelocitiesToTemperature", {"temperature": float("nan")}),
-        ("setVelocitiesToTemperature", {"temperature": 300, "seed": 2.7}),
+        ("setVelocitiesToTemperature", {"temperature": 300, "rng": 2.7}),
+        ("setVelocitiesToTemperature", {"temperature": 300, "rng": 2**31}),
         ("minimizeEnergy", {"tolerance": float("nan")}),
         ("minimizeEnergy", {"tolerance": -1}),
         ("minimizeEnergy", {"maxIterations": 2.5}),

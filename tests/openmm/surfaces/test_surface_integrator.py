@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import openmm
 import pytest
-from openmm import app, unit
+from openmm import unit
 from openmm_systems import PLATFORMS
 from surface_cases import (
     CENTER,
@@ -29,7 +29,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.landings import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 
 # -- what is refused --------------------------------------------------------------------------------
@@ -216,17 +216,6 @@ def test_constraint_forces(kind, compiled):
     assert integrator.degrees_of_freedom(context) == 6
 
 
-def test_centripetal_force():
-    system = system_of(potential="0", springs=0)
-    integrator = SurfaceIntegrator(0.01, surfaces=Sphere([1], [0, 0, 0], 2.0), system=system)
-    context = started(system, integrator, [[9, 9, 9], [2, 0, 0], [8, 8, 8]], [[1, 1, 1], [0, 3, 0], [0, 0, 0]])
-    forces = integrator.constraint_forces(context)
-    assert forces[1] == pytest.approx([-MASSES[1] * 9 / 2, 0, 0], abs=1e-13)
-    assert not forces[[0, 2]].any()
-    assert integrator.multipliers(context) == pytest.approx([-MASSES[1] * 9 / 2])
-    assert integrator.surface_atoms.tolist() == [1]
-
-
 # -- a citizen of OpenMM ----------------------------------------------------------------------------
 
 
@@ -261,35 +250,6 @@ def test_copies_and_pickles(kind):
         there = started(system, other, POSITIONS, VELOCITIES)
         other.step(20)
         assert np.array_equal(state_of(there)[0], state_of(context)[0])
-
-
-def test_in_a_simulation(tmp_path):
-    system = system_of()
-    integrator = SurfaceIntegrator(
-        2 * unit.femtoseconds, surfaces=Sphere([0, 1], CENTER), system=system, positions=POSITIONS
-    )
-    topology = app.Topology()
-    chain = topology.addChain()
-    for _ in range(3):
-        topology.addAtom("A", None, topology.addResidue("A", chain))
-    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    simulation.context.setPositions(POSITIONS)
-    integrator.setVelocitiesToTemperature(simulation.context, 300 * unit.kelvin, 7)
-    log = tmp_path / "log"
-    simulation.reporters.append(app.StateDataReporter(str(log), 5, step=True, temperature=True, totalEnergy=True))
-    simulation.step(20)
-    assert max(worst(integrator, simulation.context)) <= 1e-14
-    table = np.loadtxt(log, delimiter=",")
-    v = state_of(simulation.context)[1]
-    kinetic = 0.5 * MASSES @ (v**2).sum(axis=1)
-    assert table[-1, 2] == pytest.approx(2 * kinetic / (7 * 8.31446261815324e-3), rel=1e-9)
-
-
-def test_listing_tells_the_steps():
-    for kind, words in (("sphere", "a landing exists"), ("torus", "Newton step"), ("formula", "Newton's method")):
-        integrator, _ = on_surface(kind, "rattle", 0.01)
-        assert words in integrator.listing()
-        assert str(integrator).endswith(integrator.listing())
 
 
 def test_periodic_boxes_do_not_repeat_surfaces():

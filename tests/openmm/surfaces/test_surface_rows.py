@@ -32,26 +32,8 @@ from kcons.openmm import (
     NoseHooverMiddle,
     ProjectedIntegrator,
     SurfaceIntegrator,
-    hold,
     surface_parts,
 )
-
-
-@pytest.mark.parametrize("others", [False, True], ids=["all", "some"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_surfaces_move_as_rows_of_hold(kind, others):
-    """Whose landings are the engine's: by Newton's method, from the constraints that were given."""
-    atoms = [2, 0] if others else [0, 1, 2]
-    integrator, context = on_surface(kind, "rattle", 0.01, atoms=atoms)
-    rows = [item for part in integrator.surfaces for item in part.rows]
-    part = hold(system := system_of(), rows, POSITIONS)
-    other = context_of(system, ProjectedIntegrator(0.01, parts=[part]))
-    other.setPositions(POSITIONS)
-    other.setVelocities(state_of(context)[1])
-    for one in (context, other):
-        one._integrator.step(50)
-    assert np.abs(np.array(state_of(context)) - state_of(other)).max() <= 1e-11
-    assert max(worst(integrator, context)) <= 1e-13
 
 
 @pytest.mark.parametrize("kind", QUADRICS)
@@ -108,46 +90,6 @@ def test_a_step_without_landing_is_told_by_openmm_s_own_arithmetic_too():
         integrator.step(1)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_sphere_as_a_bond_of_openmm(compiled):
-    """The vector between two bonded particles moves on a sphere, with the reduced mass: VerletIntegrator's own bond."""
-    masses, length, dt = (12.0, 4.0), 0.3, 1e-3
-    reduced = 1 / (1 / masses[0] + 1 / masses[1])
-    r, u = np.array([length, 0, 0]), np.array([0, 1.5, -0.7])
-
-    pair = openmm.System()
-    for m in masses:
-        pair.addParticle(m)
-    pair.addConstraint(0, 1, length)
-    between = openmm.CustomCompoundBondForce(2, "120*(z2-z1)+300*(x2-x1)*(y2-y1)")
-    between.addBond([0, 1], [])
-    pair.addForce(between)
-    theirs = openmm.VerletIntegrator(dt)
-    theirs.setConstraintTolerance(1e-15)
-    bonded = context_of(pair, theirs)
-    share = np.array([-masses[1], masses[0]])[:, None] / sum(masses)
-    bonded.setPositions(share * r)
-    force = np.array(bonded.getState(forces=True).getForces(asNumpy=True)._value)
-    bonded.setVelocities(share * u - 0.5 * dt * force / np.array(masses)[:, None])
-
-    single = openmm.System()
-    single.addParticle(reduced)
-    field = openmm.CustomExternalForce("120*z+300*x*y")
-    field.addParticle(0)
-    single.addForce(field)
-    sphere = Sphere([0], [0, 0, 0], length)
-    ours = SurfaceIntegrator(dt, surfaces=sphere, system=single, compiled=compiled)
-    context = context_of(single, ours)
-    context.setPositions([r])
-    context.setVelocities([u])
-    for steps, limit in ((100, 1e-12), (3900, 1e-9)):
-        ours.step(steps)
-        theirs.step(steps)
-        both = bonded.getState(positions=True).getPositions(asNumpy=True)._value
-        x = state_of(context)[0][0]
-        assert np.abs(x - (both[1] - both[0])).max() <= limit
-
-
 def test_copies_of_a_system_make_steps_in_threads():
     """Each drift begins where the particles of its own Context are."""
     n = 20
@@ -196,16 +138,6 @@ def test_refused_parameters_of_a_formula():
     for values in ([1.0, 2.0], np.nan):
         with pytest.raises(InputError, match="one finite number"):
             ExpressionSurface([0], "x-a", {"a": values})
-
-
-def test_no_force_groups_left():
-    system = system_of()
-    for group in range(32):
-        force = openmm.CustomExternalForce("0")
-        force.setForceGroup(group)
-        system.addForce(force)
-    with pytest.raises(UnsupportedError, match="force groups"):
-        SurfaceIntegrator(0.001, surfaces=ExpressionSurface([0], "x"), system=system)
 
 
 def test_leaves_room_for_the_groups_of_the_user():

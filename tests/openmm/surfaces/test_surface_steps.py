@@ -21,7 +21,7 @@ from surface_cases import (
 
 from kcons.constraints import Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm.integrator.schemes import SCHEMES
-from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.landings import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
 
 
@@ -50,15 +50,6 @@ def test_the_steps_are_those_of_the_core(kind, scheme, steps):
     x_core, v_core = core_run(kind, SCHEMES[scheme](), 0.04, steps, atoms=(0, 2))
     assert np.abs(x - x_core).max() <= 1e-12
     assert np.abs(v - v_core).max() <= 1e-12
-
-
-def test_several_steps_at_once_are_the_same_as_one_by_one():
-    together, alone = (on_surface("sphere", "rattle", 0.02) for _ in range(2))
-    together[0].step(40)
-    for _ in range(40):
-        alone[0].step(1)
-    for a, b in zip(state_of(together[1]), state_of(alone[1]), strict=True):
-        assert np.abs(a - b).max() <= 1e-14
 
 
 # -- reference solutions ----------------------------------------------------------------------------
@@ -202,35 +193,6 @@ def test_energy_has_no_slope(kind):
     assert spread <= 1e-3
     # Consistent with none: the error of a slope fitted to numbers that scatter like this.
     assert abs(slope) <= 5 * spread / np.std(times) / np.sqrt(40)
-
-
-@pytest.mark.parametrize("platform", PLATFORMS)
-@pytest.mark.parametrize("compiled", [False, True])
-def test_lennard_jones_particles_on_one_sphere(platform, compiled):
-    n = 60
-    k = np.arange(n) + 0.5
-    height, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    directions = np.stack(
-        [np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height], axis=1
-    )
-    radius = np.sqrt(n * 0.42**2 / (4 * np.pi))
-    system, forces = openmm.System(), openmm.NonbondedForce()
-    for _ in range(n):
-        system.addParticle(39.948)
-        forces.addParticle(0, 0.34, 0.996)
-    system.addForce(forces)
-    center = np.array([1.0, 2.0, 3.0])
-    sphere = Sphere(np.arange(n), center, radius)
-    integrator = SurfaceIntegrator(0.005, surfaces=sphere, system=system, compiled=compiled)
-    context = started(
-        system, integrator, center + radius * directions, np.random.default_rng(5).normal(size=(n, 3)) * 0.15, platform
-    )
-    before = energy_of(context, integrator)
-    integrator.step(500)
-    assert max(worst(integrator, context)) <= 1e-14
-    kinetic = context.getState(energy=True).getKineticEnergy()._value
-    assert abs(energy_of(context, integrator) - before) <= 2e-3 * kinetic
-    assert integrator.degrees_of_freedom(context) == 2 * n
 
 
 # -- company ----------------------------------------------------------------------------------------

@@ -15,14 +15,14 @@ from kcons.solvers.kernels.array_views import (
     lattice_piece,
     none_of,
     octets,
-    piece,
+    table_array,
 )
 from kcons.solvers.kernels.two_and_four_wide import load_double, store_double
 
 
 @njit
 def write(room, header, k, value):
-    part = piece(room, header, k)
+    part = table_array(room, header, k)
     part[:] = value
     return len(part)
 

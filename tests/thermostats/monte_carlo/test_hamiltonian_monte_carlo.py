@@ -15,11 +15,22 @@ from scipy.stats import kstest
 from thermostat_systems import dumbbells, system, waves, waves_potential
 
 from kcons.constraints import Distance, FixedAtoms, Formula, MovingTarget, Plane
-from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, ReversibilityCheck, State, Suzuki4, System, run
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, ReversibilityError, UnsupportedError
+from kcons.steppers import (
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Geodesic,
+    Rattle,
+    ReversibilityCheck,
+    State,
+    Suzuki4,
+    System,
+    run,
+)
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.freedom import MARK
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import CHANGE, POTENTIAL, PROPOSAL, stream
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import CHANGE, POTENTIAL, PROPOSAL, ReversedSteps, stream
 from kcons.thermostats.monte_carlo.replica_exchange import potential_of
 
 
@@ -278,13 +289,60 @@ def test_a_potential_is_one_number(value):
     assert caught.value.item == "potential"
 
 
-def test_a_step_of_zero_stands_still():
-    held, state = started()
-    after = HamiltonianMonteCarlo(0.5, 3, 1).step(held, state, 0.0)
-    assert np.array_equal(after.positions, state.positions) and after.step == 1
-
-
 def test_it_says_what_it_is():
     assert HamiltonianMonteCarlo(0.5, 10, 7, stepper=BlanesMoan4()).force_evaluations == 60
     empty = Counts.of(State(np.zeros((1, 3)), np.zeros((1, 3))))
     assert empty.proposals == 0 and np.isnan(empty.acceptance) and np.isnan(empty.mean_square)
+
+
+# -- steps that are taken back -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Geodesic(3), Suzuki4(), BlanesMoan4(), BlanesMoan6a()], ids=repr)
+def test_the_way_back_costs_no_force_and_the_step_is_the_stepper_s(stepper):
+    held, start = started()
+    calls = []
+    counted = System(held.motion, lambda x, t: (calls.append(1), held.force(x, t))[1], potential=held.potential)
+    state = counted.with_forces(start)
+    steps = ReversedSteps(counted, stepper, 1e-9)
+    for k in range(1, 4):
+        calls.clear()
+        state = steps.step(counted, state, 0.1)
+        # A stepper that ends with a drift does not know the forces at its end.
+        assert len(calls) == stepper.force_evaluations, k
+    plain = run(held, start, 0.1, 3, stepper=stepper)
+    assert np.array_equal(plain.positions, state.positions) and np.array_equal(plain.velocities, state.velocities)
+
+
+def test_forces_that_differ_on_the_way_back_are_not_remembered():
+    """Where the way back leads elsewhere, the force is asked for there."""
+    held, state = trimer(trap, trap_potential)
+    steps = ReversedSteps(held, Rattle(), 1e-9)
+    steps._known = [(state.positions, np.ones((3, 3)))]
+    steps._back, steps._near = True, 1e-9
+    assert np.array_equal(steps._force(state.positions + 1e-10, 0.0), np.ones((3, 3)))
+    assert np.array_equal(steps._force(state.positions + 1e-8, 0.0), trap(state.positions + 1e-8))
+
+
+class Skewed(Rattle):
+    """A step that is not undone by the step back."""
+
+    def step(self, system, state, dt):
+        after = super().step(system, state, dt)
+        return State(after.positions, after.velocities + 1e-6, after.time, after.forces, after.step)
+
+
+class Stuck(Rattle):
+    """A step that has no way back."""
+
+    def step(self, system, state, dt):
+        if dt < 0:
+            raise ConvergenceError("no solution")
+        return super().step(system, state, dt)
+
+
+@pytest.mark.parametrize(("stepper", "words"), [(Skewed(), "misses its start by"), (Stuck(), "cannot be taken back")])
+def test_what_cannot_be_taken_back_is_seen(stepper, words):
+    held, state = started()
+    with pytest.raises(ReversibilityError, match=words):
+        ReversedSteps(held, stepper, 1e-9).step(held, state, 0.05)

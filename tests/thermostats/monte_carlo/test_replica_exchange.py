@@ -96,10 +96,3 @@ def test_states_of_other_systems(other):
     again = run(same, start, 0.3, 1, stepper=HamiltonianMonteCarlo(0.45, 3, 1, keep=0.2))
     after, _ = exchange([states[0], again, states[2]], LADDER, 1, 0)
     assert np.isfinite(run(held, after[0], 0.3, 1, stepper=HamiltonianMonteCarlo(0.3, 3, 0, keep=0.2)).positions).all()
-
-
-def test_what_are_no_states_or_temperatures():
-    _, states = ladder()
-    for given in ((states, 0.3), (None, LADDER), ([None] * 3, LADDER)):
-        with pytest.raises(InputError, match="state"):
-            exchange(*given, 5, 0)

@@ -9,9 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Turn, drifts_of
-from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, middle_of, nested
+from kcons.thermostats.multistep.nesting import Level, levels_of, nested
 
 THREE = levels_of({"fast": 12, "slow": 1, "medium": 4})
 
@@ -52,7 +51,11 @@ def test_every_group_kicks_and_every_drift_flies_for_the_whole_step(order, turns
     assert shares(done, push) == pytest.approx({"slow": 1, "medium": 1, "fast": 1}, rel=1e-14)
     assert shares(done, Fly)[""] == pytest.approx(1, rel=1e-14)
     assert shares(done, Exchange)[""] == pytest.approx(1, rel=1e-14)
-    assert evaluations(done) == {"slow": 1, "medium": 4, "fast": 12 * (1 if order == 2 else 6)}
+    assert Counter(o.group for o in done if isinstance(o, Evaluate)) == {
+        "slow": 1,
+        "medium": 4,
+        "fast": 12 * (1 if order == 2 else 6),
+    }
     ends = [o.ends[-1] for o in done if isinstance(o, Fly)]
     assert ends[-1] == 1.0 and math.fsum(o.fraction for o in done if isinstance(o, Fly)) == pytest.approx(1)
 
@@ -69,19 +72,6 @@ def test_slow_kicks_in_the_middle(turns):
     assert middle == (*inner[:half], Evaluate("slow"), push(1.0, "slow"), *inner[half:], *tail)
 
 
-@pytest.mark.parametrize(
-    ("steps", "where", "words"),
-    [
-        ({"slow": 1, "fast": 4}, "start", "slow_kicks is 'start'; choose 'ends' or 'middle'"),
-        ({"slow": 1, "fast": 3}, "middle", "takes 3 steps, between which there is no middle"),
-        (None, "middle", "all forces are one group"),
-    ],
-)
-def test_places_of_slow_kicks_that_cannot_be(steps, where, words):
-    with pytest.raises(InputError, match=words):
-        middle_of(levels_of(steps), where)
-
-
 @pytest.mark.parametrize("order", [2, 4])
 def test_a_step_is_its_own_mirror_image(order):
     """But for evaluations, which go before the kicks that use them."""
@@ -95,26 +85,6 @@ def test_on_spheres_velocities_are_projected_after_each_drift():
     done = nested(THREE, 2, (1.0,), turns=True)
     assert all(isinstance(b, Project) for a, b in pairwise(done) if isinstance(a, Fly))
     assert not any(isinstance(o, Kick) for o in done)
-
-
-@pytest.mark.parametrize(
-    ("steps", "words"),
-    [
-        ({}, "steps must name each group"),
-        (4, "steps must name each group"),
-        ({"slow": 1, "fast": 0}, "'fast' takes 0 steps"),
-        ({"slow": 1, "fast": -2}, "'fast' takes -2 steps"),
-        ({"slow": 1, "fast": 2.5}, "'fast' takes 2.5 steps"),
-        ({"slow": 1, "fast": math.nan}, "'fast' takes nan steps"),
-        ({"slow": 1, "fast": True}, "'fast' takes True steps"),
-        ({"slow": 2, "fast": 4}, "'slow', the slowest, takes 2 steps"),
-        ({"slow": 1, "fast": 1}, "both take 1 steps"),
-        ({"slow": 1, "medium": 4, "fast": 6}, "the step of group 'fast' does not divide that of 'medium'"),
-    ],
-)
-def test_steps_that_cannot_be(steps, words):
-    with pytest.raises(InputError, match=words):
-        levels_of(steps)
 
 
 def spreads(angle, share, friction=0.05, count=10):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from thermostat_systems import dumbbells, molecules, quartic, springs, waves
 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget
-from kcons.steppers import State, System, run
+from kcons.steppers import System, run
 from kcons.thermostats import ForceGroups, IsokineticSpheres, Langevin, LangevinRespa
 from kcons.thermostats.langevin import MASSES, LangevinStep
 
@@ -87,33 +86,6 @@ def test_slow_kicks_in_the_middle_are_of_order_two_and_made_once():
     split.force.evaluations.update(fast=0, slow=0)
     assert run(split, state, 0.1, 3, stepper=stepper).forces is None
     assert split.force.evaluations == {"fast": 3 * 5, "slow": 3}
-
-
-@pytest.mark.parametrize("kind", [LangevinRespa, IsokineticSpheres])
-def test_a_run_goes_on_to_the_last_bit(kind):
-    """Also where forces at the same place differ in their last digits from one evaluation to the next."""
-    held, state = molecules("bent", 3, ions=1)
-    file = io.BytesIO()
-
-    def unsteady():
-        calls = []
-
-        def force(x, t):
-            calls.append(t)
-            return springs(x, t) * (1 + 1e-9 * math.sin(len(calls)))
-
-        return grouped(held.motion, fast=force, slow=gentle), calls
-
-    (whole, calls), (first, _), (second, again) = unsteady(), unsteady(), unsteady()
-    made = lambda: kind(0.5, 1.0, 3, steps=TWO)  # noqa: E731
-    end = run(whole, state, 0.1, 20, stepper=made())
-    half = run(first, state, 0.1, 10, stepper=made())
-    half.save(file)
-    file.seek(0)
-    again += calls[:41]  # as many as there have been
-    other = run(second, State.load(file), 0.1, 10, stepper=made())
-    for name in ("positions", "velocities", "forces", "thermostat"):
-        np.testing.assert_array_equal(getattr(end, name), getattr(other, name))
 
 
 def test_each_exchange_of_a_step_has_noise_of_its_own(monkeypatch):

@@ -9,7 +9,6 @@ import pytest
 from pressure_systems import METHANE, cells_of, gas, no_force, p_value, round_shape, started
 from scipy import stats
 
-from kcons.errors import InputError
 from kcons.thermostats import mean
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
@@ -23,7 +22,7 @@ def test_volumes_of_a_rigid_ideal_gas(tau):
     n, side = 100, 12.0
     system, x = gas(METHANE, n, side)
     pressure = (n + 1) / side**3
-    barostat = CellRescaling(pressure, tau, 1 / pressure, every=1, seed=2)
+    barostat = CellRescaling(pressure, tau, 1 / pressure, every=1, rng=2)
     state = started(system, x, barostat)
     volumes = np.linalg.det(cells_of(system, state, barostat, 1200))
     assert p_value(volumes, stats.gamma(n + 1, scale=1 / pressure)) > 0.01
@@ -90,8 +89,8 @@ class Turned:
 @pytest.mark.parametrize(
     "barostat",
     [
-        CellRescaling(0.06, 2.0, 16.0, every=1, seed=2, kind="anisotropic"),
-        MonteCarloBarostat(0.06, every=1, seed=2, kind="anisotropic", width=0.05),
+        CellRescaling(0.06, 2.0, 16.0, every=1, rng=2, kind="anisotropic"),
+        MonteCarloBarostat(0.06, every=1, rng=2, kind="anisotropic", width=0.05),
     ],
     ids=["rescaling", "Monte Carlo"],
 )
@@ -121,7 +120,7 @@ def test_volumes_of_other_kinds(kind):
     n, side = 100, 12.0
     system, x = gas(n=n, side=side, force=no_force, potential=round_shape, stress=round_stress)
     pressure = (n + 1) / side**3
-    barostat = CellRescaling(pressure, 8.0, 1 / pressure, every=1, seed=2, kind=kind)
+    barostat = CellRescaling(pressure, 8.0, 1 / pressure, every=1, rng=2, kind=kind)
     volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 1200))
     assert p_value(volumes, stats.gamma(n + 1, scale=1 / pressure)) > 0.01
 
@@ -132,7 +131,7 @@ def test_noise_of_few_pieces_stays_within_what_a_trial_may_change(kind):
     n, side = 3, 12.0
     system, x = gas(n=n, side=side, force=no_force, potential=round_shape, stress=round_stress)
     pressure = (n + 1) / side**3
-    barostat = CellRescaling(pressure, 0.05, 1 / pressure, every=1, seed=2, kind=kind)
+    barostat = CellRescaling(pressure, 0.05, 1 / pressure, every=1, rng=2, kind=kind)
     state = started(system, x, barostat)
     volumes = np.linalg.det(cells_of(system, state, barostat, 3000))
     found = mean(volumes)
@@ -145,15 +144,7 @@ def test_far_from_the_pressure_it_goes_there():
     n, side = 100, 20.0
     system, x = gas(n=n, side=side)
     pressure = 10 * n / side**3
-    barostat = CellRescaling(pressure, 20.0, 1 / pressure, every=1, seed=2)
+    barostat = CellRescaling(pressure, 20.0, 1 / pressure, every=1, rng=2)
     volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 300))
     assert volumes[-100:].mean() == pytest.approx((n + 1) / pressure, rel=0.1)
     assert volumes[10] > 0.3 * side**3
-
-
-def test_bad_input():
-    for bad in (0.0, -1.0, np.nan):
-        with pytest.raises(InputError, match="tau"):
-            CellRescaling(1.0, bad, 1.0)
-        with pytest.raises(InputError, match="compressibility"):
-            CellRescaling(1.0, 1.0, bad)

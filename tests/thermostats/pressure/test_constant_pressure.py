@@ -11,14 +11,14 @@ from scipy import stats
 from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import ProjectedVerlet, Rattle, State, Suzuki4, interpreter, run
+from kcons.steppers import Rattle, State, Suzuki4, interpreter, run
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, autocorrelation_time, thermal_velocities
 from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
 
 N, SIDE = 40, 12.0
 PRESSURE = (N + 1) / SIDE**3
 STEPPERS = {
-    "langevin": lambda: Langevin(1.0, 0.5, seed=2),
+    "langevin": lambda: Langevin(1.0, 0.5, rng=2),
     "nose-hoover": lambda: NoseHooverChain(1.0, period=3.0, momentum="free"),
     "isokinetic": lambda: Isokinetic(1.0, momentum="free"),
 }
@@ -64,7 +64,7 @@ def test_a_run_goes_on_bit_for_bit(name, barostat, tmp_path):
 
 def test_march_is_the_same_as_steps():
     system, state = begun()
-    stepper = ConstantPressure(Langevin(1.0, 0.5, seed=2), MonteCarloBarostat(PRESSURE, every=4, width=0.2))
+    stepper = ConstantPressure(Langevin(1.0, 0.5, rng=2), MonteCarloBarostat(PRESSURE, every=4, width=0.2))
     one = state = stepper.start(system, state)
     for _ in range(10):
         one = stepper.step(system, one, 0.05)
@@ -88,7 +88,7 @@ def test_listing():
     assert lines[0].startswith("a step of ConstantPressure(Langevin(")
     assert lines[-1].split()[0] == "press"
     assert "(anisotropic), every 25 steps" in lines[-1]
-    assert lines[1:-1] == Langevin(1.0, 0.5, seed=2).listing().splitlines()[1:]
+    assert lines[1:-1] == Langevin(1.0, 0.5, rng=2).listing().splitlines()[1:]
 
 
 def test_zero_and_negative_steps():
@@ -143,17 +143,7 @@ def swaying(x, t, h):
     return -np.sin(2 * np.pi * x @ np.linalg.inv(h))
 
 
-def test_a_second_run_from_one_state_is_the_first_again():
-    system, state = begun(force=swaying, potential=lambda x, t, h: 0.0)
-    first, second = (run(system, state, 0.05, 9, stepper=made("langevin", 3)) for _ in range(2))
-    assert np.array_equal(first.positions, second.positions)
-    assert np.array_equal(first.barostat, second.barostat)
-    assert not np.array_equal(first.cell, SIDE * np.eye(3))
-
-
-@pytest.mark.parametrize(
-    "stepper", [*(make() for make in STEPPERS.values()), Rattle(), Suzuki4(), ProjectedVerlet()], ids=repr
-)
+@pytest.mark.parametrize("stepper", [*(make() for make in STEPPERS.values()), Rattle(), Suzuki4()], ids=repr)
 def test_other_steppers_go_on_in_the_cell_of_the_state(stepper):
     """Which they keep, wherever the System has been since."""
     system, state = begun(force=swaying, potential=lambda x, t, h: 0.0)

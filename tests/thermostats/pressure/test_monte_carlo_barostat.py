@@ -26,7 +26,7 @@ def test_volumes_of_a_rigid_ideal_gas(shape):
     """V^N exp(-P V/kT): the N of molecules, whatever the number of their atoms and rows."""
     n, side = 100, 12.0
     system, x = gas(shape, n, side)
-    barostat = MonteCarloBarostat((n + 1) / side**3, seed=1, width=0.25)
+    barostat = MonteCarloBarostat((n + 1) / side**3, rng=1, width=0.25)
     volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 1200))
     exact = stats.gamma(n + 1, scale=side**3 / (n + 1))
     assert p_value(volumes, exact) > 0.01
@@ -42,7 +42,7 @@ def test_volumes_of_other_kinds(kind):
     """The volume is spread as in cells of one shape."""
     n, side = 100, 12.0
     system, x = gas(DUMBBELL, n, side, force=no_force, potential=round_shape)
-    barostat = MonteCarloBarostat((n + 1) / side**3, kind=kind, seed=1, width=0.09)
+    barostat = MonteCarloBarostat((n + 1) / side**3, kind=kind, rng=1, width=0.09)
     cells = cells_of(system, started(system, x, barostat), barostat, 1500)
     assert p_value(np.linalg.det(cells), stats.gamma(n + 1, scale=side**3 / (n + 1))) > 0.01
     lengths = cells[-1][np.tril_indices(3)]
@@ -59,7 +59,7 @@ def test_trials_of_few_pieces_end_at_what_a_trial_may_change():
     """Two pieces would be accepted in half of the trials with far wider ones; volumes are right all the same."""
     n, side = 2, 12.0
     system, x = gas(n=n, side=side)
-    barostat = MonteCarloBarostat((n + 1) / side**3, every=1, seed=1, width=1.0)
+    barostat = MonteCarloBarostat((n + 1) / side**3, every=1, rng=1, width=1.0)
     state = started(system, x, barostat)
     volumes = np.linalg.det(cells_of(system, state, barostat, 4000))
     assert np.abs(np.diff(np.log(volumes))).max() <= 0.27

@@ -1,0 +1,105 @@
+"""The projected equation of motion, integrated as an ordinary differential equation: for comparison, not for use.
+
+a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b (notes eq. 105, corrected) keeps A a = b, and so the constraints only as
+well as the integrator does: they drift, and with them the energy. Projecting positions and velocities after each step
+keeps the constraints and still leaves a drift of the energy, since the step is neither reversible nor symplectic.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, UnsupportedError
+from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.steppers.state import State, System
+from kcons.steppers.stepper import explained
+
+
+class ProjectedEquation:
+    """Velocity Verlet or the classical Runge-Kutta scheme on the projected equation of motion.
+
+    Parameters
+    ----------
+    order : {2, 4}
+        Verlet, with the velocity in b predicted, takes one force evaluation a step, Runge-Kutta four.
+    project : bool
+        Whether to project positions, along the gradients at the start, and velocities after each step.
+    """
+
+    reversible = False
+    symplectic = False
+
+    def __init__(self, order: int = 2, *, project: bool = False) -> None:
+        self.order, self.force_evaluations = order, {2: 1, 4: 4}[order]
+        self.holds = self.project = project
+
+    def __repr__(self) -> str:
+        return f"ProjectedEquation({self.order}{', project=True' if self.project else ''})"
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` for friction and forces that depend on the velocities."""
+        if system.friction is not None or system.velocity_dependent:
+            raise UnsupportedError(f"{self!r} is made for forces of positions alone; use Rattle")
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`; the constraints drift.
+
+        Raises
+        ------
+        ConvergenceError
+            With `project`, if no positions on the constraints are near enough; carries `step`.
+        NonFiniteError
+            The motion diverged; carries `step`.
+        """
+        number, (time, left_over) = state.step + 1, state.later(dt)
+        advance = self._verlet if self.order == 2 else self._runge_kutta
+        try:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                x, v, forces = advance(system, system.with_forces(state), dt, time)
+                if self.project:
+                    system.motion.project_velocities(x, v, time=time, out=v)
+        except ConvergenceError as error:
+            raise explained(error, system, state, dt, number) from error
+        check_finite(v, "velocity", number)
+        return State(x, v, time, forces, number, None, left_over, None, state.barostat)
+
+    def _verlet(
+        self, system: System, start: State, dt: float, time: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        motion, (x0, v0, f0), number = system.motion, system.kernel_arrays(start), start.step + 1
+        assert f0 is not None
+        a0 = motion.acceleration(x0, v0, f0, start.time)
+        half = v0 + (0.5 * dt) * a0
+        x = self._arrive(system, start, x0 + dt * half, time)
+        predicted = half + (0.5 * dt) * a0
+        f = system.forces(x, predicted, time, number)
+        return x, half + (0.5 * dt) * motion.acceleration(x, predicted, f, time), f
+
+    def _runge_kutta(
+        self, system: System, start: State, dt: float, time: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        x0, v0, f0 = system.kernel_arrays(start)
+        middle, number = start.time + 0.5 * dt, start.step + 1
+        assert f0 is not None
+
+        def slope(x: FloatArray, v: FloatArray, t: float) -> FloatArray:
+            check_finite(x, "position", number)
+            return system.motion.acceleration(x, v, system.forces(x, v, t, number), t)
+
+        a1 = system.motion.acceleration(x0, v0, f0, start.time)
+        x2, v2 = x0 + 0.5 * dt * v0, v0 + 0.5 * dt * a1
+        a2 = slope(x2, v2, middle)
+        x3, v3 = x0 + 0.5 * dt * v2, v0 + 0.5 * dt * a2
+        a3 = slope(x3, v3, middle)
+        x4, v4 = x0 + dt * v3, v0 + dt * a3
+        a4 = slope(x4, v4, time)
+        x = self._arrive(system, start, x0 + (dt / 6) * (v0 + 2 * v2 + 2 * v3 + v4), time)
+        return x, v0 + (dt / 6) * (a1 + 2 * a2 + 2 * a3 + a4), None
+
+    def _arrive(self, system: System, start: State, x: FloatArray, time: float) -> FloatArray:
+        """The new positions, with `project` on the constraints."""
+        check_finite(x, "position", start.step + 1)
+        if self.project:
+            system.motion.project_positions(x, start.positions, time=time, reference_time=start.time, out=x)
+        return x

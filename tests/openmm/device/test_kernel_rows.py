@@ -1,0 +1,322 @@
+"""Rows of an integrator on the device: trajectories beside those of the host, failures, places, multipliers."""
+
+from pathlib import Path
+
+import numpy as np
+import openmm as mm
+import pytest
+from openmm import app, unit
+from openmm_systems import GPUS, alanine, started
+
+from kcons import ConstraintSet, Motion, State, System
+from kcons.constraints import Angle, Custom, Dihedral, Distance, Formula, LinearRelation, Plane, Sphere
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.openmm import Langevin, ProjectedIntegrator, hold
+from kcons.openmm.device import build
+from kcons.steppers import Rattle
+
+pytestmark = pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
+ON_ALL = ["Reference", "CPU", *GPUS]
+MIXED = [each for each in GPUS if each.id.endswith(("mixed", "none"))]
+
+
+def field(n, rng, strength=20.0):
+    """A force on each particle that depends on its place."""
+    force = mm.CustomExternalForce("c*sin(3*x)+c*cos(4*y+z)")
+    force.addPerParticleParameter("c")
+    for k in range(n):
+        force.addParticle(k, [rng.normal() * strength])
+    return force
+
+
+def waters(n=9, held=True):
+    rng, system = np.random.default_rng(0), mm.System()
+    base = np.array([[0, 0, 0], [0.09572, 0, 0], [-0.0239987, 0.0926627, 0]])
+    x = []
+    for k in range(n):
+        for mass in (15.9994, 1.008, 1.008):
+            system.addParticle(mass)
+        x.append(base @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + 0.6 * np.array([k % 3, k // 3 % 3, k // 9]))
+        for i, j in ((0, 1), (0, 2), (1, 2)) if held else ():
+            system.addConstraint(3 * k + i, 3 * k + j, np.linalg.norm(base[i] - base[j]))
+    system.addForce(field(3 * n, rng))
+    return system, np.concatenate(x)
+
+
+def start(system, x, seed=1):
+    rng = np.random.default_rng(seed)
+    masses = np.array([system.getParticleMass(k)._value for k in range(len(x))])
+    return 0.4 * rng.normal(size=x.shape) * np.sqrt(2.494 / np.where(masses > 0, masses, np.inf))[:, None]
+
+
+def run(system, x, v, platform, steps, parts=(), device=True, **options):
+    """Positions after some steps, and the Context."""
+    integrator = ProjectedIntegrator(0.002, parts=parts, device=device, **options)
+    context = started(system, integrator, x, v, platform)
+    integrator.step(steps)
+    return np.array(context.getState(positions=True).getPositions(asNumpy=True)._value), context
+
+
+ROWS = [
+    Distance([[0, 3]]),
+    Angle([[0, 3, 10]]),
+    Dihedral([[9, 13, 16, 20]]),
+    Plane(21, [0, 0, 1.0]),
+    Sphere(24, [0.1, 0.2, 0.3]),
+    Formula("z1 - a*sin(k*x1)", 18, {"a": 0.1, "k": 2.0}, target=None),
+]
+#: Forces of OpenCL are multiples of 2^-32 and single numbers in mixed precision, which a trajectory of 40 steps shows.
+CLOSE = {"double": 3e-8, "mixed": 3e-7, "single": 2e-5}
+
+
+@pytest.fixture(scope="module")
+def carried():
+    """The same rows by callbacks of the host."""
+    system, x = waters()
+    part = hold(system, ROWS, x, take="all", keep_water=False)
+    return run(system, x, start(system, x), "Reference", 40, [part], device=False)
+
+
+@pytest.mark.parametrize("platform", ON_ALL)
+def test_rows_go_the_way_of_the_callbacks(platform, carried):
+    """Waters, some joined by rows into one large cluster, others with rows on places in space."""
+    system, x = waters()
+    tolerance = {"single": 1e-6, "mixed": 1e-11}.get(platform.split()[-1], 1e-13)
+    found, context = run(system, x, start(system, x), platform, 40, ROWS, tolerance=tolerance)
+    integrator = context.getIntegrator()
+    assert {shape.together for shape in integrator.rows.shapes} == {False, True}
+    assert np.abs(found - carried[0]).max() < CLOSE.get(platform.split()[-1], 1e-12)
+    assert integrator.parts[0].worst_violation(context) is None
+    # Positions up to 1.3 nm are rounded to 6e-8 where they are single numbers, at both ends and in three coordinates.
+    bound = 2e-6 if platform.endswith("single") else 1e-10
+    assert np.abs(integrator.rows.set.value(found)).max() < bound
+    assert integrator.degrees_of_freedom() == carried[1].getIntegrator().degrees_of_freedom() == 81 - 27 - 6
+
+
+def test_rows_of_hold_go_over_to_the_device(carried):
+    system, x = waters()
+    part = hold(system, ROWS, x, take="all", keep_water=False)
+    found = run(system, x, start(system, x), "Reference", 40, [part], tolerance=1e-13)[0]
+    assert np.abs(found - carried[0]).max() < 1e-12
+
+
+def protein(constraints):
+    """Villin without water, near its constraints."""
+    pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))
+    model = app.Modeller(pdb.topology, pdb.positions)
+    model.deleteWater()
+    model.delete([atom for atom in model.topology.atoms() if len(list(atom.residue.atoms())) < 4])
+    forces = app.ForceField("amber14-all.xml")
+    system = forces.createSystem(model.topology, constraints=constraints, nonbondedMethod=app.NoCutoff)
+    return system, np.array(model.positions.value_in_unit(unit.nanometer))
+
+
+@pytest.mark.parametrize("constraints", [app.HBonds, app.AllBonds])
+def test_a_protein_goes_the_way_of_the_engine_on_arrays(constraints):
+    """582 atoms in the field of one force; all bonds are one cluster of 589 rows in 11 levels."""
+    whole, x = protein(constraints)
+    system = mm.System()
+    masses = np.array([whole.getParticleMass(k)._value for k in range(len(x))])
+    for mass in masses:
+        system.addParticle(mass)
+    rows = [whole.getConstraintParameters(k) for k in range(whole.getNumConstraints())]
+    for i, j, length in rows:
+        system.addConstraint(i, j, length)
+    force = mm.CustomExternalForce("20*sin(3*x)+20*cos(4*y+z)")
+    for k in range(len(x)):
+        force.addParticle(k)
+    system.addForce(force)
+    bonds = Distance([[i, j] for i, j, _ in rows], [length._value for *_, length in rows])
+    held = ConstraintSet(bonds, x, masses)
+    motion = Motion(held, x)
+    x = motion.restore_positions(x, bonds=[])
+    v = motion.project_velocities(x, start(system, x))
+
+    def forces(y, time=0.0):
+        slope = -20 * 4 * np.sin(4 * y[:, 1] + y[:, 2])
+        return -np.stack([60 * np.cos(3 * y[:, 0]), slope, slope / 4], axis=1)
+
+    state = State(x, v)
+    stepper, arrays = Rattle(), System(motion, forces)
+    for _ in range(20):
+        state = stepper.step(arrays, state, 0.002)
+    found, context = run(system, x, v, "CPU", 20, tolerance=1e-12)
+    levels = [array for array in context.getIntegrator().rows.arrays if array.name == "rows_level"]
+    assert [len(array.values) - 1 for array in levels] == ([11] if constraints is app.AllBonds else [])
+    assert np.abs(found - state.positions).max() < 1e-10
+    assert np.abs(held.value(found) / held.scale).max() < 2e-12
+
+
+def test_a_peptide_with_dihedrals_held():
+    """Alanine dipeptide: hydrogens by the System, phi and psi by rows, as the callbacks of the host do it."""
+    torsions = Dihedral([[4, 6, 8, 14], [6, 8, 14, 16]])
+    system, x, v = alanine("HBonds")
+    part = hold(system, torsions, x, take="all")
+    host = run(system, x, v, "Reference", 50, [part], device=False)[0]
+    system, x, v = alanine("HBonds")
+    assert np.abs(run(system, x, v, "Reference", 50, torsions)[0] - host).max() < 1e-9
+
+
+# -- targets, places, images ------------------------------------------------------------------------
+
+
+def test_targets_move_with_time_and_with_a_parameter():
+    system, x = waters(2)
+    pull = Distance([[0, 3]], lambda t: 0.6 + 0.05 * t)
+    level = Plane(1, [0, 0, 1.0], lambda t: contexts[0].getParameter("level") if contexts else x[1, 2])
+    force = mm.CustomExternalForce("0*level*x")
+    force.addGlobalParameter("level", x[1, 2])
+    system.addForce(force)
+    contexts = []
+    integrator = ProjectedIntegrator(0.002, parts=[pull, level], device=True)
+    context = started(system, integrator, x, platform="CPU")
+    contexts.append(context)
+    integrator.step(700)  # longer than what is known at once
+    y = context.getState(positions=True).getPositions(asNumpy=True)._value
+    assert np.linalg.norm(y[3] - y[0]) == pytest.approx(0.6 + 0.05 * 1.4, abs=1e-10)
+    context.setParameter("level", float(x[1, 2]) + 0.01)
+    integrator.step(1)
+    y = context.getState(positions=True).getPositions(asNumpy=True)._value
+    assert y[1, 2] == pytest.approx(x[1, 2] + 0.01, abs=1e-10)
+
+
+@pytest.mark.parametrize("platform", ["CPU", *MIXED])
+def test_rows_across_faces_and_places_in_a_box_that_openmm_sorts(platform):
+    """Molecules scattered over many boxes are moved back and sorted by OpenMM; rows mean what State gives."""
+    rng = np.random.default_rng(5)
+    n, edge = 400, 3.0
+    system = mm.System()
+    system.setDefaultPeriodicBoxVectors(*(edge * np.eye(3)))
+    force = mm.NonbondedForce()
+    force.setNonbondedMethod(mm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(1.0)
+    grid = np.array([[i, j, k] for i in range(8) for j in range(8) for k in range(8)])[: n // 2] * edge / 8
+    x = np.zeros((n, 3))
+    for k in range(n):
+        system.addParticle(39.9)
+        force.addParticle(0, 0.2, 0.5)
+        x[k] = grid[k // 2] + (k % 2) * np.array([0.15, 0, 0])
+    for k in range(0, n, 2):
+        force.addException(k, k + 1, 0, 1, 0)
+        system.addConstraint(k, k + 1, 0.15)
+    system.addForce(force)
+    x = x + np.repeat(rng.integers(-3, 4, size=(n // 2, 3)), 2, axis=0) * edge
+    rng.shuffle(pairs := np.arange(n // 2))
+    x = x.reshape(-1, 2, 3)[pairs].reshape(n, 3)  # 90 % of them are not where they would be in space
+    rows = [Distance([[0, 2]]), Plane(10, [0, 0, 1.0]), Distance([[20, 22]])]
+    integrator = ProjectedIntegrator(0.002, parts=rows, device=True)
+    context = started(system, integrator, x, start(system, x), platform)
+    integrator.step(300)
+    y = context.getState(positions=True).getPositions(asNumpy=True)._value
+    near = y[[0, 20]] - y[[2, 22]]
+    near -= edge * np.round(near / edge)
+    far = x[[0, 20]] - x[[2, 22]]
+    far -= edge * np.round(far / edge)
+    bound = 1e-9 if platform == "CPU" else 1e-6  # what OpenMM moves back into the box it rounds to single numbers
+    assert np.abs(np.linalg.norm(near, axis=1) - np.linalg.norm(far, axis=1)).max() < bound
+    assert abs(y[10, 2] - x[10, 2]) < bound
+    lengths = np.linalg.norm(y[::2] - y[1::2], axis=1)
+    assert np.abs(lengths - 0.15).max() < bound
+
+
+def test_linear_rows_of_a_straight_molecule_are_found():
+    """CO2 held by three distances is converted as the engine converts it."""
+    system = mm.System()
+    for mass in (16.0, 12.0, 16.0):
+        system.addParticle(mass)
+    rows = Distance([[0, 1], [1, 2], [0, 2]], [0.116, 0.116, 0.232])
+    system.addForce(field(3, np.random.default_rng(2), 20.0))
+    x = np.array([[0, 0, 0], [0.116, 0, 0], [0.232, 0, 0.0]])
+    found, context = run(system, x, start(system, x), "CPU", 100, rows)
+    assert np.linalg.norm(found[2] - found[0]) == pytest.approx(0.232, abs=1e-9)
+    assert np.abs(found[1] - (found[0] + found[2]) / 2).max() < 1e-9
+    assert any(isinstance(item, LinearRelation) for item in context.getIntegrator().rows.set.constraints)
+
+
+# -- multipliers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", ["Reference", *MIXED])
+def test_multipliers_are_summed_where_the_rows_are(platform):
+    """A pair that is pulled apart by 100 kJ/mol/nm at each end, and a bath that adds nothing on average."""
+    system = mm.System()
+    for _ in range(2):
+        system.addParticle(12.0)
+    force = mm.CustomExternalForce("-c*x")
+    force.addPerParticleParameter("c")
+    force.addParticle(0, [-100.0])
+    force.addParticle(1, [100.0])
+    system.addForce(force)
+    x = np.array([[0, 0, 0], [0.15, 0, 0]])
+    _, context = run(system, x, 0 * x, platform, 50, Distance([[0, 1]]))
+    integrator = context.getIntegrator()
+    part = integrator.parts[0]
+    assert part.mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-5)
+    part.reset_multipliers(integrator)
+    assert np.isnan(part.mean_multipliers(integrator)).all()
+    integrator.step(10)
+    assert part.mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-5)
+    assert part.multipliers(context) == pytest.approx([-100.0], abs=1e-5)
+
+
+def test_noise_is_in_no_multiplier():
+    """A free pair in a bath: the mean of lambda is minus the centrifugal force, 2 kT/3r of two directions by r."""
+    system = mm.System()
+    for _ in range(2):
+        system.addParticle(12.0)
+    x = np.array([[0, 0, 0], [0.15, 0, 0]])
+    integrator = ProjectedIntegrator(0.002, parts=Distance([[0, 1]]), device=True, ensemble=Langevin(300, 5.0))
+    integrator.setRandomNumberSeed(3)
+    context = started(system, integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(100_000)
+    wanted = -2 * 8.314462618e-3 * 300 / 0.15
+    assert integrator.parts[0].mean_multipliers(integrator)[0] == pytest.approx(wanted, rel=0.1)
+
+
+# -- failures ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", ON_ALL)
+@pytest.mark.parametrize("large", [False, True])
+def test_a_row_without_a_solution_is_told_and_the_state_put_back(platform, large):
+    """A particle that is kicked far away within one step."""
+    n = 12 if large else 3
+    system = mm.System()
+    for _ in range(n):
+        system.addParticle(12.0)
+    force = mm.CustomExternalForce("select(step(x-0.01), -k*z, 0)")
+    force.addPerParticleParameter("k")
+    force.addParticle(1, [1e9])
+    system.addForce(force)
+    x = 0.1 * np.stack([np.arange(n) * 1.2, np.arange(n) % 2 * 0.9, np.zeros(n)], axis=1)
+    x -= x[1]
+    v = np.zeros_like(x)
+    v[:, 0] = 1.0
+    rows = Distance(np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
+    integrator = ProjectedIntegrator(0.002, parts=rows, device=True)
+    context = started(system, integrator, x, v, platform)
+    integrator.step(3)
+    before = context.getState(positions=True).getPositions(asNumpy=True)._value.copy()
+    with pytest.raises(
+        ConvergenceError, match=r"step \d+: row #\d+ Distance.* on the device; the step was taken"
+    ) as told:
+        integrator.step(10)
+    assert told.value.row in range(n - 1) and 4 <= told.value.step <= 13
+    after = context.getState(positions=True).getPositions(asNumpy=True)._value
+    assert np.isfinite(after).all()
+    assert context.getStepCount() <= 3
+    assert np.abs(rows.with_target(None).measure(after[rows.atoms], 0.0) - 0.15).max() < 1e-5
+    assert np.abs(after - before).max() < 0.01
+
+
+def test_what_the_device_does_not_hold():
+    system, x = waters(2)
+    item = Custom([0, 3], lambda r: float(np.linalg.norm(r[0] - r[1])))
+    with pytest.raises(UnsupportedError, match="Formula"):
+        ProjectedIntegrator(0.002, parts=[item], device=True)
+    integrator = ProjectedIntegrator(0.002, parts=[Distance([[0, 3]], 0.9)], device=True)
+    context = started(system, integrator, x)
+    assert not integrator.bound or context.getStepCount() == 0
+    with pytest.raises(InputError, match="off row"):
+        integrator.step(1)

@@ -1,0 +1,47 @@
+"""Tutorials as notebooks: the cells are the snippets of the page, and they run."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+
+import pytest
+from committed_pages import ROOT
+
+
+@pytest.fixture(scope="module")
+def notebooks():
+    spec = importlib.util.spec_from_file_location("notebooks", ROOT / "docs" / "notebooks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_cells_are_the_snippets_of_the_page(notebooks):
+    pages = notebooks.pages()
+    assert len(pages) >= 8
+    for page in pages:
+        snippets = re.findall(r"^```python\n(.*?)\n```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+        cells = notebooks.notebook_of(page).cells
+        assert [cell.source for cell in cells if cell.cell_type == "code"] == snippets, page.name
+        words = "\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
+        assert not re.search(r"\]\((?!https?:)", words), page.name  # nothing leads out of the notebook
+
+
+def test_a_notebook_runs_and_a_cell_that_fails_is_told(notebooks, tmp_path):
+    (page,) = (page for page in notebooks.pages() if page.stem == "check_trajectory")
+    notebook = notebooks.notebook_of(page)
+    notebook = notebooks.run(notebook, tmp_path)
+    said = [
+        output.text
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
+        if "text" in output
+    ]
+    assert any("kept to the precision of the file" in text for text in said)
+    notebook.cells.append({"cell_type": "code", "source": "assert False", "metadata": {}, "outputs": []})
+    from nbclient.exceptions import CellExecutionError
+
+    with pytest.raises(CellExecutionError):
+        notebooks.run(notebook, tmp_path)
