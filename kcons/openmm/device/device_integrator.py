@@ -22,9 +22,8 @@ from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, Spheres, plan
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-from kcons.openmm.ensembles.langevin_ensemble import Langevin
+from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-from kcons.openmm.ensembles.respa_ensemble import LangevinRespa
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard

@@ -192,7 +192,8 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
         ]
         unpack = " ".join(lines)
     else:
-        own_arrays = [f"GLOBAL {array.kind}* {array.name}" for array in arrays]
+        alone = "" if scratch else "RESTRICT "  # items of a group read what others have written
+        own_arrays = [f"GLOBAL {array.kind}* {alone}{array.name}" for array in arrays]
         given = ", ".join([*_GIVEN, *(f"GLOBAL const mm_long* RESTRICT {name}" for name in forces), *own_arrays])
         unpack = ""
     words = {
