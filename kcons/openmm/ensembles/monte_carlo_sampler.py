@@ -29,7 +29,8 @@ from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts, best_acceptance
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
+from kcons.thermostats.langevin import noise_generator
+from kcons.thermostats.monte_carlo import (
     ACCEPTED,
     CHANGE,
     ENERGY,
@@ -42,10 +43,10 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     SQUARES,
     SUM,
     UNSOLVED,
+    DualAveraging,
+    Proposals,
     step_range,
-    stream,
 )
-from kcons.thermostats.monte_carlo.tuning import DualAveraging, Proposals
 
 #: What acts on a state between steps and knows no way back.
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
@@ -292,7 +293,7 @@ class HamiltonianMonteCarlo:
             held[POTENTIAL] = self._potential()
             if not math.isfinite(held[POTENTIAL]):
                 raise NonFiniteError(f"the potential energy is {held[POTENTIAL]} at proposal {number}", item="energy")
-        random = stream(self.seed, number, PROPOSAL)
+        random = noise_generator((self.seed, 0), number, PROPOSAL)
         count, threshold = int(random.integers(self.steps[0], self.steps[1] + 1)), math.log1p(-random.random())
         v0 = velocities_of(context)
         try:

@@ -19,7 +19,8 @@ from kcons.errors import ConvergenceError, InputError, NonFiniteError, Unsupport
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import exchange
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import ACCEPTED, POTENTIAL, PROPOSAL, SIZE, stream
+from kcons.thermostats.langevin import noise_generator
+from kcons.thermostats.monte_carlo import ACCEPTED, POTENTIAL, PROPOSAL, SIZE
 
 reversing = HamiltonianMonteCarlo.reversing_integrator
 
@@ -51,7 +52,7 @@ def test_every_decision_follows_from_the_energies():
     kt, outcomes = GAS_CONSTANT * 300, set()
     for number in range(1, 21):
         x, v = state_of(sampler.context)
-        random = stream(3, number, PROPOSAL)
+        random = noise_generator((3, 0), number, PROPOSAL)
         count, threshold = int(random.integers(2, 6)), random.random()
         noise = random.standard_normal(x.shape) * np.sqrt(kt * (1 - 0.4**2) / masses)
         other.setPositions(x)
