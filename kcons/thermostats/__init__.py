@@ -1,7 +1,6 @@
 """Thermostats on constraints. Each is a stepper.
 
-- `bodies`: what rows tie together, and what may move as one
-- `freedom`: which degrees of freedom a thermostat acts on
+- `freedom`: which degrees of freedom a thermostat acts on, and what rows tie together
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
 - `noise`: normal numbers drawn in kernels
@@ -9,18 +8,21 @@
 - `monte_carlo`: without any error of the time step
 - `multistep`: several time steps, and isokinetic spheres
 - `correlated_series`: errors of means and of slopes along a run
-- `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
+- `configurational_temperature`: the temperature of configurations, whole and by kind of motion
 - `slow_share`: the stiffness that slow forces carry
 """
 
-from kcons.thermostats.configurational_temperature import configurational_sample, configurational_temperature
+from kcons.thermostats.configurational_temperature import (
+    SplitTemperatures,
+    TemperatureSplit,
+    configurational_sample,
+    configurational_temperature,
+)
 from kcons.thermostats.correlated_series import Estimate, autocorrelation_time, evaluations_per_sample, mean
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import Counts, HamiltonianMonteCarlo
-from kcons.thermostats.monte_carlo.replica_exchange import exchange
-from kcons.thermostats.monte_carlo.tuning import Tuned, best_acceptance, tune
+from kcons.thermostats.monte_carlo import Counts, HamiltonianMonteCarlo, Tuned, best_acceptance, exchange, tune
 from kcons.thermostats.multistep import (
     ForceGroups,
     IsokineticSpheres,
@@ -38,7 +40,6 @@ from kcons.thermostats.pressure import (
     instantaneous_pressure,
 )
 from kcons.thermostats.slow_share import slow_share
-from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [

@@ -5,21 +5,54 @@ summed over all directions, kT = <|grad U|^2>/<laplacian of U> (Rugh, Phys. Rev.
 J. Chem. Phys. 109, 6519 (1998)). Constrained canonical configurations have the volume that belongs to the metric M, so
 that |grad U|^2 = f.M_par^+ f, and the laplacian is the mean second derivative of U along geodesics, which are the free
 flights of the constrained atoms.
+
+By kind of motion: clusters that shift, that turn, and what is left.
+A cluster is what constraints tie together; a free atom is one of its own. For any field X along the surface
+
+    kT <div X> = <X . grad U>.
+
+Shifts S_a of a cluster along fixed axes and its turns R_a about fixed axes through its center of mass are isometries of
+M and keep all rows, if no row knows a place or a direction in space. So they have no divergence, and the fields
+S_a(U) S_a / m and J_ab R_a(U) R_b, where J is the inverse of the tensor of inertia, give
+
+    kT = <|F|^2/m> / <sum S_a S_a U / m>,    kT = <t . J t> / <sum J_ab R_a R_b U>
+
+with the force F and the torque t on the cluster (derivatives of J cancel: it turns with the cluster). Both are shares
+of <|grad U|^2>/<laplacian of U>, and what remains above and below the line is the temperature of everything else.
+
+Second derivatives are differences of forces along random moves of all clusters at once, of which cross terms have the
+mean zero (Hutchinson): the cost does not depend on the number of clusters.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_float_array, whole_number
+from kcons.constraints.arguments import (
+    Rng,
+    as_array,
+    as_float_array,
+    generator_of,
+    positive,
+    refuse_other,
+    whole_number,
+)
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
+from kcons.motion.motion import Motion
 from kcons.steppers import State, System
-from kcons.thermostats.correlated_series import Estimate, checked, few, spread
+from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate, checked, few, spread
+from kcons.thermostats.freedom import UNCHANGED, atom_numbers, bodies, row_changes
 from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
@@ -113,3 +146,432 @@ def _slope(system: System, x: FloatArray, v: FloatArray, time: float, h: float) 
     there, v = system.flown(x, v, h, time)
     end = system.motion.project_velocities(there, v, time=time)
     return -float((system.forces(there, end, time, 0) * end).sum())
+
+
+#: Typical move for a difference, as a share of the distance to the next atom.
+MOVE = 1e-3
+#: Moment of inertia about an axis, relative to the largest, below which there is no turn.
+THIN = 1e-9
+#: Share of its thermal energy below which a cluster has no motion of its own.
+RIGID = 1e-9
+#: Sum of the forces in a cluster, relative to the sum of their sizes, that is their rounding; the same of torques.
+BALANCED = 1e-7
+#: Violation of a row, relative to its scale, that no temperature shows; OpenMM's own integrators leave 1e-5.
+OFF = 1e-4
+
+
+@dataclass(frozen=True)
+class SplitTemperatures:
+    """Temperatures of configurations, k_B T in the units of the System; None for motions that do not exist.
+
+    Attributes
+    ----------
+    shift, turn : Estimate or None
+        Of whole clusters that move, and that turn about their centers of mass.
+    internal : Estimate or None
+        Of all other motions that the constraints allow: within clusters, and of clusters tied to space.
+    shifts, turns : int
+        Degrees of freedom of the first two.
+    shift_frequency, turn_frequency : float
+        Root mean square angular frequency of shifts and of turns, as of oscillators, in inverse units of time.
+        Velocities at the positions, as velocity Verlet has them, are colder than configurations by about
+        (frequency dt/2)^2.
+    samples : int
+    left_out : tuple of str
+        What does not count, and why.
+    """
+
+    shift: Estimate | None
+    turn: Estimate | None
+    internal: Estimate | None
+    shifts: int
+    turns: int
+    shift_frequency: float
+    turn_frequency: float
+    samples: int
+    left_out: tuple[str, ...]
+
+
+class Clusters:
+    """What constraints tie together, and which of it may shift and turn as a whole.
+
+    Attributes
+    ----------
+    label : ndarray of int, shape (n_atoms,)
+        Cluster of each atom; -1 for atoms that are fixed.
+    count : int
+    mass : ndarray, shape (count,)
+    shifts, turns : ndarray of bool, shape (count,)
+        Whether a cluster may shift in every direction, and turn about every axis, without a change of any row.
+    """
+
+    def __init__(self, motion: Motion, positions: FloatArray, moving: NDArray[np.bool_]) -> None:
+        held = motion.constraint_set
+        self._motion, self._held = motion, held
+        self._masses = np.where(moving, held.masses, 0.0)
+        self.label: IntArray = bodies(motion, moving)
+        self.count = int(self.label.max(initial=-1)) + 1
+        self._moving = np.flatnonzero(moving)
+        self._of = self.label[self._moving]
+        self.mass: FloatArray = self.add_up(self._masses)
+        rows, touched = held.incidence.nonzero()
+        rows, touched = rows[moving[touched]], touched[moving[touched]]
+        first = touched[np.searchsorted(rows, rows)]
+        self._tree = spanning_tree(np.stack([first, touched], axis=1).astype(np.int64), len(moving))
+        self.shifts, self.turns = self._open(positions)
+
+    def add_up(self, values: FloatArray) -> FloatArray:
+        """Sums over the atoms of each cluster, shape (count,) or (count, 3)."""
+        if values.ndim == 1:
+            return np.asarray(np.bincount(self._of, values[self._moving], self.count), dtype=np.float64)
+        return np.stack([self.add_up(np.ascontiguousarray(column)) for column in values.T], axis=1)
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Values of the clusters given to their atoms, 0 for fixed ones; shape (n_atoms, 3)."""
+        out = np.zeros((len(self.label), *values.shape[1:]))
+        out[self._moving] = values[self._of]
+        return out
+
+    def arms(self, x: FloatArray) -> FloatArray:
+        """Places relative to the centers of mass, shape (n_atoms, 3), in pieces put together across the box."""
+        y = self._whole(x)
+        centers = self.add_up(self._masses[:, None] * y) / self.mass[:, None]
+        return np.where((self.label >= 0)[:, None], y - self.spread(centers), 0.0)
+
+    def _whole(self, x: FloatArray) -> FloatArray:
+        return make_whole(x, *self._tree, self._held.lattice)
+
+    def unit_turns(self, arms: FloatArray) -> FloatArray:
+        """Turns g of unit energy as columns, shape (count, 3, 3): g g^T is the (pseudo-)inverse tensor of inertia.
+
+        0 about axes without inertia, and for clusters that do not turn.
+        """
+        products = np.empty((self.count, 3, 3))
+        for a in range(3):
+            for b in range(a + 1):
+                products[:, a, b] = products[:, b, a] = self.add_up(self._masses * arms[:, a] * arms[:, b])
+        tensor = np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3) - products
+        moments, axes = np.linalg.eigh(tensor)
+        has = (moments > THIN * moments[:, -1:]) & self.turns[:, None]
+        return np.asarray(axes * np.where(has, 1.0 / np.sqrt(np.where(has, moments, 1.0)), 0.0)[:, None, :])
+
+    def _open(self, positions: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """By the change of each row, here and at two places nearby, where nothing cancels by symmetry."""
+        every, several = np.ones(self.count, dtype=bool), np.bincount(self._of, minlength=self.count) > 1
+        held = self._held
+        if not held.n_rows:
+            return every, several
+        shifts, turns = every.copy(), several.copy()
+        rows, touched = held.incidence.nonzero()
+        whole = self._whole(positions)
+        size = min(extent(whole) or 1.0, float(held.scale.min()))
+        inside = (self.label >= 0)[:, None]
+
+        def fields(x: FloatArray) -> FloatArray:
+            p = self.arms(x)
+            reach = math.sqrt(float((p * p).sum(axis=1).max(initial=0.0))) or 1.0
+            moves = [np.where(inside, axis, 0.0) for axis in np.eye(3)]
+            return np.stack([m.ravel() for m in (*moves, *(np.cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
+
+        for change in row_changes(self._motion, whole, fields, 0.0, size):
+            kept: NDArray[np.bool_] = np.asarray(np.abs(change) <= UNCHANGED)  # not NaN: a surface that ends there
+            for may, some in ((shifts, kept[:, :3]), (turns, kept[:, 3:])):
+                hit = self.label[touched[~np.asarray(some.all(axis=1))[rows]]]
+                may[hit[hit >= 0]] = False
+        return shifts, turns
+
+
+class TemperatureSplit:
+    """Samples configurations of any run, and tells the temperatures of shifts, turns and all other motions.
+
+    Whatever the velocities do: a thermostat that fixes the kinetic energy, or a step that is too long, shows here.
+
+    Parameters
+    ----------
+    system : System
+        Constraints, and forces of any provider; in any consistent units.
+    rng : int, numpy.random.Generator or None
+        Of the random moves.
+    displacement : float, optional
+        Typical move of an atom for a difference; a thousandth of the distance to the next atom by default. Forces in
+        single precision want three to ten times as much.
+    directions : int
+        Random moves a sample.
+    groups : mapping of str to array_like of int, optional
+        Atoms by name, whose temperatures `result` tells apart. A cluster belongs to the group of its first atom.
+
+    Raises
+    ------
+    UnsupportedError
+        Targets move, rows hold velocities, or forces depend on velocities.
+
+    Notes
+    -----
+    A sample costs 2 evaluations of the forces for shifts, 2 for turns and 2 for what is left, for each direction, where
+    there is such a motion, and one at the configuration itself if its forces are not given.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        *,
+        rng: Rng = 0,
+        displacement: float | None = None,
+        directions: int = 1,
+        groups: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        refuse_other(system, System, "system", "a kcons.steppers.System")
+        if system.motion.plan.driven or system.velocity_dependent:
+            raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
+        if not system.motion.constraint_set.holonomic.all():
+            raise UnsupportedError("configurations have a temperature where rows hold positions, not velocities only")
+        if displacement is not None:
+            positive(displacement, "displacement")
+        if groups is not None and not isinstance(groups, Mapping):
+            raise InputError(f"groups is {groups!r}; give a mapping of names to atoms", item="groups")
+        self._system, self._displacement = system, displacement
+        self._directions = whole_number(directions, "directions")
+        self._groups = {name: atom_numbers(atoms, system.n_atoms) for name, atoms in (groups or {}).items()}
+        self._rng = generator_of(rng)
+        self._clusters: Clusters | None = None
+        #: Clusters with motions besides shifts and turns; known after the first draw.
+        self._rest: NDArray[np.bool_] | None = None
+        self._flight = 0.0
+        self._series: list[FloatArray] = []
+
+    def __len__(self) -> int:
+        return len(self._series)
+
+    def add(self, positions: ArrayLike, forces: ArrayLike | None = None) -> None:
+        """Take one configuration, on the constraints, and its forces if they are known; shape (n_atoms, 3) each.
+
+        Raises
+        ------
+        InputError
+            Positions off the constraints; groups without a cluster.
+        """
+        system = self._system
+        x = configuration(system, positions)
+        f = self._forces(x) if forces is None else as_array(forces, x.shape, "forces")
+        check_finite(f, "force", len(self._series))
+        if self._clusters is None:
+            self._begin(x)
+        clusters, masses = self._clusters, system.masses[:, None]
+        assert clusters is not None
+        arms = clusters.arms(x)
+        turns = clusters.unit_turns(arms)
+        if self._rest is None:
+            rest = masses * self._rest_of(x, arms, turns) ** 2
+            self._rest = clusters.add_up(rest.sum(axis=1)) > RIGID
+        above = self._squares(x, f, arms, turns)
+        below = np.mean([self._curvatures(x, arms, turns) for _ in range(self._directions)], axis=0)
+        for kinds in (above, below):  # what is left: all less shifts and turns
+            kinds[2] = np.where(self._rest, kinds[2] - kinds[0] - kinds[1], 0.0)
+        self._series.append(np.stack([above, below]) @ self._member.T)
+
+    def result(self, group: str | None = None) -> SplitTemperatures:
+        """Temperatures so far, of all clusters or of those of one group.
+
+        Raises
+        ------
+        InputError
+            Fewer than 32 samples; an unknown group.
+
+        Warns
+        -----
+        UserWarning
+            Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
+        """
+        if len(self._series) < MIN_SAMPLES or self._clusters is None or self._rest is None:
+            raise InputError(
+                f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
+            )
+        names = [None, *self._groups]
+        if group not in names:
+            raise InputError(f"there is no group {group!r}; there are {', '.join(self._groups)}", item="group")
+        which = names.index(group)
+        inside = self._member[which] > 0
+        clusters = self._clusters
+        series = np.array(self._series)[:, :, :, which]
+        exists = (clusters.shifts & inside, self._axes * inside, self._rest & inside)
+        found: list[Estimate | None] = [None, None, None]
+        for kind, (name, there) in enumerate(zip(("shifts", "turns", "internal motions"), exists, strict=True)):
+            if there.any() and series[:, 0, kind].any():
+                found[kind], doubt = temperature(series[:, 0, kind], series[:, 1, kind])
+                if doubt:
+                    warnings.warn(f"temperature of {name}: {doubt}", UserWarning, stacklevel=2)
+        counts = 3 * int(exists[0].sum()), int(exists[1].sum())
+        squares = [max(float(series[:, 1, kind].mean()), 0.0) / max(counts[kind], 1) for kind in (0, 1)]
+        return SplitTemperatures(
+            shift=found[0],
+            turn=found[1],
+            internal=found[2],
+            shifts=counts[0],
+            turns=counts[1],
+            shift_frequency=math.sqrt(squares[0]),
+            turn_frequency=math.sqrt(squares[1]),
+            samples=len(series),
+            left_out=(
+                *self._left_out(inside),
+                *(
+                    f"no force {does} clusters as a whole: that has no temperature"
+                    for does, kind in (("shifts", 0), ("turns", 1))
+                    if exists[kind].any() and not series[:, 0, kind].any()
+                ),
+            ),
+        )
+
+    # -- inner ----------------------------------------------------------------------------------
+
+    def _begin(self, x: FloatArray) -> None:
+        system = self._system
+        moving = system.inverse_masses[:, 0] > 0
+        self._flight = flight_of(system, x, self._displacement, MOVE)
+        clusters = Clusters(system.motion, x, moving)
+        first = np.full(clusters.count, system.n_atoms)
+        atoms = np.flatnonzero(moving)
+        np.minimum.at(first, clusters.label[atoms], atoms)
+        members = [np.ones(clusters.count), *(np.isin(first, chosen) * 1.0 for chosen in self._groups.values())]
+        for name, member in zip(self._groups, members[1:], strict=True):
+            if not member.any():
+                raise InputError(
+                    f"group {name!r} has no first atom of a cluster that moves; give all atoms of its clusters",
+                    item="groups",
+                )
+        self._member: FloatArray = np.array(members)
+        #: Axes about which each cluster turns.
+        self._axes: IntArray = clusters.unit_turns(clusters.arms(x)).any(axis=1).sum(axis=1)
+        self._clusters = clusters
+
+    def _forces(self, x: FloatArray) -> FloatArray:
+        return self._system.forces(x, np.zeros_like(x), 0.0, len(self._series))
+
+    def _rest_of(self, x: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
+        """Thermal velocities of unit energy, less shifts and turns."""
+        clusters, masses = self._clusters, self._system.masses[:, None]
+        assert clusters is not None
+        v = thermal_velocities(self._system, x, 1.0, self._rng)
+        pace = clusters.add_up(masses * v) / clusters.mass[:, None] * clusters.shifts[:, None]
+        spins = np.einsum("cik,cjk,cj->ci", turns, turns, clusters.add_up(masses * np.cross(arms, v)))
+        return np.asarray(v - clusters.spread(pace) - np.cross(clusters.spread(spins), arms))
+
+    def _squares(self, x: FloatArray, f: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
+        """Squares of the slopes by shifts, by turns, and of all, of each cluster; shape (3, clusters)."""
+        clusters = self._clusters
+        assert clusters is not None
+        sizes = np.sqrt((f * f).sum(axis=1))
+        force = _unbalanced(clusters.add_up(f), clusters.add_up(sizes))
+        reach = np.sqrt((arms * arms).sum(axis=1))
+        torque = _unbalanced(clusters.add_up(np.cross(arms, f)), clusters.add_up(reach * sizes))
+        shift = np.where(clusters.shifts, (force * force).sum(axis=1) / clusters.mass, 0.0)
+        turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
+        whole = np.zeros_like(shift)
+        if self._rest is None or self._rest.any():
+            whole = clusters.add_up((f * constrained_acceleration(self._system, x, f, 0.0)).sum(axis=1))
+        return np.stack([shift, turn, whole])
+
+    def _curvatures(self, x: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
+        """Samples of the second derivatives of U in the same order, along moves of unit energy.
+
+        Shifts and turns have random signs along their axes, which is less noise than normal numbers make. One draw
+        serves all three, so that it cancels in what is left.
+        """
+        clusters, h = self._clusters, self._flight
+        assert clusters is not None and self._rest is not None
+        signs = self._rng.choice((-1.0, 1.0), size=(2, clusters.count, 3))
+        pushed = clusters.spread(signs[0] * (clusters.shifts / np.sqrt(clusters.mass))[:, None])
+        spin = clusters.spread(np.einsum("cik,ck->ci", turns, signs[1]))
+        v = pushed
+        if self._rest.any():
+            v = self._rest_of(x, arms, turns) + pushed + np.cross(spin, arms)
+        found = np.zeros((3, clusters.count))
+        for way in (h, -h):
+            if clusters.shifts.any():
+                found[0] -= self._slopes(x + way * pushed, pushed) / (2 * way)
+            if self._axes.any():
+                turned = _turned(arms, spin, way)
+                found[1] -= self._slopes(x + (turned - arms), np.cross(spin, turned)) / (2 * way)
+            if self._rest.any():
+                there, speed = self._system.flown(x, v, way)
+                end = self._system.motion.project_velocities(there, speed)
+                found[2] -= self._slopes(there, end) / (2 * way)
+        return found
+
+    def _slopes(self, x: FloatArray, v: FloatArray) -> FloatArray:
+        """What the forces of each cluster do at x along v."""
+        assert self._clusters is not None
+        return self._clusters.add_up((self._forces(x) * v).sum(axis=1))
+
+    def _left_out(self, inside: NDArray[np.bool_]) -> list[str]:
+        clusters = self._clusters
+        assert clusters is not None
+        several = np.bincount(clusters.label[clusters.label >= 0], minlength=clusters.count) > 1
+        notes = []
+        tied = int((~clusters.shifts & inside).sum())
+        if tied:
+            notes.append(f"{tied} clusters are tied to a place in space and do not shift: they count as internal")
+        bound = int((clusters.shifts & several & ~clusters.turns & inside).sum())
+        if bound:
+            notes.append(f"{bound} clusters are tied to a direction in space and do not turn: they count as internal")
+        if not several[inside].any():
+            notes.append("single atoms only: nothing turns")
+        fixed = int((clusters.label < 0).sum())
+        if fixed:
+            notes.append(f"{fixed} fixed atoms have no temperature")
+        return notes
+
+
+def configuration(system: System, positions: ArrayLike) -> FloatArray:
+    """Positions, shape (n_atoms, 3), that are finite and on the constraints; `InputError` otherwise."""
+    x = as_array(positions, (system.n_atoms, 3), "positions")
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if len(bad):
+        raise InputError(f"positions of atom {bad[0]} are not finite; leave this frame out", atoms=[int(bad[0])])
+    held = system.motion.constraint_set
+    miss = np.abs(held.value(x, 0.0)) / held.scale
+    if not np.all(miss <= OFF):
+        row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss)))
+        raise InputError(
+            f"positions are off row {held.row_name(row)} by {miss[row]:.3g} of its size; bring them onto the "
+            "constraints with Motion.restore_positions",
+            item="positions",
+            atoms=held.row_atoms(row),
+        )
+    return x
+
+
+def _unbalanced(sums: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Sums of vectors by cluster; 0 where they are the rounding of what was added."""
+    return np.where((np.abs(sums).max(axis=1) > BALANCED * sizes)[:, None], sums, 0.0)
+
+
+def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:
+    """Arms after a turn by h spin (Rodrigues)."""
+    angle = h * np.sqrt((spin * spin).sum(axis=1))[:, None]
+    sine = h * np.sinc(angle / np.pi)
+    versed = 0.5 * (h * np.sinc(0.5 * angle / np.pi)) ** 2
+    across = np.cross(spin, arms)
+    return np.asarray(arms + sine * across + versed * np.cross(spin, across))
+
+
+def flight_of(system: System, x: FloatArray, displacement: float | None, share: float) -> float:
+    """How long atoms that move fly at unit thermal energy until they have typically moved so far.
+
+    By default that is a share of the distance to the next atom, which a single atom has not.
+    """
+    moving = system.inverse_masses > 0
+    if not moving.any():
+        raise InputError("all atoms are fixed: nothing has a temperature, or a stiffness", item="atoms")
+    move = share * spacing(x) if displacement is None else positive(displacement, "displacement")
+    return move / math.sqrt(3.0 * float(system.inverse_masses[moving].mean()))
+
+
+def spacing(x: FloatArray) -> float:
+    """Distance from an atom to the next, the median."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(x).query(x, k=2)[0][:, 1] if len(x) > 1 else np.zeros(1)
+    near = near[np.isfinite(near) & (near > 0)]
+    if not len(near):
+        raise InputError("there is one atom only, and no length to go by; give a displacement", item="displacement")
+    return float(np.median(near))

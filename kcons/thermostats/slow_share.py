@@ -11,9 +11,9 @@ from kcons.constraints.arguments import Rng, as_float_array, generator_of, refus
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.thermostats.configurational_temperature import configuration, flight_of
 from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.multistep import ForceGroups
-from kcons.thermostats.temperature_split import configuration, flight_of
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Typical move for a difference, as a share of the distance to the next atom.

@@ -1,19 +1,443 @@
-"""Langevin dynamics on constraints with several time steps."""
+"""Several time steps on constraints: forces in groups, the operations of a step, Langevin dynamics made of them.
+
+The slowest group kicks at the ends of the step, and between its kicks the next one makes its steps, and so on
+(Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992)). The innermost group moves the atoms, by a symmetric
+scheme of order 2 or 4, with the heat bath in its middle. The same chain of operations may begin half a step later, so
+that slow forces kick in the middle of a step, and states are those halfway between two kicks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
 
-from kcons.constraints.arguments import Rng
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.arguments import Rng, as_float_array, check_call, checked, read_only_view, whole_number
 from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
-from kcons.steppers.operations import Evaluate
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.program import Row
+from kcons.steppers.splitting import SUZUKI_4
+from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.thermostats.freedom import carried
+from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
-from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
-from kcons.thermostats.multistep.nesting import InnerOrder, Nesting, SlowKicks
+
+ForceFunction = Callable[[FloatArray, float], ArrayLike]
+
+#: Difference of the forces of a state from the sum of those of its groups, relative to these, that is their rounding.
+SAME = 1e-12
+
+
+class ForceGroups:
+    """Applied forces as a sum of groups. It is the force function of a `System`: called, it gives the sum.
+
+    Parameters
+    ----------
+    groups : mapping of str to callable
+        Forces ``force(x, t)``, shape (n_atoms, 3), by name.
+
+    Attributes
+    ----------
+    evaluations : dict of str to int
+        How often each group was asked for.
+
+    Raises
+    ------
+    InputError
+        No groups; a name that is no text; one function in two groups, whose forces would count twice.
+    """
+
+    def __init__(self, groups: Mapping[str, ForceFunction]) -> None:
+        if not isinstance(groups, Mapping) or not groups:
+            raise InputError("there are no groups of forces; give a mapping of names to functions", item="groups")
+        for name, force in groups.items():
+            if not isinstance(name, str) or not name:
+                raise InputError(f"a group of forces is called {name!r}; give it a name, a text", item="groups")
+            if force is None:
+                raise InputError(f"the force of group {name!r} is None; give a function of x, t", item=name)
+            check_call(f"the force of group {name!r}", force, ("x", "t"))
+            # By value: a method is another object each time it is looked up.
+            other = next(other for other in groups if groups[other] == force)
+            if other != name:
+                raise InputError(
+                    f"groups {other!r} and {name!r} overlap: both are {force!r}, whose forces would count "
+                    "twice. Put it into one of them",
+                    item=name,
+                )
+        self.groups: dict[str, ForceFunction] = dict(groups)
+        self.evaluations = dict.fromkeys(self.groups, 0)
+
+    @classmethod
+    def difference(
+        cls, cheap: ForceFunction, expensive: ForceFunction, *, fast: str = "fast", slow: str = "slow"
+    ) -> ForceGroups:
+        """`cheap` forces as the fast group, `expensive` less `cheap` ones as the slow group: `expensive` in all.
+
+        Parameters
+        ----------
+        cheap, expensive : callable
+            Of the same atoms.
+        fast, slow : str
+            Names of the groups.
+
+        Raises
+        ------
+        InputError
+            Both are the same function, or both groups have one name.
+        """
+        if cheap == expensive:
+            raise InputError("cheap and expensive forces are the same function; nothing is left to be slow", item=slow)
+        if fast == slow:
+            raise InputError(f"fast and slow forces are both called {fast!r}; give them two names", item="slow")
+        return cls({fast: cheap, slow: _difference(cheap, expensive)})
+
+    def __repr__(self) -> str:
+        return f"ForceGroups({', '.join(self.groups)})"
+
+    def __call__(self, x: FloatArray, time: float) -> FloatArray:
+        """The sum over all groups."""
+        total: FloatArray | None = None
+        for name in self.groups:
+            f = self.of(name, x, time)
+            if total is None:
+                total = np.array(f)
+            elif f.shape != total.shape:
+                raise InputError(
+                    f"group {name!r} gives forces of shape {f.shape}, the groups before it {total.shape}: they are of "
+                    "different systems",
+                    item=name,
+                )
+            else:
+                total += f
+        assert total is not None
+        return total
+
+    def of(self, name: str, x: FloatArray, time: float) -> FloatArray:
+        """Forces of one group."""
+        f = as_float_array(self.groups[name](x, time), f"forces of group {name!r}")
+        self.evaluations[name] += 1
+        return f
+
+
+def _difference(cheap: ForceFunction, expensive: ForceFunction) -> ForceFunction:
+    """Expensive forces less cheap ones at the same place."""
+
+    def force(x: FloatArray, time: float) -> FloatArray:
+        # A function may use its array again, also where both share it.
+        less = np.array(as_float_array(cheap(x, time), "cheap forces"))
+        whole = as_float_array(expensive(x, time), "expensive forces")
+        if less.shape != whole.shape:
+            raise InputError(
+                f"cheap forces have shape {less.shape}, expensive ones {whole.shape}: they are of different systems, "
+                "and their difference is none",
+                item="forces",
+            )
+        return whole - less
+
+    return force
+
+
+def group_names(force: object, names: tuple[str, ...]) -> None:
+    """Refuse forces that are in no groups (`UnsupportedError`), or not in those that a stepper has steps for."""
+    if names == ("",):
+        return
+    if not isinstance(force, ForceGroups):
+        raise UnsupportedError(
+            f"the System has no groups of forces, and {', '.join(names)} were given steps; make it with "
+            "System(motion, ForceGroups({...}))"
+        )
+    for name in names:
+        if name not in force.groups:
+            raise InputError(f"there is no group {name!r} of forces; there are {', '.join(force.groups)}", item="steps")
+    for name in force.groups:
+        if name not in names:
+            raise InputError(f"group {name!r} of the forces has no number of steps; add it to steps", item="steps")
+
+
+@dataclass
+class GroupedForces:
+    """Forces that were last evaluated, by the names of their groups; one empty name where they come in no groups.
+
+    A state carries them, if there are two or more, in the order of their names behind the variables of its thermostat
+    and a number that stands for the names, so that a run that is continued evaluates nothing anew. Where the slowest
+    group, the first, kicks in the middle of steps it carries none, and each step begins with an evaluation of the
+    others.
+    """
+
+    system: System
+    names: tuple[str, ...]
+    now: dict[str, FloatArray]
+    middle: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        state: State,
+        names: tuple[str, ...],
+        variables: int,
+        name: str,
+        *,
+        marked: bool = False,
+        middle: bool = False,
+    ) -> tuple[GroupedForces, FloatArray | None]:
+        """Forces at a state, evaluated where it has none, and the variables of its thermostat (see `carried`)."""
+        size = 3 * system.n_atoms
+        stored = len(names) * size + 1 if len(names) > 1 and not middle else 0
+        known = carried(state, variables + stored, name, marked=marked)
+        x, _, forces = system.kernel_arrays(state)
+        found = cls(system, names, {}, middle)
+        if forces is not None and not stored and not middle:
+            found.now[names[0]] = forces
+        elif forces is not None and known and stored:
+            assert state.thermostat is not None
+            if state.thermostat[variables] != _number_of(names):
+                raise InputError(
+                    f"the state carries forces of groups of other names than {', '.join(names)}; name the groups as "
+                    "they were, or begin from its positions and velocities: State(state.positions, state.velocities)",
+                    item="groups",
+                )
+            parts = state.thermostat[variables + 1 :].reshape(len(names), *x.shape)
+            found.now.update(zip(sorted(names), parts, strict=True))
+            # Positions and their forces may have been put together with variables of another place.
+            if not np.all(np.abs(parts.sum(axis=0) - forces) <= SAME * np.abs(parts).max()):
+                found.now.clear()
+        for group in names[1:] if middle else names:
+            if group not in found.now:
+                found.evaluate(group, x, state.time, state.step)
+        return found, None if state.thermostat is None else state.thermostat[:variables]
+
+    def evaluate(self, name: str, x: FloatArray, time: float, step: int) -> None:
+        """Forces of one group at positions as the force function sees them; errors have the number of the step."""
+        system = self.system
+        force = system.force
+        if not name or not isinstance(force, ForceGroups):
+            self.now[name] = system.forces(x, x, time, step)
+            return
+        f = system.accepted(force.of(name, read_only_view(x), time), step, True)
+        check_finite(f, "force", step)
+        self.now[name] = f
+
+    def stacked(self) -> FloatArray:
+        """Those of all groups one after another, shape (n_groups n_atoms, 3)."""
+        if len(self.names) == 1:
+            return self.now[self.names[0]]
+        none = np.zeros((self.system.n_atoms, 3))
+        return np.concatenate([self.now.get(name, none) for name in self.names])
+
+    def total(self) -> FloatArray | None:
+        """Their sum, None where the slowest ones are those of another place."""
+        if self.middle:
+            return None
+        first, *others = (self.now[name] for name in self.names)
+        return first if not others else first + sum(others[1:], start=others[0])
+
+    def closed(self, variables: FloatArray) -> FloatArray:
+        """What a state carries: the variables of the thermostat, and forces."""
+        if len(self.names) == 1 or self.middle:
+            return variables
+        forces = [self.now[name].ravel() for name in sorted(self.names)]
+        return np.concatenate([variables, [_number_of(self.names)], *forces])
+
+
+def _number_of(names: tuple[str, ...]) -> float:
+    return float(zlib.crc32("\n".join(sorted(names)).encode()))
+
+
+#: Where the slowest forces kick: half at each end of the step, or once in its middle.
+SlowKicks = Literal["ends", "middle"]
+InnerOrder = Literal[2, 4]
+
+
+@dataclass(frozen=True)
+class Level:
+    """A group of forces, and its steps in one step of the whole."""
+
+    group: str
+    steps: int
+
+
+def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
+    """Groups from the slowest to the fastest; None for all forces at once.
+
+    Raises
+    ------
+    InputError
+        Numbers of steps of which one does not divide the next, or of which the least is not 1.
+    """
+    if steps is None:
+        return (Level("", 1),)
+    if not isinstance(steps, Mapping) or not steps:
+        raise InputError("steps must name each group of forces, as {'slow': 1, 'fast': 4}", item="steps")
+    counts: list[int] = []
+    for name, count in steps.items():
+        try:
+            counts.append(whole_number(count, "steps"))
+        except InputError:
+            raise InputError(
+                f"group {name!r} takes {count!r} steps; give a whole number, 1 or more", item="steps"
+            ) from None
+    levels = sorted(map(Level, steps, counts), key=lambda level: level.steps)
+    if levels[0].steps != 1:
+        raise InputError(
+            f"group {levels[0].group!r}, the slowest, takes {levels[0].steps} steps; it takes 1, the step itself",
+            item="steps",
+        )
+    for outer, inner in pairwise(levels):
+        if outer.steps == inner.steps:
+            raise InputError(
+                f"groups {outer.group!r} and {inner.group!r} both take {inner.steps} steps; add their forces to one",
+                item="steps",
+            )
+        if inner.steps % outer.steps:
+            raise InputError(
+                f"the step of group {inner.group!r} does not divide that of {outer.group!r}: {inner.steps} steps are "
+                f"no multiple of {outer.steps}",
+                item="steps",
+            )
+    return tuple(levels)
+
+
+def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
+    """Whether the slowest group kicks in the middle of the step; `InputError` where that has none."""
+    if slow_kicks == "ends":
+        return False
+    if len(levels) == 1:
+        raise InputError("all forces are one group: there are no slow kicks in the middle", item="slow_kicks")
+    if levels[1].steps % 2:
+        raise InputError(
+            f"group {levels[1].group!r} takes {levels[1].steps} steps, between which there is no middle for slow "
+            "kicks; give an even number",
+            item="slow_kicks",
+        )
+    return True
+
+
+def nested(
+    levels: tuple[Level, ...],
+    order: int,
+    flight: tuple[float, ...],
+    *,
+    turns: bool = False,
+    exact: bool = False,
+    middle: bool = False,
+) -> tuple[Operation, ...]:
+    """The operations of a step.
+
+    Parameters
+    ----------
+    levels, order
+        The groups, and the order of the innermost scheme.
+    flight : tuple of float
+        What each drift is made of, as fractions that add up to 1.
+    turns : bool
+        Kicks on spheres, before which velocities are put onto the constraints.
+    exact : bool
+        Fly along great circles.
+    middle : bool
+        The slowest group kicks once, in the middle.
+    """
+    kicks, drifts, _ = SCHEMES[order]
+    inner, odd = levels[-1].steps, len(drifts) % 2 == 1
+    halves = [d for k, d in enumerate(drifts) for d in ([d / 2] * 2 if odd and k == len(drifts) // 2 else [d])]
+    flights = iter(drifts_of([d / inner for _ in range(inner) for d in halves], flight, exact=exact))
+    if middle:
+        group, count = levels[0].group, levels[1].steps
+        done: list[Operation] = []
+        for number in range(count):
+            if 2 * number == count:
+                done += [Evaluate(group), (Turn if turns else Kick)(1.0, group)]
+            done += _level(levels, 1, kicks, drifts, flights, turns)
+    else:
+        done = list(_level(levels, 0, kicks, drifts, flights, turns))
+    if not turns:
+        done.append(Project())
+    return tuple(done)
+
+
+class Nesting:
+    """Steps of all groups of forces, from the arguments of a stepper with several time steps.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Groups from the slowest to the fastest.
+    middle : bool
+        Whether the slowest kicks in the middle.
+    in_flights, on_circles : tuple of Operation
+        A step, and one whose flights are great circles.
+    evaluations : int
+        Of forces in a step, those of all groups.
+    words : list of str
+        Steps, and what else is not as by default, as arguments.
+    """
+
+    @checked
+    def __init__(
+        self,
+        steps: Mapping[str, int] | None,
+        order: InnerOrder,
+        substeps: int,
+        slow_kicks: SlowKicks,
+        turns: bool = False,
+    ) -> None:
+        levels = levels_of(steps)
+        flight = (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
+        self.names = tuple(level.group for level in levels)
+        self.middle = middle_of(levels, slow_kicks)
+        self.in_flights = nested(levels, order, flight, turns=turns, middle=self.middle)
+        self.on_circles = nested(levels, order, (1.0,), turns=turns, exact=True, middle=self.middle)
+        self.evaluations = sum(isinstance(operation, Evaluate) for operation in self.in_flights)
+        counts = {level.group: level.steps for level in levels}
+        self.words = ["" if steps is None else f", steps={counts}", "" if order == 2 else f", order={order}"]
+        self.words[1] += ", slow_kicks='middle'" if self.middle else ""
+
+
+def _level(
+    levels: tuple[Level, ...],
+    at: int,
+    kicks: tuple[float, ...],
+    drifts: tuple[float, ...],
+    flights: Iterator[Fly],
+    turns: bool,
+) -> Iterator[Operation]:
+    """A step of one group, with those of the faster ones in it."""
+
+    def drift() -> Iterator[Operation]:
+        yield next(flights)
+        if turns:
+            yield Project()
+
+    push = Turn if turns else Kick
+    group, length = levels[at].group, 1.0 / levels[at].steps
+    if at + 1 < len(levels):
+        yield push(0.5 * length, group)
+        for _ in range(levels[at + 1].steps // levels[at].steps):
+            yield from _level(levels, at + 1, kicks, drifts, flights, turns)
+        yield Evaluate(group)
+        yield push(0.5 * length, group)
+        return
+    center = len(drifts) // 2
+    odd = len(drifts) % 2 == 1
+    for k, fraction in enumerate(kicks):
+        if not odd and k == center:
+            yield from (push(0.5 * fraction * length, group), Exchange(length), push(0.5 * fraction * length, group))
+        else:
+            yield push(fraction * length, group)
+        if k < len(drifts):
+            yield from drift()
+            if odd and k == center:
+                yield Exchange(length)
+                yield from drift()
+            yield Evaluate(group)
 
 
 class LangevinRespa(Langevin):

@@ -30,12 +30,10 @@ from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Operation, Project, Turn
 from kcons.steppers.program import Program, Row
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.bodies import placed_rows
-from kcons.thermostats.freedom import MARK
+from kcons.thermostats.freedom import MARK, placed_rows
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
-from kcons.thermostats.multistep.nesting import InnerOrder, Nesting, SlowKicks
+from kcons.thermostats.multistep.respa import GroupedForces, InnerOrder, Nesting, SlowKicks, group_names
 
 Spheres = Literal["split", "axes", "cluster", "global"]
 

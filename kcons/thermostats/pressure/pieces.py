@@ -16,7 +16,7 @@ from kcons.constraints.periodic.one_piece import follow_parents, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.thermostats.bodies import UNCHANGED, placed_rows, row_changes, rows_where, shifts
+from kcons.thermostats.freedom import UNCHANGED, placed_rows, row_changes, rows_where, shifts
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.topology.topology import connected
 

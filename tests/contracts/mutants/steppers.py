@@ -79,9 +79,12 @@ MUTANTS = {
             'row.name == "evaluate"« and row.here == 1→»',
             "test_interpreter.py::test_kicks_in_succession_and_before_other_operations",
         ),
-        ("«met[verb] += 1→pass»", "test_spheres.py::test_noise_is_a_function_of_seed_step_and_part"),
+        (
+            "«met[verb] += 1→pass»",
+            "thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part",
+        ),
     ],
-    "thermostats/monte_carlo/hamiltonian_monte_carlo.py": [
+    "thermostats/monte_carlo.py": [
         (
             "velocities=«-→»begin.velocities)",
             "test_hamiltonian_monte_carlo.py::test_every_decision_follows_from_the_energies[0.7]",
@@ -98,17 +101,15 @@ MUTANTS = {
             "kept += «(1 - self.keep)→self.keep» * drift_velocity",
             "test_hamiltonian_monte_carlo.py::test_atoms_at_rest_stay_and_planes_keep_their_momentum",
         ),
+        (
+            "(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])",
+            "test_replica_exchange.py::test_the_rule_and_what_changes_places",
+        ),
     ],
     "steppers/reversibility_check.py": [
         (
             "if not residual <«= self.tolerance→ 1e300»:",
             "test_hamiltonian_monte_carlo.py::test_what_cannot_be_taken_back_is_seen",
-        ),
-    ],
-    "thermostats/monte_carlo/replica_exchange.py": [
-        (
-            "(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])",
-            "test_replica_exchange.py::test_the_rule_and_what_changes_places",
         ),
     ],
     "thermostats/nose_hoover.py": [
@@ -213,7 +214,7 @@ MUTANTS = {
             "test_cell_rescaling.py::test_noise_of_few_pieces_stays_within_what_a_trial_may_change[anisotropic]",
         ),
     ],
-    "thermostats/temperature_split.py": [
+    "thermostats/configurational_temperature.py": [
         ("if «not np.all(miss <= OFF)→False»:", "test_temperature_split.py::test_frames_off_the_constraints"),
     ],
     "thermostats/slow_share.py": [
@@ -225,6 +226,12 @@ MUTANTS = {
     ],
     "constraints/arguments.py": [
         ('if «array.dtype.kind == "c"→False»:', "test_arguments.py::test_what_is_no_real_number_is_refused"),
+        ("«not 0 <= rng < 2**bits→False»", "test_arguments.py::test_what_is_neither_a_seed_nor_a_generator"),
+        ("or «value not in words→False»:", "test_methods.py::test_what_is_wrong_with_a_method_is_said"),
+        (
+            "for rule in () if «optional and→» value is None else asked:",
+            "test_arguments.py::test_none_where_it_is_no_value",
+        ),
     ],
     "constraints/periodic/images.py": [
         ("«| (self.item.kind == RowKind.LINEAR)→»", "test_images.py::test_atoms_in_any_image_are_held_as_whole_ones"),

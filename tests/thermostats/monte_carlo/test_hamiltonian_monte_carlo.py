@@ -30,8 +30,8 @@ from kcons.steppers import (
 )
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.freedom import MARK
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import CHANGE, POTENTIAL, PROPOSAL, ReversedSteps, stream
-from kcons.thermostats.monte_carlo.replica_exchange import potential_of
+from kcons.thermostats.langevin import noise_generator
+from kcons.thermostats.monte_carlo import CHANGE, POTENTIAL, PROPOSAL, ReversedSteps, potential_of
 
 
 def started(n=2):
@@ -70,7 +70,7 @@ def test_every_decision_follows_from_the_energies(keep):
     outcomes = set()
     for number in range(1, 31):
         after = sampler.step(held, state, dt)
-        random = stream(12, number, PROPOSAL)
+        random = noise_generator((12, 0), number, PROPOSAL)
         count = int(random.integers(2, 5))
         threshold = random.random()
         begin = replace(state, velocities=refreshed(held, state, kt, keep, random))

@@ -13,7 +13,8 @@ from kcons.constraints import Distance
 from kcons.errors import InputError
 from kcons.steppers import State, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange
-from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import EXCHANGE, POTENTIAL, stream
+from kcons.thermostats.langevin import noise_generator
+from kcons.thermostats.monte_carlo import EXCHANGE, POTENTIAL
 
 LADDER = [0.3, 0.45, 0.7]
 
@@ -33,7 +34,7 @@ def test_the_rule_and_what_changes_places():
     for number in range(40):
         after, made = exchange(states, LADDER, 5, number)
         pair = number % 2
-        u = stream(5, number, EXCHANGE).random(3)[pair]
+        u = noise_generator((5, 0), number, EXCHANGE).random(3)[pair]
         power = (1 / LADDER[pair] - 1 / LADDER[pair + 1]) * (energies[pair] - energies[pair + 1])
         assert made == [(math.log1p(-u) < power) if k == pair else None for k in range(2)]
         seen.add(made[pair])

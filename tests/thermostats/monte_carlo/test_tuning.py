@@ -13,7 +13,7 @@ from thermostat_systems import dumbbells
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import Rattle, System, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, best_acceptance, tune
-from kcons.thermostats.monte_carlo.tuning import DualAveraging
+from kcons.thermostats.monte_carlo import DualAveraging
 
 
 @pytest.mark.parametrize("start", [0.1, 0.5, 2.5])

@@ -11,7 +11,7 @@ from thermostat_systems import quartic, springs, system
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import ForceGroups, LangevinRespa
-from kcons.thermostats.multistep.force_groups import GroupedForces, group_names
+from kcons.thermostats.multistep.respa import GroupedForces, group_names
 
 X = np.random.default_rng(0).normal(size=(4, 3))
 NAMES = ("slow", "fast")

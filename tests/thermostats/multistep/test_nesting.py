@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Turn, drifts_of
-from kcons.thermostats.multistep.nesting import Level, levels_of, nested
+from kcons.thermostats.multistep.respa import Level, levels_of, nested
 
 THREE = levels_of({"fast": 12, "slow": 1, "medium": 4})
 

@@ -1,16 +1,24 @@
-"""Hamiltonian Monte Carlo on constraints: proposals by dynamics, accepted or rejected by the change of energy."""
+"""Hamiltonian Monte Carlo on constraints: averages without any error of the time step.
+
+Proposals by dynamics, each step of which is seen to be reversible, are accepted or rejected by the change of energy.
+The time step for a wanted share of accepted proposals is found before a run, and configurations are exchanged between
+neighboring temperatures.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import is_
+from typing import Annotated, TypeAlias
 from weakref import ref
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import Positive, Rng, Share, checked, seed_from
+from kcons.constraints.arguments import Positive, Rng, Share, checked, positive, seed_from, share, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import (
@@ -24,19 +32,13 @@ from kcons.errors import (
 from kcons.steppers import Rattle, ReversibilityCheck, State, Stepper, System
 from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
+from kcons.thermostats.langevin import noise_generator
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
 POTENTIAL, ACCEPTED, ENERGY, IRREVERSIBLE, UNSOLVED, NOT_FINITE, CHANGE, SUM, SQUARES, LAST = range(10)
 SIZE = 10
 #: Uses of random numbers, told apart in the counter of the generator; 0 is Langevin's.
 PROPOSAL, EXCHANGE = 1, 2
-
-
-def stream(seed: int, number: int, use: int) -> np.random.Generator:
-    """Random numbers that are a function of the seed, of the number of the step and of what they are for."""
-    key: NDArray[np.uint64] = np.array([seed, 0], dtype=np.uint64)
-    counter: NDArray[np.uint64] = np.array([0, 0, number, use], dtype=np.uint64)
-    return np.random.Generator(np.random.Philox(key=key, counter=counter))
 
 
 @dataclass(frozen=True)
@@ -278,7 +280,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
                     item="energy",
                     step=state.step + 1,
                 )
-        random = stream(self.seed, state.step + 1, PROPOSAL)
+        random = noise_generator((self.seed, 0), state.step + 1, PROPOSAL)
         count, threshold = int(random.integers(self.steps[0], self.steps[1] + 1)), math.log1p(-random.random())
         begin = replace(system.with_forces(state), velocities=self._refreshed(system, state, random))
         end, reason, change, potential = self._judged(system, begin, dt, count, threshold, held[POTENTIAL])
@@ -371,3 +373,236 @@ def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
             f"steps is {steps!r}; give a whole number, 1 or more, or the fewest and the most", item="steps"
         )
     return int(both[0]), int(both[1])
+
+
+#: Of dual averaging: how strongly proposals move the step, how many count as made already, how fast old ones are
+#: forgotten.
+PULL, BEFORE, FORGET = 0.2, 10, 0.75
+
+Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
+
+
+class DualAveraging:
+    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5)."""
+
+    @checked
+    def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
+        self.wanted = wanted
+        self._center = self._log = math.log(dt)
+        self._sum = self._mean = 0.0
+        self._told: list[float] = []
+        self.made = 0
+
+    @property
+    def dt(self) -> float:
+        """For the next proposal."""
+        return math.exp(self._log)
+
+    @property
+    def result(self) -> float:
+        """The mean, later proposals counting more."""
+        return math.exp(self._mean) if self.made else self.dt
+
+    @property
+    def acceptance(self) -> float:
+        """Mean probability of the second half of the proposals."""
+        second = self._told[(self.made + 1) // 2 :]
+        return sum(second) / len(second)
+
+    def refuse_failure(self, shown: Callable[[float], str] = "{:.3g}".format) -> None:
+        """Raise `ConvergenceError` where none of the second half of the proposals succeeded; `shown` tells a time."""
+        if not self.acceptance > 0:
+            raise ConvergenceError(
+                f"no proposal succeeded with time steps down to {shown(self.dt)}; is the start sound?"
+            )
+
+    def learn(self, probability: float) -> None:
+        """A proposal with `dt` had this probability of being accepted."""
+        self.made += 1
+        self._told.append(probability)
+        self._sum += self.wanted - probability
+        self._log = self._center - math.sqrt(self.made) / PULL * self._sum / (self.made + BEFORE)
+        share = self.made**-FORGET
+        self._mean += share * (self._log - self._mean)
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What `tune` found.
+
+    Attributes
+    ----------
+    dt : float
+        The time step.
+    acceptance : float
+        Mean probability of the second half of the proposals, whose steps differed still.
+    state : State
+        To go on from, with counts that begin anew.
+    """
+
+    dt: float
+    acceptance: float
+    state: State
+
+
+def best_acceptance(order: int) -> float:
+    """The share of accepted proposals that costs least, p/(p + 1) for order p.
+
+    For many degrees of freedom dH is normal, its deviation s is proportional to dt^p and its mean s^2/2, and
+    erfc(s/sqrt(8)) of the proposals are accepted. dt erfc(s/sqrt(8)) is largest for 0.651 at order 2, 0.796 at order 4
+    and 0.856 at order 6.
+    """
+    return order / (order + 1)
+
+
+@checked
+def tune(
+    system: System,
+    state: State,
+    dt: float,
+    sampler: HamiltonianMonteCarlo,
+    *,
+    wanted: float | None = None,
+    proposals: Proposals = 80,
+) -> Tuned:
+    """Find the time step for a share of accepted proposals, by proposals with steps that differ.
+
+    They bring the state towards equilibrium too, but are no sample: a step that looks at what it did has no stationary
+    density. Run with the step that was found, which stays.
+
+    Parameters
+    ----------
+    system : System
+    state : State
+    dt : float
+        To begin with.
+    sampler : HamiltonianMonteCarlo
+        Its number of steps stays, so that trajectories become longer or shorter with the step.
+    wanted : float, optional
+        Between 0 and 1; by default what costs least for the order of the stepper, see `best_acceptance`.
+    proposals : int
+
+    Raises
+    ------
+    InputError
+        A step that is not positive, a share not between 0 and 1, fewer than 20 proposals.
+    ConvergenceError
+        No proposal of the second half could be made, however small the step became.
+    KconsError
+        As `HamiltonianMonteCarlo.step`.
+    """
+    search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
+    sampler.check(system)
+    known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
+    held = np.zeros(SIZE) if known is None else known
+    for _ in range(proposals):
+        before = held[SUM]
+        state = sampler.step(system, state, search.dt)
+        held = np.asarray(state.thermostat)
+        search.learn(float(held[SUM] - before))
+    search.refuse_failure(system.shown_time)
+    potential, held = held[POTENTIAL], np.zeros(SIZE)
+    held[POTENTIAL] = potential
+    return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
+
+
+def exchange(
+    states: Sequence[State], thermal_energies: Sequence[float], rng: Rng, number: int
+) -> tuple[list[State], list[bool | None]]:
+    """Offer neighbors an exchange: with probability min(1, exp((1/kT_i - 1/kT_j) (U_i - U_j))) it is made.
+
+    Configurations change places and velocities are scaled with sqrt(T), which leaves the product of all densities as it
+    is. Pairs (0, 1), (2, 3), ... take turns with (1, 2), (3, 4), ... Numbers, clocks and counts stay with their
+    temperatures. Each run needs a seed of its own: with the same one all draw the same numbers, and runs that are not
+    independent do not have the product of the densities.
+
+    Parameters
+    ----------
+    states : sequence of State
+        One for each temperature, of the same system, after at least one step of `HamiltonianMonteCarlo` each: they know
+        their potential energies.
+    thermal_energies : sequence of float
+        k_B T of each.
+    rng : int, numpy.random.Generator or None
+    number : int
+        Of the round: random numbers are a function of it and of the integer given as `rng`.
+
+    Returns
+    -------
+    states : list of State
+    made : list of bool or None, one less than states
+        Whether each pair was exchanged; None where it had no turn.
+
+    Raises
+    ------
+    InputError
+        A state without a potential energy; states of Systems of other masses or constraints.
+    """
+    if not all(isinstance(given, Sequence | np.ndarray) for given in (states, thermal_energies)):
+        raise InputError("give a sequence of states, and of as many temperatures", item="states")
+    kt = np.array([positive(value, "thermal_energies") for value in thermal_energies])
+    if len(states) < 2 or len(states) != len(kt):
+        raise InputError(
+            f"{len(states)} states and {len(kt)} temperatures; give one for each, two or more", item="states"
+        )
+    number = whole_number(number, "number", 0, 2**64 - 1)
+    for k, state in enumerate(states):
+        if (
+            not isinstance(state, State)
+            or state.thermostat is None
+            or state.thermostat.shape != (SIZE,)
+            or math.isnan(potential_of(state))
+        ):
+            raise InputError(
+                f"state {k} does not know its potential energy; make a step of HamiltonianMonteCarlo with it first",
+                item="states",
+            )
+        if state.positions.shape != states[0].positions.shape:
+            raise InputError(f"state {k} has another number of atoms than state 0", item="states")
+        _refuse_others(states[0], state, k)
+    chances = np.log1p(-noise_generator((seed_from(rng), 0), number, EXCHANGE).random(len(states)))
+    after = list(states)
+    told: list[bool | None] = [None] * (len(states) - 1)
+    for k in range(int(number) % 2, len(states) - 1, 2):
+        a, b = states[k], states[k + 1]
+        told[k] = bool(chances[k] < (1 / kt[k] - 1 / kt[k + 1]) * (potential_of(a) - potential_of(b)))
+        if told[k]:
+            scale = math.sqrt(float(kt[k] / kt[k + 1]))
+            after[k], after[k + 1] = _moved(b, a, scale), _moved(a, b, 1 / scale)
+    return after, told
+
+
+def potential_of(state: State) -> float:
+    """The potential energy that a state of `HamiltonianMonteCarlo` knows; NaN if it does not."""
+    return math.nan if state.thermostat is None else float(state.thermostat[POTENTIAL])
+
+
+def _refuse_others(first: State, other: State, k: int) -> None:
+    """Refuse states of which one is not on the constraints of the other."""
+    systems = [s.origin[0]() if s.origin is not None and s.origin[0] is not None else None for s in (first, other)]
+    if systems[0] is None or systems[1] is None:
+        return
+    if not np.array_equal(systems[0].masses, systems[1].masses):
+        raise InputError(f"state {k} has other masses than state 0", item="states")
+    for system, state in zip(systems, (other, first), strict=True):
+        assert system is not None
+        try:
+            system.initial_state(state.positions, time=state.time)
+        except InputError as error:
+            raise InputError(f"state {k} is of other constraints than state 0: {error}", item="states") from None
+
+
+def _moved(there: State, here: State, scale: float) -> State:
+    """The configuration of `there`, with velocities scaled, in the run of `here`."""
+    assert there.thermostat is not None and here.thermostat is not None
+    held = here.thermostat.copy()
+    held[POTENTIAL] = there.thermostat[POTENTIAL]
+    return replace(
+        here,
+        positions=there.positions,
+        velocities=scale * there.velocities,
+        forces=there.forces,
+        remainder=there.remainder,
+        thermostat=held,
+        origin=there.origin,
+    )
