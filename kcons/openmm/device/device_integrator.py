@@ -174,6 +174,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     """
 
     _program_type = DeviceProgram
+    program: DeviceProgram
     #: Rows of the Context, once they are known.
     rows: Any = None
     _seed = 0
@@ -404,9 +405,7 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
 
 
 def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, rows: Any) -> Plan:
-    operations = [
-        Op(*(tuple(value) if isinstance(value, list) else value for value in op)) for op in described["operations"]
-    ]
+    operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
     names = list(dict.fromkeys(op.group for op in operations if op.verb == "evaluate"))
     seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
     return plan(

@@ -216,7 +216,7 @@ def standard_arrays(
         Array("parameters", "mixed", np.array([*parameters, 0.0])),
         Array("memory", "mixed", np.array([*memory, 0.0]), saved=True),
         Array("memory_before", "mixed", np.zeros(len(memory) + 1)),
-        Array("seed", "int", np.array([seed])),
+        Array("seed", "int", np.array([seed]), saved=True),
         Array("failure", "int", np.zeros(3, dtype=np.int64)),
         Array("failure_residual", "mixed", np.zeros(1)),
         Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
