@@ -79,7 +79,10 @@ MUTANTS = {
             'row.name == "evaluate"« and row.here == 1→»',
             "test_interpreter.py::test_kicks_in_succession_and_before_other_operations",
         ),
-        ("«met[verb] += 1→pass»", "thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part"),
+        (
+            "«met[verb] += 1→pass»",
+            "thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part",
+        ),
     ],
     "thermostats/monte_carlo.py": [
         (
