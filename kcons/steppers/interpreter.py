@@ -84,7 +84,7 @@ class Interpreted(Listed):
             on_their_way = self.begun(system, state, dt, self.at_once(state, steps))
         after = on_their_way.through()
         self.note(after)
-        if known is not None and not on_their_way.far:
+        if known is not None:
             system.going = after, self, known, on_their_way
         return after, on_their_way.made
 
@@ -162,14 +162,12 @@ class Interpreter:
     numbers : ndarray
     number : int
         Of the step that is made.
-    far : bool
-        Whether they have ended far from the origin, from where the next ones have to begin anew.
     """
 
     __slots__ = (
         *("system", "dt", "program", "start", "steps", "made", "number", "shape", "shift", "begun", "x", "v", "out"),
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
-        *("far", "unchanging"),
+        "unchanging",
     )
 
     #: Whether forces are those of the System's function, all at once.
@@ -219,7 +217,9 @@ class Interpreter:
 
     def resume(self, state: State, steps: int) -> None:
         """Get ready for more steps, from the state that the last ones have ended in."""
-        self.start, self.steps, self.made, self.x = state, steps, -1, state.positions
+        self.start, self.steps, self.made, self.x, self.shift = state, steps, -1, state.positions, None
+        if state.remainder is not None:
+            self.steps, (self.x, self.shift) = 1, self.system.near_origin(state)
         self.v, self.out = state.velocities.copy(), np.empty(self.shape)
         if self.low is None:
             self.push, self.spare = self.v, self.out
@@ -451,11 +451,10 @@ class Interpreter:
 
     def end(self, here: int) -> State:
         """The state, with remainders from here on if it is far from the origin by now."""
-        x = self.x if self.x.flags.writeable else self.x.copy()
+        x = self.x if self.shift is not None or self.x.flags.writeable else self.x.copy()
         when, arrays = (self.then, self.left_over_then), (x, self.v, self.applied(here))
-        shift, far = self.shift, bool(self.room[FAR])
-        self.far = far or shift is not None
-        return self.system.ended(self.start, self.number, when, arrays, shift, self.low, far, self.variables())
+        more = self.shift, self.low, bool(self.room[FAR]), self.variables()
+        return self.system.ended(self.start, self.number, when, arrays, *more)
 
     def applied(self, here: int) -> FloatArray | None:
         """The forces at the end, None where a drift came last."""

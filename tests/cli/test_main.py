@@ -63,7 +63,7 @@ MISTAKES = [
     ("warmup protein", "did you mean 'proteins'?"),
     ("compare chain --methods shake", "there is no method 'shake'"),
     ("compare chain --methods ,", "no method"),
-    ("compare chain --size 0", "at least one bond"),
+    ("compare chain --size 0", "size is 0; give a whole number, 1 or more"),
     ("compare chain --size 3 --dt 3", "does not divide the horizon"),
     ("compare chain --size 3 --dt ,", "--dt is empty"),
     ("compare chain --seed -1", "non-negative"),

@@ -459,6 +459,13 @@ def test_what_is_neither_a_seed_nor_a_generator(rng):
     assert drawn[0] == drawn[1] and seed_from(None) != seed_from(None) and seed_from(7) == 7
 
 
+def test_none_where_it_is_no_value():
+    """Annotations say where it is one: of `Isokinetic`, not of `Langevin`."""
+    assert Isokinetic(None).thermal_energy is None
+    with pytest.raises(InputError, match="thermal_energy is None; give a positive number"):
+        Langevin(None, 1.0, 1)
+
+
 @pytest.mark.parametrize("bonds", [[[0, 1], [2]], "ab", [[0.0, 1.5]], [0, 1], [[1, 1]], [[-1, 0]]])
 def test_what_is_no_pair_of_atoms(bonds):
     with pytest.raises(InputError, match="bonds"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -26,7 +27,9 @@ PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
 EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
 #: Pages on a program that no extra installs.
-NEEDS = {"tutorials/replica_exchange.md": "openmmtools"}
+NEEDS = {
+    f"tutorials/{name}.md": package for name, package in runpy.run_path(ROOT / "docs/notebooks.py")["NEEDS"].items()
+}
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 #: Between the cells of a table.

@@ -7,6 +7,8 @@ import re
 
 import pytest
 from committed_pages import ROOT
+from nbclient.exceptions import CellExecutionError
+from nbformat import v4
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +42,6 @@ def test_a_notebook_runs_and_a_cell_that_fails_is_told(notebooks, tmp_path):
         if "text" in output
     ]
     assert any("kept to the precision of the file" in text for text in said)
-    notebook.cells.append({"cell_type": "code", "source": "assert False", "metadata": {}, "outputs": []})
-    from nbclient.exceptions import CellExecutionError
-
-    with pytest.raises(CellExecutionError):
+    notebook.cells.append(v4.new_code_cell("assert False"))
+    with pytest.raises(CellExecutionError, match="assert False"):
         notebooks.run(notebook, tmp_path)

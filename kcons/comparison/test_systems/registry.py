@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from kcons.comparison.test_systems.system import TestSystem
-from kcons.constraints.arguments import Rng, seed_from
+from kcons.constraints.arguments import Count, Rng, checked, seed_from
 from kcons.errors import InputError, did_you_mean
 
 
@@ -66,7 +66,8 @@ def add_system(
     SYSTEMS[name] = Entry(make, text, size, size if quick_size is None else quick_size, unit, only, takes, options)
 
 
-def build(name: str, size: int | None = None, rng: Rng = 1, *, quick: bool = False, **options: Any) -> TestSystem:
+@checked
+def build(name: str, size: Count | None = None, rng: Rng = 1, *, quick: bool = False, **options: Any) -> TestSystem:
     """The test system called `name`.
 
     Parameters

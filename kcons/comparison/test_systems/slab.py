@@ -14,7 +14,6 @@ from kcons.comparison.test_systems.registry import add_system
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError
 from kcons.motion.motion import Motion
 
 #: C-O distance, and height of C above a top site, in Å.
@@ -27,8 +26,6 @@ TEMPERATURE = 300.0
 
 def build(size: int, rng: int) -> TestSystem:
     """`size` molecules, one on each 2 x 2 patch; patches beyond their number are left bare."""
-    if size < 1:
-        raise InputError(f"the slab needs at least one molecule, not {size}", item="size")
     across = math.ceil(math.sqrt(size))
     along = math.ceil(size / across)
     atoms = fcc111("Cu", (PATCH * across, PATCH * along, LAYERS), vacuum=VACUUM)

@@ -18,7 +18,6 @@ from kcons.comparison.test_systems.system import REDUCED, Reference, TestSystem
 from kcons.constraints import Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 
 RADIUS = 1.0
 #: The start near the top: angles from it, and speeds. What a method does wrong there is magnified a hundred times.
@@ -27,8 +26,6 @@ TILT, SLOW = 0.02, 0.01
 
 def build(size: int, rng: int, *, gravity: float = 0.0, near_top: bool = False) -> TestSystem:
     """`size` particles, each on its own sphere of radius 1, with speeds between 0.5 and 1."""
-    if size < 1:
-        raise InputError(f"a test system needs at least one particle, not {size}", item="size")
     generator = np.random.default_rng(rng)
     n: FloatArray = generator.standard_normal((size, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]

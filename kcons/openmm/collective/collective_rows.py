@@ -43,7 +43,7 @@ from kcons.openmm.collective.coordinates import (
     put_in_groups,
     unit_of,
 )
-from kcons.openmm.collective.row_program import GroupRows, owner, require_holder, variables_of
+from kcons.openmm.collective.row_program import GroupRows, owner, require_holder
 from kcons.openmm.integrator.part import BOND, NEAR, Solver, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
@@ -518,8 +518,7 @@ class CollectiveRows(GroupRows):
     def _targets_and_rates(self, context: openmm.Context) -> tuple[FloatArray, FloatArray]:
         """What the integrator was made with or told; its variables are copies for the program."""
         holder = owner(self, context)
-        program = getattr(holder, "program", None)
-        known = {} if holder is None else variables_of(holder) if program is None else program.settings
+        known = {} if holder is None else holder.program.settings
 
         def now(name: str, given: Sequence[float | str | None]) -> FloatArray:
             found = [

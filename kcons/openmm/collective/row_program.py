@@ -18,6 +18,7 @@ from typing import Any
 import openmm
 
 from kcons.errors import InputError
+from kcons.openmm.integrator.ensemble import Integrator
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
@@ -29,7 +30,7 @@ PIVOT = 1e-10
 #: A push that is not measured leaves this part of sigma at most; what it leaves more, the next step takes away.
 _LEFT = 0.01
 #: Integrators whose programs hold rows, by the address of the object of OpenMM.
-_HOLDING: weakref.WeakValueDictionary[int, openmm.CustomIntegrator] = weakref.WeakValueDictionary()
+_HOLDING: weakref.WeakValueDictionary[int, Integrator] = weakref.WeakValueDictionary()
 
 
 class GroupRows(Part):
@@ -99,7 +100,8 @@ class GroupRows(Part):
 
     def declare(self, p: Program) -> None:
         c, integrator = self.code, p.integrator
-        _HOLDING[int(integrator.this)] = integrator
+        if isinstance(integrator, Integrator):
+            _HOLDING[int(integrator.this)] = integrator
         scheme = getattr(integrator, "scheme", None)
         alone = len(getattr(integrator, "parts", (self,))) == 1
         self._leapfrog = scheme is None
@@ -429,14 +431,12 @@ class GroupRows(Part):
     # -- seen from Python -----------------------------------------------------------------------
 
     def _clock(self, integrator: openmm.CustomIntegrator) -> float:
-        """The time of the targets between steps."""
-        return clock_of(variables_of(integrator), self.code_in(integrator)) if self._drives else 0.0
-
-
-def clock_of(variables: dict[str, float], code: int) -> float:
-    """The time of the targets of the part with this number; the step made last counts where it was kept."""
-    kept = variables[f"began{code}"] != variables["good_steps"]
-    return variables[f"clock{code}"] + (variables[f"flown{code}"] if kept else 0.0)
+        """The time of the targets between steps; the step made last counts where it was kept."""
+        if not self._drives:
+            return 0.0
+        c, read = self.code_in(integrator), integrator.getGlobalVariableByName
+        kept = read(f"began{c}") != read("good_steps")
+        return float(read(f"clock{c}") + (read(f"flown{c}") if kept else 0.0))
 
 
 def require_holder(integrator: openmm.CustomIntegrator) -> None:
@@ -447,24 +447,16 @@ def require_holder(integrator: openmm.CustomIntegrator) -> None:
         )
 
 
-def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
-    """All global variables of an integrator by name."""
-    numbers = range(integrator.getNumGlobalVariables())
-    return {integrator.getGlobalVariableName(k): integrator.getGlobalVariable(k) for k in numbers}
-
-
-def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
+def owner(rows: GroupRows, context: openmm.Context) -> Integrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
     require_context(context)
     integrator = context.getIntegrator()
-    members = [integrator]
-    if isinstance(integrator, openmm.CompoundIntegrator):
-        members = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
-    known = [_HOLDING.get(int(one.this), one) for one in members if isinstance(one, openmm.CustomIntegrator)]
-    holding = [one for one in known if rows._of("push", 0, one) in variables_of(one)]
+    compound = isinstance(integrator, openmm.CompoundIntegrator)
+    members = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())] if compound else [integrator]
+    known = [_HOLDING.get(int(one.this)) for one in members]
+    holding = [one for one in known if one is not None and rows in one.parts]
     # Of members of a CompoundIntegrator the one that made steps last.
-    ours = (one for one in holding if getattr(one, "program", holding) is rows.program)
-    return next(ours, next(iter(holding), None))
+    return next((one for one in holding if one.program is rows.program), next(iter(holding), None))
 
 
 def _halved(integrator: Any, scheme: Any) -> bool:

@@ -21,7 +21,7 @@ from kcons.openmm.device.rows import DeviceRows, rows_of
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import SystemRows
+from kcons.openmm.integrator.system_checks import SystemRows, settled_rows
 from kcons.openmm.quantities import accepted, masses_of
 from kcons.openmm.states import positions_of
 
@@ -93,6 +93,10 @@ class KernelRows(CarriedConstraints):
         KconsError
             As `rows_of`.
         """
+        pairs, lengths = system_rows
+        # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
+        lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
+        system_rows = pairs, lengths
         made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
         if self._bound is None or self._of != made_of:
             cell = None if self._wraps is False else cell

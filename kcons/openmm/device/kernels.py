@@ -192,7 +192,8 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
         ]
         unpack = " ".join(lines)
     else:
-        own_arrays = [f"GLOBAL {array.kind}* {array.name}" for array in arrays]
+        alone = "" if scratch else "RESTRICT "  # items of a group read what others have written
+        own_arrays = [f"GLOBAL {array.kind}* {alone}{array.name}" for array in arrays]
         given = ", ".join([*_GIVEN, *(f"GLOBAL const mm_long* RESTRICT {name}" for name in forces), *own_arrays])
         unpack = ""
     words = {
@@ -220,7 +221,7 @@ def standard_arrays(
         Array("failure_residual", "mixed", np.zeros(1)),
         Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
         Array("kept", "mixed", np.zeros(3 * particles)),
-        Array("looked", "mixed", np.zeros(6)),
+        Array("looked", "mixed", np.zeros(7)),
     ]
 
 
@@ -268,8 +269,13 @@ def divided(operations: Sequence[Op], noisy: bool) -> tuple[list[Op], list[Op], 
     last = max((k for k, op in enumerate(ops) if op.verb == "evaluate"), default=-1) + 1
     if not last:
         raise UnsupportedError("a step on the device evaluates forces at its end; the leapfrog does not")
+    flown = max((k for k, op in enumerate(ops) if op.verb == "fly"), default=-1) + 1
+    if noisy and all(op.verb in ("evaluate", "project") for op in ops[flown:last]):
+        flown = last  # nothing changes v before: only the end of a call has to take the sum
     head, tail = ops[:last], [op._replace(begun=-1) for op in ops[last:]]
-    noted = [Op("note"), *tail] if noisy else tail
+    noted = [Op("note"), *tail] if noisy and flown == last else tail
+    if noisy and flown < last:
+        head = [*head[:flown], Op("note"), *head[flown:]]
     return joined(head), joined([*tail, *head]), joined(noted)
 
 
@@ -357,12 +363,14 @@ _LOOK = (
   mixed v[3], w[1];
   GET_V(0, p)
   acc0 += v[0]*v[0]+v[1]*v[1]+v[2]*v[2];
+  if (w[0] != 0) acc2 += (v[0]*v[0]+v[1]*v[1]+v[2]*v[2])/w[0];
  }
  for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
 """
     + _REDUCE
     + """ if (LOCAL_ID == 0) {
   looked[0] = shared[0]; looked[1] = shared[WG]; looked[5] = failure_residual[0];
+  looked[6] = shared[2*WG];
   for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
  }
 """

@@ -226,6 +226,12 @@ MUTANTS = {
     ],
     "constraints/arguments.py": [
         ('if «array.dtype.kind == "c"→False»:', "test_arguments.py::test_what_is_no_real_number_is_refused"),
+        ("«not 0 <= rng < 2**bits→False»", "test_arguments.py::test_what_is_neither_a_seed_nor_a_generator"),
+        ("or «value not in words→False»:", "test_methods.py::test_what_is_wrong_with_a_method_is_said"),
+        (
+            "for rule in () if «optional and→» value is None else asked:",
+            "test_arguments.py::test_none_where_it_is_no_value",
+        ),
     ],
     "constraints/periodic/images.py": [
         ("«| (self.item.kind == RowKind.LINEAR)→»", "test_images.py::test_atoms_in_any_image_are_held_as_whole_ones"),

@@ -26,7 +26,7 @@ from openmm_systems import GPUS, started
 from kcons import ConstraintSet
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.projection import project_velocities
-from kcons.errors import ConstraintError, ConvergenceError, InfeasibleError, SingularGeometryError
+from kcons.errors import ConstraintError, ConvergenceError, InfeasibleError, SingularGeometryError, UnsupportedError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, positions_of, velocities_of
 
 THREE = [Distance([0, 3]), Dihedral([0, 1, 2, 3]), Angle([2, 3, 4])]
@@ -114,6 +114,12 @@ def _held_without_check(rows, constrained=False):
     part = CollectiveRows(system, rows, positions=CHAIN)
     integrator = ProjectedIntegrator(0.001, parts=[part], tolerance=1e-13)
     return context_of(system, integrator, CHAIN, some_velocities()), integrator, part
+
+
+def test_functions_that_cannot_be_copied_are_refused():
+    context, _, part = _held_without_check([Row(openmm.PythonForce(lambda state: (0.0, 0.0 * CHAIN)), 0.3)])
+    with pytest.raises(UnsupportedError, match="Define the function in a module"):
+        part.restore(context)
 
 
 def test_row_without_gradient_is_named():

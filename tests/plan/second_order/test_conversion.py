@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -297,15 +295,6 @@ def test_many_molecules_are_found_one_by_one() -> None:
     held = converted(Distance(pairs), x)
     assert counts(held) == (600 + 200 + 60, 600 + 20 * 27)
     assert np.abs(held.value(x)).max() < 1e-13
-
-
-def test_documented_examples_run() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "hard-cases.md").read_text(encoding="utf-8")
-    snippets = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    assert len(snippets) >= 5
-    names: dict[str, object] = {}
-    for snippet in snippets:
-        exec(compile(snippet, "docs/hard-cases.md", "exec"), names)
 
 
 @pytest.mark.slow

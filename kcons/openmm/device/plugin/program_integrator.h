@@ -52,7 +52,7 @@ typedef int (*Planner)(Plan* plan, const Given* given);
 
 // Of a step that failed: what the kernels have told.
 struct Look {
-    double squares = 0, residual = 0;
+    double squares = 0, residual = 0, twice = 0;   // twice: the kinetic energy
     int failed = 0, step = 0, row = 0;
 };
 
@@ -84,7 +84,8 @@ private:
     Plan planned(bool whole) const;
     std::vector<std::string> savedNames() const;
     mutable OpenMM::Kernel handle;
-    double middleKinetic = -1, restoredKinetic = -1;   // -1: none is known
+    // Of the middle of the last step, and of the velocities that it ended with: those of others have another. -1: none.
+    double middleKinetic = -1, endKinetic = -1;
 };
 
 // What platforms have in common; each says how a kernel is launched and where arrays are.
