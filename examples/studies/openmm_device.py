@@ -28,8 +28,8 @@ from kcons.openmm import (
     Precision,
     ProjectedIntegrator,
     constraints_of,
+    move_constraints,
     positions_of,
-    take_constraints,
 )
 
 #: Ensembles by name, and what OpenMM has beside them.
@@ -105,7 +105,7 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     plain, positions = protein(VILLIN, app.HBonds)
     start = start_of(plain, positions, place, 2000 if full else 20)
     system, _ = protein(VILLIN, app.HBonds)
-    take_constraints(system, "all")
+    move_constraints(system, "all")
     topology = app.PDBFile(str(VILLIN)).topology
     held = constraints_of(topology, start.getPositions(), "bonds+angles", system=system)
     integrator = ProjectedIntegrator(2 * STEP, parts=list(held), device=True)

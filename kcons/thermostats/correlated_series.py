@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.fft import dct
 
 from kcons.constraints.arguments import as_float_array, positive
 from kcons.constraints.target import FloatArray
@@ -87,11 +86,18 @@ class _Processes(NamedTuple):
     prior: FloatArray
 
 
+def _cosines(values: FloatArray) -> FloatArray:
+    """The orthonormal cosine transform (DCT-II) along the first axis."""
+    from scipy.fft import dct  # slow to import
+
+    return np.asarray(dct(values, axis=0, norm="ortho"))
+
+
 @lru_cache(maxsize=4)
 def _processes(cosines: int, degree: int) -> _Processes:
     """All that are tried, for the mean (degree 0) or the slope (1) of as many values as cosines."""
     k, t = np.arange(cosines), np.arange(cosines, dtype=np.float64)
-    design = dct(np.vander(t - t.mean(), degree + 1), axis=0, norm="ortho")
+    design = _cosines(np.vander(t - t.mean(), degree + 1))
     inside = np.linalg.qr(design, mode="complete")[0][:, degree + 1 :]
     rule = np.linalg.pinv(design)[0]
     same_parity = (k[:, None] - k) % 2 == 0
@@ -123,7 +129,7 @@ def _error(values: FloatArray, degree: int) -> tuple[float, int]:
     Of values whose mean, and slope, is 0.
     """
     # In the fastest third the spectrum of values at intervals is not that of a continuous motion.
-    found = dct(values, norm="ortho")[: min(_COSINES, max(2 * len(values) // 3, _FEWEST_COSINES))]
+    found = _cosines(values)[: min(_COSINES, max(2 * len(values) // 3, _FEWEST_COSINES))]
     while len(found) >= 2 * _FEWEST_COSINES:
         squares = found**2
         if squares @ np.cos(np.pi / len(found) * np.arange(len(found))) <= _SMOOTH * squares.sum():

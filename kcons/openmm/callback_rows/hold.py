@@ -18,7 +18,7 @@ from openmm import unit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-from kcons.constraints import Angle, Constraint, Distance
+from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -27,8 +27,6 @@ from kcons.openmm.quantities import masses_of
 
 #: Hydrogens, also heavy ones, are lighter than this (dalton).
 _HYDROGEN = 4.5
-#: Angles closer to 180 degrees than this stay distances.
-_STRAIGHT = np.radians(5.0)
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
 #: Forces whose particles OpenMM counts as bonded.
@@ -42,7 +40,6 @@ def move_constraints(
     which: Choice = "all",
     *,
     keep_water: bool = True,
-    angles: bool = False,
 ) -> list[Constraint]:
     """Take constraints out of a System and return them as constraints of kcons.
 
@@ -59,14 +56,11 @@ def move_constraints(
     keep_water : bool
         Whether rigid water stays with OpenMM, whose SETTLE is fastest there; molecules among given atoms are taken
         all the same.
-    angles : bool
-        Whether distances that close a triangle over two held bonds (createSystem(constraints=HAngles)) come back as
-        angles. Rigid water and angles near 180 degrees stay distances.
 
     Returns
     -------
     list of Constraint
-        A Distance in nm and, where asked for, an Angle; empty if there is nothing to take.
+        A Distance in nm; empty if there is nothing to take.
 
     Raises
     ------
@@ -75,7 +69,7 @@ def move_constraints(
     """
     table = _table(system)
     chosen = _chosen(system, table, which, keep_water)
-    rows = _as_rows(table, chosen, angles)
+    rows = _as_rows(table, chosen)
     _release(system, table, chosen)
     return rows
 
@@ -87,7 +81,6 @@ def hold(
     *,
     take: Choice = "touched",
     keep_water: bool = True,
-    angles: bool = False,
     periodic: bool | None = None,
     degenerate: Literal["convert", "raise"] = "convert",
     join: bool = False,
@@ -109,7 +102,7 @@ def hold(
         On or near the constraints; targets left at None are taken from them.
     take : 'touched', 'all', 'hbonds' or iterable of int
         Which clusters of the System's constraints move over besides those that a row touches.
-    keep_water, angles
+    keep_water
         As for `move_constraints`; water that a row touches moves over.
     periodic, degenerate, time
         As for `CarriedConstraints`.
@@ -133,7 +126,7 @@ def hold(
     chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
-    taken = _as_rows(table, chosen, angles)
+    taken = _as_rows(table, chosen)
     part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
     links = [_neighbors(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
@@ -151,7 +144,7 @@ def hold(
 def constraints_about(system: openmm.System, atoms: IntArray) -> list[Constraint]:
     """The constraints of a System in the clusters of some atoms, as a `Distance` in nm; the System keeps them."""
     table = _table(system)
-    return _as_rows(table, _sharing(table, atoms), angles=False)
+    return _as_rows(table, _sharing(table, atoms))
 
 
 @dataclass
@@ -219,43 +212,8 @@ def _sharing(table: _Table, atoms: IntArray) -> NDArray[np.bool_]:
     return np.asarray(np.isin(table.cluster, table.clusters[atoms]))
 
 
-def _as_rows(table: _Table, chosen: NDArray[np.bool_], angles: bool) -> list[Constraint]:
-    rows: list[Constraint] = []
-    distances = chosen.copy()
-    if angles:
-        triples, values, replaced = _as_angles(table, chosen & ~table.water)
-        distances[replaced] = False
-        if triples:
-            rows.append(Angle(triples, values))
-    if distances.any():
-        rows.insert(0, Distance(table.pairs[distances], table.lengths[distances]))
-    return rows
-
-
-def _as_angles(table: _Table, chosen: NDArray[np.bool_]) -> tuple[list[tuple[int, int, int]], list[float], list[int]]:
-    """Angles (i, j, k), their values, and the constraints i-k that they replace.
-
-    From the shortest constraint up: one that closes a triangle over two shorter ones that are bonds is the far side
-    of an angle, any other is a bond.
-    """
-    bonds: dict[int, dict[int, float]] = {}
-    triples, values, replaced = [], [], []
-    numbers = np.flatnonzero(chosen)
-    for number in numbers[np.argsort(table.lengths[numbers], kind="stable")].tolist():
-        i, k = table.pairs[number].tolist()
-        far = float(table.lengths[number])
-        first, second = bonds.setdefault(i, {}), bonds.setdefault(k, {})
-        vertex = next((j for j in first if j in second and max(first[j], second[j]) < (1 - 1e-6) * far), None)
-        if vertex is None:
-            first[k] = second[i] = far
-            continue
-        a, b = first[vertex], second[vertex]
-        cosine = (a * a + b * b - far * far) / (2 * a * b)
-        if cosine > -np.cos(_STRAIGHT):
-            triples.append((i, vertex, k))
-            values.append(float(np.arccos(cosine)))
-            replaced.append(number)
-    return triples, values, replaced
+def _as_rows(table: _Table, chosen: NDArray[np.bool_]) -> list[Constraint]:
+    return [Distance(table.pairs[chosen], table.lengths[chosen])] if chosen.any() else []
 
 
 # -- changes --------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.openmm.states import energy_of, forces_at, positions_of, velocities_of
+from kcons.openmm.states import energy_of, positions_of
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
 from kcons.thermostats.freedom import atom_numbers
@@ -304,18 +304,6 @@ class Isokinetic(CountsMomenta):
         if guard is not None and guard.alive is not None and guard.started:
             twice = self._twice_kinetic(integrator, self.masses(integrator), 0.0)
             integrator.program.set("two_k", twice)
-
-    def friction(self, integrator: Integrator) -> float:
-        """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
-        context = integrator.context
-        masses, v = self.masses(integrator), velocities_of(context)
-        f = forces_at(context, integrator.getIntegrationForceGroups())
-        inside = masses > 0
-        return float(np.sum(v[inside] * f[inside]) / (masses @ np.einsum("ij,ij->i", v, v)))
-
-    def compression_rate(self, integrator: Integrator) -> float:
-        """Divergence of the flow in phase space, -(g - 1) alpha, in 1/ps."""
-        return -(self.count(integrator) - 1) * self.friction(integrator)
 
     def conserved_energy(self, integrator: Integrator) -> float:
         """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""

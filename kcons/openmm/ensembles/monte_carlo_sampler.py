@@ -20,7 +20,6 @@ from kcons.errors import (
     ReversibilityError,
     UnsupportedError,
 )
-from kcons.openmm.ensembles.conserved_momenta import conserved_momenta
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Step
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -30,7 +29,6 @@ from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts, best_acceptance
-from kcons.thermostats.freedom import drift_velocity
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import (
     ACCEPTED,
@@ -127,8 +125,6 @@ class HamiltonianMonteCarlo:
         number of the proposal.
     keep : float
         The part of the velocities that a proposal keeps, from 0 to less than 1.
-    conserve_momentum : bool
-        Velocities are drawn relative to the center of mass, in the directions in which no row knows a place in space.
     tolerance : float
         Distance in nm by which a way back may miss its start; other solutions are off by a part of a bond.
     restart : path, optional
@@ -140,7 +136,7 @@ class HamiltonianMonteCarlo:
         Temperature not positive, fewer than one step, `keep` out of range; a file of other particles.
     UnsupportedError
         Another integrator, one with an ensemble, or the leapfrog; parts that move; barostats, AndersenThermostat or
-        CMMotionRemover in the System. At the first step: momentum that rows, or particles without mass, hold all of.
+        CMMotionRemover in the System.
 
     Notes
     -----
@@ -156,7 +152,6 @@ class HamiltonianMonteCarlo:
         rng: Rng,
         *,
         keep: Share = 0.0,
-        conserve_momentum: bool = False,
         tolerance: Positive = 1e-4,
         restart: str | PathLike[str] | None = None,
     ) -> None:
@@ -165,15 +160,12 @@ class HamiltonianMonteCarlo:
         self.setTemperature(temperature)
         self.steps = step_range(steps)
         self.seed = seed_from(rng)
-        self.conserve_momentum = bool(conserve_momentum)
         self.keep, self.tolerance = keep, tolerance
         self.integrator = _integrator_of(self.context)
         self._masses = masses_of(self.context.getSystem())[:, None]
         with np.errstate(divide="ignore"):
             self._weights = np.where(self._masses > 0, 1 / self._masses, 0.0)
         self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
-        #: In which total momentum stays, found with the first proposal.
-        self._directions: FloatArray | None = None
         #: Proposals so far.
         self.number = 0
         if restart is not None:
@@ -339,14 +331,7 @@ class HamiltonianMonteCarlo:
     def _refreshed(self, v: FloatArray, random: np.random.Generator) -> FloatArray:
         """Velocities of which a part is kept and a part drawn, on all constraints; the Context has them."""
         noise = random.standard_normal(v.shape) * np.sqrt((1 - self.keep**2) * self.thermal_energy * self._weights)
-        kept = self.keep * v
-        if self.conserve_momentum:
-            if self._directions is None:
-                self._directions = conserved_momenta(self.integrator, self.context, "conserved").directions
-            masses, moving = self._masses[:, 0], self._weights > 0
-            noise -= drift_velocity(noise, masses, self._directions) * moving
-            kept += (1 - self.keep) * drift_velocity(v, masses, self._directions) * moving
-        self.context.setVelocities(kept + noise)
+        self.context.setVelocities(self.keep * v + noise)
         self.integrator.applyVelocityConstraints(self.context)
         return velocities_of(self.context)
 

@@ -115,7 +115,7 @@ class SystemRows:
                 numbers.append(k)
         table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         given = np.array(lengths, dtype=float)
-        settled = _settled(table, given, len(masses))
+        settled = settled_rows(table, given, len(masses))
         held = np.where(settled, given.astype(np.float32).astype(float), given)
         return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled)
 
@@ -200,7 +200,7 @@ def worst_length(context: openmm.Context) -> tuple[str, float]:
     return rows.name(row), float(off[row])
 
 
-def _settled(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:
+def settled_rows(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:
     """Which rows are isolated triangles with two equal sides; OpenMM's own rule."""
     count = np.bincount(pairs.ravel(), minlength=n)
     neighbors: dict[int, dict[int, np.float32]] = {}

@@ -180,7 +180,10 @@ MUTANTS = {
         ("            kicks[«-1→0»] += operation.fraction", "test_programs.py"),
     ],
     "openmm/integrator/projected.py": [
-        ("        «→# »self._write(Program(self))", "test_part.py::test_integrators_in_turn_hold_the_same_part"),
+        (
+            "        «→# »self._write(self._program_type(self))",
+            "test_part.py::test_integrators_in_turn_hold_the_same_part",
+        ),
         (
             "            part.«begin_program(k)→code = k»\n",
             "test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",

@@ -79,7 +79,10 @@ MUTANTS = {
             'row.name == "evaluate"« and row.here == 1→»',
             "test_interpreter.py::test_kicks_in_succession_and_before_other_operations",
         ),
-        ("«met[verb] += 1→pass»", "thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part"),
+        (
+            "«met[verb] += 1→pass»",
+            "thermostats/multistep/test_spheres.py::test_noise_is_a_function_of_seed_step_and_part",
+        ),
     ],
     "thermostats/monte_carlo.py": [
         (
@@ -212,7 +215,7 @@ MUTANTS = {
         ),
     ],
     "thermostats/configurational_temperature.py": [
-        ("if «not np.all(miss <= OFF)→False»:", "test_temperature_split.py::test_frames_off_the_constraints"),
+        ("if «not np.all(miss <= OFF)→False»:", "test_configurational_temperature.py::test_frames_off_the_constraints"),
     ],
     "thermostats/slow_share.py": [
         (

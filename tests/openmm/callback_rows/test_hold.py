@@ -81,7 +81,6 @@ def test_all_constraints_change_hands(constraints):
         (("hbonds",), {}, [], 10),
         (([],), {}, [], 10),
         (("all",), {"keep_water": False}, [*WATERS, [9, 10]], 0),
-        (("all",), {"keep_water": False, "angles": True}, [*WATERS, [9, 10]], 0),
     ],
 )
 def test_clusters_are_taken_whole(arguments, options, pairs, left):
@@ -101,30 +100,6 @@ def test_unknown_choices_change_nothing(which):
     with pytest.raises(InputError):
         move_constraints(system, which)
     assert content(system) == before
-
-
-def test_angles_come_back_as_angles():
-    """The hydrogens' angles of HAngles are those of the force field."""
-    flexible = peptide(None)
-    angles = next(f for f in flexible.getForces() if isinstance(f, openmm.HarmonicAngleForce))
-    expected = {}
-    for k in range(angles.getNumAngles()):
-        i, j, m, theta, _ = angles.getAngleParameters(k)
-        expected[(min(i, m), j, max(i, m))] = theta._value
-    distances, bent = move_constraints(peptide(app.HAngles), angles=True)
-    assert (distances.family, distances.n_rows, bent.family, bent.n_rows) == ("Distance", 21, "Angle", 9)
-    for (i, j, m), theta in zip(bent.atoms.tolist(), bent.target, strict=True):
-        assert theta == pytest.approx(expected[(min(i, m), j, max(i, m))], abs=1e-9)
-
-
-def test_straight_angles_stay_distances():
-    system = openmm.System()
-    for _ in range(4):
-        system.addParticle(12.0)
-    for i, j, d in ((0, 1, 0.116), (1, 2, 0.116), (0, 2, 0.232), (2, 3, 0.15)):
-        system.addConstraint(i, j, d)
-    (rows,) = move_constraints(system, angles=True)
-    assert rows.n_rows == 4
 
 
 # -- holding --------------------------------------------------------------------------------------
@@ -148,22 +123,9 @@ def test_hold_moves_what_a_row_touches_and_nothing_else():
 
 def test_hold_takes_more_where_asked():
     system = peptide(app.HAngles)
-    part = hold(system, [Dihedral([[6, 8, 14, 16]])], PEPTIDE.positions, take="all", angles=True)
+    part = hold(system, [Dihedral([[6, 8, 14, 16]])], PEPTIDE.positions, take="all")
     assert system.getNumConstraints() == 0
-    assert [c.family for c in part.motion.constraint_set.constraints] == ["Distance", "Angle", "Dihedral"]
-
-
-def test_angle_rows_and_distance_rows_of_hangles_are_the_same_motion():
-    ends = []
-    for angles in (False, True):
-        system = peptide(app.HAngles)
-        part = hold(system, [], X, take="all", angles=angles)
-        context = context_of(system, ProjectedIntegrator(0.001, parts=[part]))
-        start(context, part, X)
-        context.getIntegrator().step(1)
-        ends.append(state_of(context)[0])
-    # One step of RATTLE along gradients of other rows: the same up to the third order of the step.
-    assert np.abs(ends[0] - ends[1]).max() <= 1e-5
+    assert [c.family for c in part.motion.constraint_set.constraints] == ["Distance", "Dihedral"]
 
 
 @pytest.mark.parametrize(

@@ -57,11 +57,11 @@ def side_by_side(cases, x, masses):
 
 def test_families_are_held_as_the_engine_holds_them():
     names = sorted(set(CASES) - PYTHON - MOVED)
-    items, x, masses = side_by_side([[CASES[name]()] for name in names], scattered(7), MASSES)
+    items, x, masses = side_by_side([[CASES[name]()] for name in names], scattered(6), MASSES)
     plain, start, w = held(items, x, masses)
     assert sum(len(shape.atoms) for shape in plain.rows.shapes) > 35
     assert {shape.together for shape in plain.rows.shapes} == {False, True}
-    compare(plain, start, w, None, TIME, 0.005)
+    compare(plain, start, w, None, TIME, 0.002)
 
 
 @pytest.mark.parametrize("name", sorted(PYTHON))

@@ -16,8 +16,6 @@ from openmm_systems import (
     alanine,
     context_of,
     dumbbell,
-    forces_at,
-    loose_alanine,
     masses_of,
     on_gpus,
     started,
@@ -172,20 +170,6 @@ def test_pseudo_energy_converges_with_the_order():
         assert context.getStepCount() == 50 * round(2e-3 / dt)
     assert spread["rattle", 1e-3] / spread["rattle", 5e-4] == pytest.approx(4, rel=0.3)
     assert spread["isokinetic4", 1e-3] < 1e-3 * spread["rattle", 1e-3]
-
-
-def test_friction_and_compression_rate():
-    system, x, v = loose_alanine()
-    ensemble = Isokinetic(300.0)
-    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
-    with pytest.warns(UserWarning, match="momentum"):
-        context = run(system, integrator, x, v, 1)
-    u = state_of(context)[1]
-    alpha = np.sum(u * forces_at(context)) / twice_kinetic(system, u)
-    assert ensemble.friction(integrator) == pytest.approx(alpha, rel=1e-12)
-    # A bond is free, and momentum is conserved.
-    assert ensemble.count(integrator) == 66 - 20 - 3
-    assert ensemble.compression_rate(integrator) == pytest.approx(-(ensemble.count(integrator) - 1) * alpha, rel=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:total momentum")

@@ -78,7 +78,7 @@ void ProgramIntegrator::step(int steps) {
         k.lookBack();                              // it came of a failure, which is told
     }
     vector<double> told = k.read("looked");    // the only wait of a call
-    look = {told[0], told[5], (int) told[2], (int) told[3], (int) told[4]};
+    look = {told[0], told[5], told[6], (int) told[2], (int) told[3], (int) told[4]};
     if (look.failed) {
         k.write("failure", {0, 0, 0});
         k.valid = false;
@@ -87,17 +87,17 @@ void ProgramIntegrator::step(int steps) {
         throw OpenMMException(text.str());
     }
     middleKinetic = noisy && steps > 0 ? told[1]/2 : -1;
+    endKinetic = told[6]/2;
 }
 void ProgramIntegrator::stateChanged(State::DataType changed) {
     if (context == nullptr) return;
-    if (changed == State::Velocities) {
-        middleKinetic = restoredKinetic;       // OpenMM says so of a checkpoint, too, once it is loaded
-        restoredKinetic = -1;
-    }
-    else handle.getAs<StepKernel>().valid = false;
+    if (changed != State::Velocities) handle.getAs<StepKernel>().valid = false;
 }
 double ProgramIntegrator::computeKineticEnergy() {
-    return middleKinetic >= 0 ? middleKinetic : handle.getAs<StepKernel>().kineticEnergy();
+    if (middleKinetic < 0) return handle.getAs<StepKernel>().kineticEnergy();
+    kernel().lookBack();
+    double now = kernel().read("looked")[6]/2;
+    return fabs(now-endKinetic) <= 1e-7*endKinetic ? middleKinetic : now;
 }
 vector<double> ProgramIntegrator::read(const string& name) const { return kernel().read(name); }
 void ProgramIntegrator::write(const string& name, const vector<double>& values) { kernel().write(name, values); }
@@ -110,21 +110,22 @@ vector<string> ProgramIntegrator::savedNames() const {
     return names;
 }
 void ProgramIntegrator::createCheckpoint(ostream& out) const {
-    out.write((const char*) &middleKinetic, sizeof(double));
+    double kinetic[] = {middleKinetic, endKinetic};
+    out.write((const char*) kinetic, sizeof(kinetic));
     for (auto& name : savedNames()) {
         vector<double> values = read(name);
         out.write((const char*) values.data(), values.size()*sizeof(double));
     }
 }
 void ProgramIntegrator::loadCheckpoint(istream& in) {
-    double kinetic;
-    in.read((char*) &kinetic, sizeof(double));
+    double kinetic[2];
+    in.read((char*) kinetic, sizeof(kinetic));
     for (auto& name : savedNames()) {
         vector<double> values = read(name);
         in.read((char*) values.data(), values.size()*sizeof(double));
         write(name, values);
     }
-    middleKinetic = restoredKinetic = kinetic;
+    middleKinetic = kinetic[0]; endKinetic = kinetic[1];
     kernel().valid = false;
 }
 static string text(const vector<double>& values) {
@@ -141,11 +142,13 @@ static vector<double> parsed(const string& text) {
 }
 void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
     node.setIntProperty("version", 1).setDoubleProperty("middleKinetic", middleKinetic);
+    node.setDoubleProperty("endKinetic", endKinetic);
     for (auto& name : savedNames()) node.setStringProperty(name, text(read(name)));
 }
 void ProgramIntegrator::deserializeParameters(const SerializationNode& node) {
     for (auto& name : savedNames()) if (node.hasProperty(name)) write(name, parsed(node.getStringProperty(name)));
     middleKinetic = node.getDoubleProperty("middleKinetic", -1);
+    endKinetic = node.getDoubleProperty("endKinetic", -1);
 }
 
 class Proxy : public SerializationProxy {
@@ -174,7 +177,9 @@ public:
 void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int steps) {
     numbers.dt = integrator.getStepSize();
     numbers.tolerance = integrator.getConstraintTolerance();
+    const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
     c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
+    for (int k = 0; k < 3; k++) if (numbers.box[k] != before[k]) valid = false;
     for (int k = 0; k < steps; k++) {
         if (c.updateContextState()) {          // barostats have moved positions
             valid = false;
@@ -201,8 +206,6 @@ void StepKernel::run(ContextImpl& c, int part) {
     bool moved = false;
     for (auto& action : plan.parts[part]) {
         if (action.verb == Verb::Launch) { launch(action.kernel); moved = true; }
-        else if (action.verb == Verb::ConstrainPositions) constrainPositions(c);
-        else if (action.verb == Verb::ConstrainVelocities) constrainVelocities(c);
         else {
             // Atoms may take new places only where no forces are kept that are still needed.
             if (moved) { c.computeVirtualSites(); positionsMoved(); }

@@ -18,7 +18,7 @@ struct Array {
     std::vector<double> values;    // that it begins with
 };
 
-enum class Verb { Launch, ConstrainPositions, ConstrainVelocities, Evaluate };
+enum class Verb { Launch, Evaluate };
 
 struct Action {
     Verb verb;
@@ -52,7 +52,7 @@ typedef int (*Planner)(Plan* plan, const Given* given);
 
 // Of a step that failed: what the kernels have told.
 struct Look {
-    double squares = 0, residual = 0;
+    double squares = 0, residual = 0, twice = 0;   // twice: the kinetic energy
     int failed = 0, step = 0, row = 0;
 };
 
@@ -84,7 +84,8 @@ private:
     Plan planned(bool whole) const;
     std::vector<std::string> savedNames() const;
     mutable OpenMM::Kernel handle;
-    double middleKinetic = -1, restoredKinetic = -1;   // -1: none is known
+    // Of the middle of the last step, and of the velocities that it ended with: those of others have another. -1: none.
+    double middleKinetic = -1, endKinetic = -1;
 };
 
 // What platforms have in common; each says how a kernel is launched and where arrays are.
@@ -107,8 +108,6 @@ protected:
     const Array& declared(const std::string& name, size_t size) const;
     virtual void prepare(OpenMM::ContextImpl& c) = 0;
     virtual void launch(const std::string& kernel) = 0;
-    virtual void constrainPositions(OpenMM::ContextImpl& c) = 0;
-    virtual void constrainVelocities(OpenMM::ContextImpl& c) = 0;
     virtual void positionsMoved() {}           // before the first evaluation at new positions
     virtual void keepForces(int slot) = 0;     // where there are several groups
 private:
