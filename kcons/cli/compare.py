@@ -31,7 +31,7 @@ def run(chosen: argparse.Namespace) -> int:
 
     temperature = _asks_for_averages(chosen)  # complain before any work
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
-    named = f"compare-{Path(chosen.system).stem}" + ("-averages" if temperature else "")
+    named = f"compare-{Path(chosen.system).name}" + ("-averages" if temperature else "")
     folder: Path = chosen.out or Path(named)
     asked = _asked(chosen, budget, temperature)
     files = [f"compare.{kind}" for kind in ("csv", "png", "txt")]
@@ -229,7 +229,7 @@ COMMAND = Command(
         ),
         Option(
             "--out",
-            "folder for compare.csv, .png and .txt (default ./compare-SYSTEM, for averages ./compare-SYSTEM-averages)",
+            "folder for compare.csv, .png and .txt (default ./compare-SYSTEM, ./compare-FILE, or these with -averages)",
             type=Path,
         ),
         Option("--quick", "smaller system, half the horizon, a budget of 5 s", action="store_true"),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from kcons.constraints import Constraint
 
 #: Option -> atoms it takes.
-FAMILIES = {"distance": 2, "angle": 3, "dihedral": 4}
+FAMILIES = {"distance": 2, "difference": 4, "angle": 3, "dihedral": 4}
 #: The exit status where some points failed; 2 is wrong use, or no point at all.
 INCOMPLETE = 3
 
@@ -71,7 +71,8 @@ def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
 
     if not chosen.coordinates:
         raise InputError(
-            "name what is scanned: --dihedral 0 1 2 3, --angle 0 1 2 or --distance 0 1", item="coordinates"
+            "name what is scanned: --dihedral 0 1 2 3, --angle 0 1 2, --distance 0 1 or --difference 0 1 1 2",
+            item="coordinates",
         )
     count = len(chosen.coordinates)
     turns = all(family == "dihedral" for family, _ in chosen.coordinates)
@@ -86,7 +87,7 @@ def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
         if family == "angle" and (min(low, high) <= 0 or max(low, high) >= 180):
             raise InputError(f"--angle from {low:g} to {high:g}: angles are between 0 and 180 degrees", item="angle")
         coordinates.append(_made(family, atoms, chosen))
-        values.append(axis if family == "distance" else np.radians(axis))
+        values.append(np.radians(axis) if family in ("angle", "dihedral") else axis)
     return coordinates, values
 
 
@@ -126,9 +127,12 @@ def _options() -> Iterator[Option]:
     """The table: options of each family are alike."""
     yield Option("structure", "any file that ASE reads; its last structure", type=Path)
     for family, size in FAMILIES.items():
-        again = "; a second coordinate makes the scan two-dimensional" if size == 2 else ""
+        more = {
+            "distance": "; a second coordinate makes the scan two-dimensional",
+            "difference": ": the distance of the first two less that of the last two",
+        }.get(family, "")
         how: dict[str, Any] = {"nargs": size, "type": int, "metavar": "ATOM"}
-        yield Option(f"--{family}", f"{size} atoms{again}", action=_Coordinate, dest="coordinates", **how)
+        yield Option(f"--{family}", f"{size} atoms{more}", action=_Coordinate, dest="coordinates", **how)
     how = {"nargs": "+", "type": float, "metavar": "VALUE"}
     yield Option("--from", "first value, one for each coordinate (dihedrals: -180)", dest="begin", **how)
     yield Option("--to", "last value, one for each coordinate (dihedrals: 180)", dest="end", **how)
@@ -158,10 +162,10 @@ def _options() -> Iterator[Option]:
 COMMAND = Command(
     "scan",
     "minima of the energy with one or two coordinates held at given values",
-    "A relaxed scan: distances, angles or dihedrals are held exactly at each of their values, all else is relaxed, "
-    "from all neighboring points (torsions are driven both ways). Atoms are counted from 0, unless --count-from 1 is "
-    "given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; 2 for wrong use, or "
-    "if no point succeeded; 3 if some points failed.",
+    "A relaxed scan: distances, their differences, angles or dihedrals are held exactly at each of their values, all "
+    "else is relaxed, from all neighboring points (torsions are driven both ways). Atoms are counted from 0, unless "
+    "--count-from 1 is given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; 2 "
+    "for wrong use, or if no point succeeded; 3 if some points failed.",
     tuple(_options()),
     _scan,
     "relaxations",

@@ -10,10 +10,11 @@ from __future__ import annotations
 import signal
 import textwrap
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from time import perf_counter, process_time
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,8 @@ BASELINE_STEPS = 4
 UNEVEN = 2.0
 #: An MD engine is interrupted within a step after so many budgets.
 PATIENCE = 3
+#: Seconds after which an interruption that did not come through is tried again.
+RING_AGAIN = 0.05
 
 #: Columns of the table.
 COLUMNS = {
@@ -218,7 +221,7 @@ def warm_up(system: TestSystem, methods: Iterable[Method], budget: float) -> Non
     for method in methods:
         if method.engine != "OpenMM" and not method.adaptive and method.refuses(system) is None:
             # What goes wrong is shown where it is measured.
-            with suppress(Exception), interrupted_after(PATIENCE * budget):
+            with suppress(Exception), InterruptedAfter(PATIENCE * budget):
                 run = method.start(system, dt)
                 run.advance()
                 run.advance(2)
@@ -300,7 +303,7 @@ def measure(
     system.potential.forget()
     run: Run | None = None
     try:
-        with watching.piece(what, system.horizon), interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
+        with watching.piece(what, system.horizon), InterruptedAfter(PATIENCE * budget), np.errstate(all="ignore"):
             run = method.start(system, setting)
             row["setup_seconds"] = clock() - begun
             planned = None if method.adaptive else round(system.horizon / setting)
@@ -497,7 +500,7 @@ class Rounds:
         """Seconds a step of a run that is started for it."""
         system, method = self.system, METHODS[row["method"]]
         system.potential.forget()
-        with interrupted_after(self.patience), np.errstate(all="ignore"):
+        with InterruptedAfter(self.patience), np.errstate(all="ignore"):
             run = method.start(system, row["setting"] * (1.0 if method.adaptive else system.units.time_unit))
             if method.adaptive:  # its steps are not alike
                 begun = self.clock()
@@ -544,30 +547,33 @@ def margin(times: Iterable[list[float]]) -> float | None:
 # -- what goes wrong --------------------------------------------------------------------------------
 
 
-@contextmanager
-def interrupted_after(seconds: float) -> Iterator[None]:
+class InterruptedAfter:
     """Raise OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread).
 
     Not while a kernel is being compiled, which happens once and must not begin again and again: then as soon as that is
-    done.
+    done. Python drops what is raised in `__del__` and in callbacks of weak references: it is raised again until the
+    body is left.
     """
-    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
-    def ring(*_: Any) -> None:
-        if announcer.compiling:
-            signal.setitimer(signal.ITIMER_REAL, 0.05)
-            return
-        raise OverBudgetError(f"not done after {seconds:.3g} s")
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._works = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
 
-    previous = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, previous)
+    def __enter__(self) -> None:
+        if self._works:
+            self._previous = signal.signal(signal.SIGALRM, self._ring)
+            signal.setitimer(signal.ITIMER_REAL, max(self.seconds, 1e-3), RING_AGAIN)
+
+    def _ring(self, _: int, frame: FrameType | None) -> None:
+        # What is raised in the two others would leave the body, or not enter it, with the timer on.
+        own = InterruptedAfter.__enter__.__code__, InterruptedAfter.__exit__.__code__
+        if not announcer.compiling and (frame is None or frame.f_code not in own):
+            raise OverBudgetError(f"not done after {self.seconds:.3g} s")
+
+    def __exit__(self, *_: object) -> None:
+        if self._works:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._previous)
 
 
 def first_line(error: Exception) -> str:

@@ -120,8 +120,8 @@ class ResultFolder:
             names = ", ".join(path.name for path in there[:3]) + (" ..." if len(there) > 3 else "")
             raise OccupiedError(f"{self.path} has other files called {names}; {remedy}", item="folder") from error
         if wrong:
-            said = ", ".join(name + value for name, value in wrong)
-            raise OccupiedError(f"{self.path} has {self.what} of other {said}; {remedy}", item=wrong[0][0])
+            said = ", ".join(f"{'other' if name.endswith('s') else 'another'} {name}{value}" for name, value in wrong)
+            raise OccupiedError(f"{self.path} has {self.what} of {said}; {remedy}", item=wrong[0][0])
 
     @contextmanager
     def taken(self) -> Iterator[None]:

@@ -162,7 +162,7 @@ def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, mo
     before = (tmp_path / "check-run" / "check.json").read_bytes()
     assert main(["check", "b/run.xtc", "--topology", top, "--constrain", "none", "--out", "check-run"]) == 2
     said = capsys.readouterr().err
-    assert "check-run has a check of other file" in said and "a/run.xtc); give another folder (--out)" in said
+    assert "check-run has a check of another file" in said and "a/run.xtc); give another folder (--out)" in said
     assert (tmp_path / "check-run" / "check.json").read_bytes() == before
 
 

@@ -102,7 +102,7 @@ def test_a_file_of_ones_own(tmp_path, monkeypatch, capsys):
     names = "openmm-verlet,openmm-kcons-rattle"
     assert run("compare", ALANINE, "--constrain", "allbonds", "--methods", names, "--dt", "2,1", "--quick") == 0
     assert "OpenMM + kcons rattle" in capsys.readouterr().out
-    table = read_csv(tmp_path / f"compare-{ALANINE.stem}" / "compare.csv")
+    table = read_csv(tmp_path / f"compare-{ALANINE.name}" / "compare.csv")
     assert "AllBonds: 21 distances" in table.attrs["title"] and table.attrs["asked"]["constrain"] == "allbonds"
     assert observed_orders(table)["OpenMM + kcons rattle"] == pytest.approx(2.0, abs=0.2)
 
@@ -136,7 +136,7 @@ def test_a_topology_with_coordinates(tmp_path, monkeypatch, capsys):
         Path(name).write_text("\n".join(lines) + "\n")
     words = ["--coordinates", "start.xyz", "--forces", "tip3p", "--methods", "rattle", "--dt", "4", "--quick"]
     assert run("compare", "water.xyz", *words) == 0
-    assert read_csv(Path("compare-water/compare.csv")).attrs["asked"]["coordinates"] == "start.xyz"
+    assert read_csv(Path("compare-water.xyz/compare.csv")).attrs["asked"]["coordinates"] == "start.xyz"
     printed = capsys.readouterr().out
     code = printed[printed.index("In Python:") + 11 : printed.index("wrote ")]
     made: dict[str, object] = {}

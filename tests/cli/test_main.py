@@ -162,5 +162,5 @@ def test_a_comparison_replaces_that_of_the_same_system_alone(tmp_path, capsys):
     assert run("compare", "chain", "--size", 4, *words) == 0
     before = (tmp_path / "compare.csv").read_bytes()
     assert run("compare", "sphere", *words) == 2
-    assert "has a comparison of other system (chain); give another folder (--out)" in capsys.readouterr().err
+    assert "has a comparison of another system (chain); give another folder (--out)" in capsys.readouterr().err
     assert (tmp_path / "compare.csv").read_bytes() == before

@@ -61,6 +61,18 @@ def test_two_coordinates_and_what_is_held(run, tmp_path):
     assert len(points) == 6 and all(p["error"] is None for p in points)
 
 
+def test_a_difference_of_distances(run, tmp_path):
+    """r(0, 2) - r(2, 1), of atoms of which one is in both."""
+    words = ("--difference", 0, 2, 2, 1, "--from", -0.9, "--to", -0.8, "--steps", 2)
+    assert run("peroxide.xyz", *words, "--hold-difference", 1, 3, 0, 1, *EMT) == 0
+    found = ase.io.read(tmp_path / "scan-peroxide" / "scan.extxyz", ":")
+    differences = [atoms.get_distance(0, 2) - atoms.get_distance(2, 1) for atoms in found]
+    assert differences == pytest.approx([-0.9, -0.85, -0.8], abs=1e-7)
+    first = ase.io.read("peroxide.xyz")
+    held = [atoms.get_distance(1, 3) - atoms.get_distance(0, 1) for atoms in (first, *found)]
+    assert held == pytest.approx([held[0]] * 4, abs=1e-7)
+
+
 def test_bonds_by_name_are_held(run, tmp_path):
     words = ("--dihedral", 2, 0, 1, 3, "--from", 100, "--to", 120, "--steps", 1)
     assert run("peroxide.xyz", *words, "--constrain", "hbonds", *EMT) == 0
@@ -133,6 +145,7 @@ TURN = ("--dihedral", 2, 0, 1, 3)
         (("none.xyz", *TURN), "there is no file none.xyz"),
         (("peroxide.xyz",), "name what is scanned: --dihedral"),
         (("peroxide.xyz", "--distance", 0, 1), "give --from: only dihedrals have a range by themselves"),
+        (("peroxide.xyz", "--difference", 0, 2, 2, 1, "--to", 1), "give --from: only dihedrals have a range by"),
         (("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190), "angles are between 0 and 180 degrees"),
         (("peroxide.xyz", *TURN, "--to", 1, 2), "--to has 2 numbers for 1 coordinates"),
         (("peroxide.xyz", *TURN, "--steps", 0), "--steps is 0; give a positive number"),

@@ -304,25 +304,24 @@ def test_forces_that_do_not_fit(file, options, words, ethanol):
 
 
 @pytest.mark.parametrize(
-    ("file", "options", "said", "folder"),
+    ("file", "options", "said"),
     [
-        ("ethanol", "--forces emt --constrain allbonds --methods rattle", "9 atoms, allbonds: 8 Distance", "ethanol"),
+        ("ethanol", "--forces emt --constrain allbonds --methods rattle", "9 atoms, allbonds: 8 Distance"),
         (
             "villin",
             "--forces amber14-all,amber14/tip3p --constrain hbonds --methods openmm-kcons-rattle",
             "test.pdb, 8867 atoms, hbonds",
-            "test",
         ),
     ],
 )
-def test_compare_runs_on_a_file(file, options, said, folder, ethanol, tmp_path, capsys, monkeypatch):
+def test_compare_runs_on_a_file(file, options, said, ethanol, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
     path = str(ethanol if file == "ethanol" else VILLIN)
     status = main.main(["compare", path, *options.split(), "--quick", "--budget", "1", "--dt", "4"])
     told = capsys.readouterr()
     assert status == 0, told.err
-    assert said in read_csv(tmp_path / f"compare-{folder}" / "compare.csv").attrs["title"]
+    assert said in read_csv(tmp_path / f"compare-{Path(path).name}" / "compare.csv").attrs["title"]
     assert ("kcons: 8 bonds were guessed" in told.err) == (file == "ethanol")
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import signal
+import sys
 import time
 from dataclasses import replace
 
@@ -136,6 +138,26 @@ def test_a_step_that_does_not_end_is_interrupted(registry):
     (row,) = compare(chain(), ["hanging"], budget=0.2, rounds=0).to_dict("records")
     assert time.perf_counter() - begun < 10
     assert row["status"] == "partial" and "step 1 was not done" in row["note"]
+
+
+def test_what_a_finalizer_swallows_is_raised_again(monkeypatch):
+    class Lingering:
+        def __del__(self):
+            time.sleep(60.0)
+
+    def body():
+        lingering = Lingering()
+        del lingering
+        assert len(lost) == 1 and lost[0] is measure.OverBudgetError  # Python goes on
+        time.sleep(60.0)
+
+    lost, before = [], signal.getsignal(signal.SIGALRM)
+    monkeypatch.setattr(sys, "unraisablehook", lambda said: lost.append(said.exc_type))
+    begun = time.perf_counter()
+    with pytest.raises(measure.OverBudgetError), measure.InterruptedAfter(0.05):
+        body()
+    assert time.perf_counter() - begun < 10
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and signal.getsignal(signal.SIGALRM) is before
 
 
 def test_what_a_method_raises_is_a_result(registry):

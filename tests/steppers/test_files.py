@@ -153,7 +153,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
         pass
     of(tmp_path, system="water", size=3).refuse_others()
     for owner, said in (({"system": "chain", "size": 3}, "system"), ({"system": "water"}, "size")):
-        with pytest.raises(OccupiedError, match=f"has a study of other {said}; give another folder") as caught:
+        with pytest.raises(OccupiedError, match=f"has a study of another {said}; give another folder") as caught:
             of(tmp_path, **owner).refuse_others()
         assert caught.value.item == said
     (tmp_path / "file").touch()
@@ -170,7 +170,7 @@ def test_a_result_may_be_the_record(tmp_path: Path) -> None:
             with folder.taken():
                 pass
         else:
-            with pytest.raises(OccupiedError, match=r"a study of other system \(water\); give"):
+            with pytest.raises(OccupiedError, match=r"a study of another system \(water\); give"):
                 folder.refuse_others()
     assert "numbers" in (tmp_path / "r.json").read_text()
 

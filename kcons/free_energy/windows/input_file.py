@@ -23,8 +23,8 @@ from typing import Annotated, Any, NamedTuple, TypeAlias, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms
-from kcons.constraints.arguments import whole_number
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, FixedAtoms
+from kcons.constraints.arguments import ANGLE, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError, did_you_mean
 from kcons.free_energy.windows.window import Sampler, Settings
@@ -32,7 +32,32 @@ from kcons.steppers.files import as_path
 
 #: Windows of an input file, at most.
 MOST_WINDOWS = 100_000
-FAMILIES: dict[str, type[Constraint]] = {"distance": Distance, "angle": Angle, "dihedral": Dihedral}
+
+
+def _difference(rows: Sequence[Sequence[int]]) -> DistanceDifference:
+    """r(i, j) - r(k, l) of each row i, j, k, l."""
+    for row in rows:
+        if len(row) != 4:
+            raise InputError(
+                f"difference names {len(row)} atoms; give four, i j k l for r(i, j) - r(k, l)", item="difference"
+            )
+    return DistanceDifference([[row[:2], row[2:]] for row in rows])
+
+
+#: What each kind of coordinate becomes, from the atoms of its rows.
+FAMILIES: dict[str, Callable[[list[list[int]]], Constraint]] = {
+    "distance": Distance,
+    "difference": _difference,
+    "angle": Angle,
+    "dihedral": Dihedral,
+}
+#: Values between which each kind lies, in angstrom and degrees.
+_RANGES = {
+    "distance": (0.0, math.inf),
+    "difference": (-math.inf, math.inf),
+    "angle": (0.0, 180.0),
+    "dihedral": (-math.inf, math.inf),
+}
 
 
 class Rule(NamedTuple):
@@ -89,6 +114,7 @@ class Forces:
 class Coordinate:
     name: Text | None = None
     distance: Atoms | None = None
+    difference: Atoms | None = None
     angle: Atoms | None = None
     dihedral: Atoms | None = None
     begin: Number | None = field(default=None, metadata={"key": "from"})
@@ -125,10 +151,10 @@ class Coordinate:
             places = np.linspace(self.begin, self.to, self.windows, endpoint=not turn)
         else:
             raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")
-        low, high = {"distance": (0.0, math.inf), "angle": (0.0, 180.0), "dihedral": (-math.inf, math.inf)}[family]
+        low, high = _RANGES[family]
         for place in places[(places <= low) | (places >= high)].tolist():
             raise InputError(f"there is no {family} of {place:g} to hold {name} at; leave it out", item="coordinate")
-        return places if family == "distance" else np.radians(places)
+        return np.radians(places) if family in ("angle", "dihedral") else places
 
 
 @dataclass(kw_only=True)
@@ -408,7 +434,7 @@ def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]
         raise InputError(
             f"{key} has {values.size} values; give one for each of {', '.join(coordinates)}", item=key.split()[0]
         )
-    return np.where([isinstance(item, Distance) for item in coordinates.values()], values, np.radians(values))
+    return np.where([item.held is ANGLE for item in coordinates.values()], np.radians(values), values)
 
 
 def _sampler(

@@ -147,7 +147,7 @@ def test_the_calculator_has_to_be_the_same(tmp_path):
     for epsilon in (0.1, 0.1, 0.2):
         atoms.calc = LennardJones(epsilon=epsilon)
         if epsilon == 0.2:
-            with pytest.raises(OccupiedError, match=r"of other calculator;"):
+            with pytest.raises(OccupiedError, match=r"of another calculator;"):
                 begun(tmp_path, atoms, grid, [], {})
         else:
             begun(tmp_path, atoms, grid, [], {})

@@ -268,7 +268,7 @@ def test_bad_input(tmp_path):
     with pytest.raises(OccupiedError, match=r"windows of other settings; give another folder"):
         run(tmp_path)
         made(tmp_path, Settings(production=320, every=10))
-    with pytest.raises(OccupiedError, match=r"windows of other system;"):
+    with pytest.raises(OccupiedError, match=r"windows of another system;"):
         made(tmp_path, digest="another system")
     with pytest.raises(OccupiedError, match=r"window-0001-up.npz was sampled elsewhere than at -1\.5708"):
         run(tmp_path, PLACES[::2])

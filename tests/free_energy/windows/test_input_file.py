@@ -93,6 +93,20 @@ def test_atoms_from_one_and_two_coordinates(folder):
     assert found.targets[1] == pytest.approx([-np.pi, 1.5])
 
 
+def test_a_difference_of_distances(folder):
+    """In angstrom and of either sign; beside a torsion in degrees, with a pull along both."""
+    text = INPUT.replace("rng = 4", "approach = [6, 0.2]").replace("[2, 0, 1, 3]", "[3, 1, 2, 4]").replace(IMPROVE, "")
+    text = text.replace('methanol.xyz"', 'methanol.xyz"\ncount_from = 1')
+    text += "\n[[coordinate]]\ndifference = [1, 2, 4, 2]\nfrom = -0.5\nto = 0.5\nwindows = 3\n"
+    found = read(folder, text + "[pulls]\nto = [90.0, 0.4]\n")
+    assert found.sampler.names == ("turn", "difference-1-2-4-2")
+    assert found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
+    assert found.options["approach"] == pytest.approx([np.radians(6), 0.2])
+    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4])
+    atoms = molecule("CH3OH")
+    assert found.sampler.begin()[0][1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
+
+
 def test_pulls(folder):
     assert read(folder).pulls is None
     found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8\nboth_ways = false\nsteps = 300\n")
@@ -125,10 +139,16 @@ def test_an_input_for_openmm(folder):
         from = 2.8
         to = 3.4
         windows = 4
+        [[coordinate]]
+        difference = [4, 14, 14, 8]
+        values = [0.3]
         """,
     )
-    assert isinstance(found.sampler, OpenMMWindows) and found.sampler.scales.tolist() == [10.0]
-    np.testing.assert_allclose(found.targets[:, 0], [2.8, 3.0, 3.2, 3.4])
+    assert isinstance(found.sampler, OpenMMWindows) and found.sampler.scales.tolist() == [10.0, 10.0]
+    np.testing.assert_allclose(found.targets, [[2.8, 0.3], [3.0, 0.3], [3.2, 0.3], [3.4, 0.3]])
+    x = np.array(pdb.positions.value_in_unit(openmm.unit.nanometer))
+    first, second = np.linalg.norm(x[[4, 8]] - x[14], axis=1)
+    assert found.sampler.begin()[0] == pytest.approx([first, first - second])
 
 
 def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
@@ -153,6 +173,7 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
         ("windows = 12", "", "give values, or from, to and windows"),
         ("dihedral = [2, 0, 1, 3]", "", "coordinate turn is nothing"),
         ("dihedral = [2, 0, 1, 3]", "dihedral = [2, 0, 1, 3]\nangle = [2, 0, 1]", "turn is angle and dihedral"),
+        ("dihedral = [2, 0, 1, 3]", "difference = [2, 0, 1]", "difference names 3 atoms; give four"),
         ("[[coordinate]]", "[coordinate]", r"write \[\[coordinate\]\]"),
         ("temperature = 310", "temperature 310", "is no TOML"),
         ('constrain = "hbonds"', 'constrain = "everything"', "everything"),
