@@ -133,11 +133,6 @@ class Langevin(SeededBath):
         Friction and noise act relative to the center of mass, in the directions in which no row knows a place in
         space; so many degrees of freedom less take part.
 
-    Raises
-    ------
-    InputError
-        Temperature not positive, friction negative, substeps below 1.
-
     Notes
     -----
     `State.thermostat` holds the heat that has flowed in: total energy less it is conserved (`conserved_energy`) to the

@@ -177,8 +177,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
 
     Raises
     ------
-    InputError
-        Temperature not positive, fewer than one step, `keep` not in [0, 1).
     UnsupportedError
         A stepper that is not reversible and symplectic, such as a thermostat.
 
@@ -481,11 +479,10 @@ def tune(
     wanted : float, optional
         Between 0 and 1; by default what costs least for the order of the stepper, see `best_acceptance`.
     proposals : int
+        20 or more.
 
     Raises
     ------
-    InputError
-        A step that is not positive, a share not between 0 and 1, fewer than 20 proposals.
     ConvergenceError
         No proposal of the second half could be made, however small the step became.
     KconsError

@@ -74,8 +74,8 @@ class NoseHooverChain(Interpreted):
 
     Raises
     ------
-    InputError
-        Temperature or period not positive, no links, an unknown order.
+    UnsupportedError
+        A stepper of another order than 2.
 
     Warns
     -----

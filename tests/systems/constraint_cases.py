@@ -158,7 +158,9 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Custom without a gradient": lambda: bare([[0, 1, 2], [5, 3, 4]]),
     "Formula": lambda: kc.Formula("z1*exp(x1/4) - a*sin(b*y1)", [0, 3], {"a": 0.4, "b": [1.0, 2.0]}, target=None),
     "Formula of differences": lambda: kc.Formula(
-        "atan2(x1 - x2, y2 - y3) + abs(z1 - z3 + 9)**1.5 - sqrt((x1 - x3)**2 + (z2 - z1)**2)/3", [[0, 1, 2], [5, 3, 4]]
+        "atan2(x1 - x2, y2 - y3) + abs(z1 - z3 + 9)**1.5 - sqrt((x1 - x3)**2 + (z2 - z1)**2)/3",
+        [[0, 1, 2], [5, 3, 4]],
+        target=None,
     ),
     "Formula moving": lambda: kc.Formula("(x1 - x2)**2 + sin(z1)*cos(w*t)/(2 + x1**2) - t**3", [0, 1], {"w": 0.8}),
     "LinearCombination": lambda: kc.LinearCombination([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]]),

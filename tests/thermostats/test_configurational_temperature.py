@@ -1,21 +1,23 @@
-"""The temperature of configurations: estimators against closed forms, and thermostats against each other."""
+"""The temperature of configurations, whole and by kind of motion: closed forms, samples without forces, thermostats."""
 
 from __future__ import annotations
 
 import math
 
+import fluids as fluid
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, quartic, quartic_potential, system
+from thermostat_systems import dumbbells, quartic, quartic_potential, system, waves
 
-from kcons.constraints import Distance, Sphere
-from kcons.errors import InputError, UnsupportedError
+from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, run
 from kcons.thermostats import (
     Estimate,
     Isokinetic,
     Langevin,
     NoseHooverChain,
+    TemperatureSplit,
     configurational_sample,
     configurational_temperature,
     mean,
@@ -151,3 +153,348 @@ def test_dumbbells_in_a_trap_by_the_general_estimator():
         found = configurational_temperature(*np.transpose(samples))
         assert abs(found.off(expected)) <= 3, (found, expected)
         assert found.error <= 0.012 * expected / 0.5
+
+
+KT = 0.6
+#: Free molecules of a kind, which do not act on each other: that many independent samples at once.
+COPIES = 250
+
+
+def curvatures(split: TemperatureSplit) -> list[tuple[float, float]]:
+    """Means and errors of the second derivatives of all clusters, by kind."""
+    series = np.array(split._series)[:, 1, :, 0]
+    return [mean(column) for column in series.T]
+
+
+# -- exactly ----------------------------------------------------------------------------------------
+
+
+def test_a_dumbbell_on_springs():
+    """U = k x^2/2 of both atoms: m_a + m_b on 2k; the turn has no slope with equal masses, and a curvature of 0."""
+    k, m, d = 3.0, 2.0, 1.4
+    x = np.array([[0.3, -0.2, 0.1], [0.3, -0.2, 0.1 + d]])
+    held = system([Distance([[0, 1]])], x, [m, m], lambda x, t: -k * x)
+    split = TemperatureSplit(held)
+    for _ in range(40):
+        split.add(x)
+    above, below = (np.array(split._series)[:, row, :, 0] for row in (0, 1))
+    center = x.mean(axis=0)
+    assert above[:, 0] == pytest.approx((2 * k) ** 2 * (center @ center) / (2 * m), rel=1e-12)
+    assert below[:, 0] == pytest.approx(3 * 2 * k / (2 * m), rel=1e-6)  # signs along the axes: no noise
+    assert np.abs(above[:, 1:]).max() < 1e-20 and np.abs(below[:, 1:]).max() < 1e-5
+    found = split.result()
+    assert (found.shifts, found.turns, found.samples) == (3, 2, 40)
+    assert found.shift_frequency == pytest.approx(math.sqrt(k / m), rel=1e-6) and found.turn_frequency < 0.01
+    assert found.turn is None and found.internal is None
+    assert found.left_out == ("no force turns clusters as a whole: that has no temperature",)
+
+
+def test_a_cluster_alone_has_no_temperature_of_shifts_and_turns():
+    """What is left of its forces when they are added up is rounding: 0 K before."""
+    x = np.array([[0.0, 0.1, 0.0], [1.0, 0.0, 0.2], [1.3, 0.9, 0.0]])
+
+    def spring(x, t):
+        pull = (np.linalg.norm(x[2] - x[0]) - 1.5) * (x[2] - x[0])
+        return np.array([pull, 0 * pull, -pull]) + 1e-16 * np.random.default_rng(0).standard_normal((3, 3))
+
+    split = TemperatureSplit(system([Distance([[0, 1], [1, 2]])], x, [1.0, 2.0, 3.0], spring))
+    for _ in range(40):
+        split.add(x)
+    found = split.result()
+    assert found.shift is None and found.turn is None and found.internal is not None
+    assert [words.split()[2] for words in found.left_out] == ["shifts", "turns"]
+
+
+def test_a_dumbbell_in_a_field():
+    """U = -E . (x_1 - x_0): torque (d x E)^2/I, and 2 E . d/I as the laplacian over turns; free shifts."""
+    field, m0, m1 = np.array([0.2, -0.5, 0.9]), 1.0, 3.0
+    x = np.array([[0.1, 0.2, 0.3], [0.9, -0.4, 1.1]])
+    held = system([Distance([[0, 1]])], x, [m0, m1], lambda x, t: np.array([-field, field]))
+    split = TemperatureSplit(held, directions=50)
+    for _ in range(40):
+        split.add(x)
+    d = x[1] - x[0]
+    inertia = m0 * m1 / (m0 + m1) * (d @ d)
+    above, below = (np.array(split._series)[:, row, 1, 0] for row in (0, 1))
+    assert above == pytest.approx((np.cross(d, field) ** 2).sum() / inertia, rel=1e-12)
+    # Every turn of unit speed has the same curvature.
+    assert below == pytest.approx(2 * (field @ d) / inertia, rel=1e-5)
+
+
+def test_curvatures_of_a_fluid():
+    """Against the compiled second derivatives: one configuration, many draws."""
+    chosen = fluid.dumbbells(8)
+    forces, kt = chosen.forces, chosen.thermal_energy
+    x = forces.metropolis(chosen.positions, kt, 500, 10, 1, chosen.shift, chosen.turn)[1]
+    split = TemperatureSplit(chosen.system(), rng=3)
+    for _ in range(1000):
+        split.add(x)
+    forward, bend, torque, twist = forces.split_sample(x)
+    mass, inertia = 2.0, 2 * (0.5 * fluid.BOND) ** 2
+    above = np.array(split._series)[0, 0, :, 0]
+    assert above[0] == pytest.approx(forward / mass, rel=1e-9)
+    assert above[1] == pytest.approx(torque / inertia, rel=1e-9)
+    shift, turn, rest = curvatures(split)
+    assert abs(shift.off(bend / mass)) <= 3.5 and shift.error < 0.04 * shift.value
+    assert abs(turn.off(twist / inertia)) <= 3.5 and turn.error < 0.04 * turn.value
+    assert rest.value == 0
+
+
+def test_what_is_left_is_what_a_free_angle_does():
+    """Two arms about a hub, an angle spring: no shift or turn changes U, and U'' of the angle is known."""
+    k, wanted = 2.0, 0.2
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [math.cos(1.9), math.sin(1.9), 0.0]])
+    masses = np.array([5.0, 1.0, 2.0])
+
+    def force(x: np.ndarray, t: float) -> np.ndarray:
+        a, b = x[1] - x[0], x[2] - x[0]
+        cosine = (a @ b) / math.sqrt((a @ a) * (b @ b))
+        pull = -k * (cosine - wanted)
+        ga = (b / math.sqrt((a @ a) * (b @ b))) - cosine * a / (a @ a)
+        gb = (a / math.sqrt((a @ a) * (b @ b))) - cosine * b / (b @ b)
+        return pull * np.array([-ga - gb, ga, gb])
+
+    split = TemperatureSplit(system([Distance([[0, 1], [0, 2]])], x, masses, force), directions=20)
+    for _ in range(60):
+        split.add(x)
+    above = np.array(split._series)[0, 0, :, 0]
+    assert np.abs(above[:2]).max() < 1e-20 * above[2] + 1e-25
+    # Laplacian by the metric g of the angle alone: shape space, with the volume of the turns; by differences.
+    g = _inverse_metric(1.9, masses)
+    slope = -k * (math.cos(1.9) - wanted) * math.sin(1.9)
+    assert above[2] == pytest.approx(g * slope**2, rel=1e-9)
+
+    def flux(t: float) -> float:
+        return _density(t, masses) * _inverse_metric(t, masses) * (-k * (math.cos(t) - wanted) * math.sin(t))
+
+    h = 1e-4
+    laplacian = (flux(1.9 + h) - flux(1.9 - h)) / (2 * h) / _density(1.9, masses)
+    rest = curvatures(split)[2]
+    assert abs(rest.off(laplacian)) <= 3.5 and rest.error < 0.1 * abs(rest.value)
+
+
+def _determinant(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | float:
+    """det Z of the two bonds."""
+    w = 1.0 / masses
+    return (w[0] + w[1]) * (w[0] + w[2]) - (w[0] * np.cos(angle)) ** 2
+
+
+def _density(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | float:
+    """Volume of the constraint surface, of an angle."""
+    return np.sin(angle) * np.sqrt(_determinant(angle, masses))
+
+
+def _inverse_metric(angle: float, masses: np.ndarray) -> float:
+    """|grad angle|^2 in the mass metric with the bonds held (Z of all three rows against Z of the bonds)."""
+    w, c, s = 1.0 / masses, math.cos(angle), math.sin(angle)
+    bonds = np.array([[w[0] + w[1], w[0] * c], [w[0] * c, w[0] + w[2]]])
+    cross = np.array([-w[0] * s, -w[0] * s])
+    own = (w[0] + w[1]) + (w[0] + w[2]) - 2 * w[0] * c
+    return float(own - cross @ np.linalg.solve(bonds, cross))
+
+
+# -- against a sampler without forces ---------------------------------------------------------------
+
+
+def bent(centers: np.ndarray, turns: np.ndarray, angle: np.ndarray, masses: np.ndarray) -> np.ndarray:
+    """Two arms of length 1 about a hub, shape (copies, 3, 3)."""
+    shape = np.zeros((len(angle), 3, 3))
+    shape[:, 1, 0], shape[:, 2, 0], shape[:, 2, 1] = 1.0, np.cos(angle), np.sin(angle)
+    shape -= np.einsum("a,nak->nk", masses / masses.sum(), shape)[:, None]
+    return centers[:, None] + np.einsum("nij,naj->nai", turns, shape)
+
+
+def rotations(vectors: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vectors).as_matrix()
+
+
+def sampled(kt: float, samples: int, rng: np.random.Generator, *, flexible: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Configurations by Metropolis moves of place, orientation and angle, with the volume sqrt(det Z)."""
+    masses = np.array([3.0, 1.0, 2.0])
+    k = np.array([1.0, 1.3, 0.7])
+
+    def energy(x: np.ndarray) -> np.ndarray:
+        return (np.cos(k * x + np.array([0.1, 0.5, 0.9])) / k).sum(axis=(1, 2))
+
+    at, turn, angle = rng.uniform(0, 9, (COPIES, 3)), rotations(rng.normal(size=(COPIES, 3))), np.full(COPIES, 1.8)
+    x = bent(at, turn, angle, masses)
+    has = energy(x) - kt * np.log(_density(angle, masses))
+    kept = []
+    for sweep in range(60 + 6 * samples):
+        new = (
+            at + rng.normal(size=at.shape),
+            rotations(0.8 * rng.normal(size=at.shape)) @ turn,
+            angle + flexible * rng.normal(size=COPIES),
+        )
+        good = (new[2] > 0) & (new[2] < math.pi)
+        y = bent(*new, masses)
+        wants = energy(y) - kt * np.log(_density(np.where(good, new[2], 1.0), masses))
+        take = good & (rng.random(COPIES) < np.exp(np.minimum(0, (has - wants) / kt)))
+        at, angle = np.where(take[:, None], new[0], at), np.where(take, new[2], angle)
+        turn = np.where(take[:, None, None], new[1], turn)
+        x, has = np.where(take[:, None, None], y, x), np.where(take, wants, has)
+        if sweep >= 60 and sweep % 6 == 0:
+            kept.append(x.reshape(-1, 3).copy())
+    return np.array(kept), np.tile(masses, COPIES)
+
+
+@pytest.mark.parametrize("flexible", [False, True])
+def test_against_metropolis(flexible):
+    """Molecules that are rigid, or bend freely: all temperatures are those of the sampler; 20 % more is seen."""
+    configurations, masses = sampled(KT, 200, np.random.default_rng(5), flexible=flexible)
+    k = 3 * np.arange(COPIES)
+    pairs = [np.c_[k, k + 1], np.c_[k, k + 2], *([] if flexible else [np.c_[k + 1, k + 2]])]
+    split = TemperatureSplit(system([Distance(np.concatenate(pairs))], configurations[0], masses, waves), rng=1)
+    for x in configurations:
+        split.add(x)
+    found = split.result()
+    kinds = [found.shift, found.turn, *([found.internal] if flexible else [])]
+    assert (found.internal is not None) is flexible
+    assert (found.shifts, found.turns) == (3 * COPIES, 3 * COPIES)
+    for estimate in kinds:
+        assert estimate is not None and abs(estimate.off(KT)) <= 3
+    assert all(abs(e.off(1.2 * KT)) > 5 for e in (found.shift, found.turn))
+
+
+def test_groups_have_their_own_temperatures():
+    """Half of the molecules from a hotter sampler: the whole hides it, the groups do not."""
+    rng = np.random.default_rng(7)
+    cold, masses = sampled(KT, 64, rng, flexible=False)
+    hot, _ = sampled(1.3 * KT, 64, rng, flexible=False)
+    both = np.concatenate([cold, hot], axis=1)
+    k = 3 * np.arange(2 * COPIES)
+    rows = Distance(np.concatenate([np.c_[k, k + 1], np.c_[k, k + 2], np.c_[k + 1, k + 2]]))
+    half = 3 * COPIES
+    groups = {"cold": np.arange(half), "hot": np.arange(half, 2 * half)}
+    split = TemperatureSplit(system([rows], both[0], np.tile(masses, 2), waves), groups=groups)
+    for x in both:
+        split.add(x, waves(x))
+    for name, kt in (("cold", KT), ("hot", 1.3 * KT)):
+        found = split.result(name)
+        assert abs(found.shift.off(kt)) <= 3.5 and abs(found.turn.off(kt)) <= 3.5
+        assert found.shifts == 3 * COPIES
+    with pytest.raises(InputError, match="no group 'warm'; there are cold, hot"):
+        split.result("warm")
+
+
+# -- what has no shifts or turns --------------------------------------------------------------------
+
+
+def test_single_atoms_do_not_turn():
+    x = np.arange(12.0).reshape(4, 3)
+    split = TemperatureSplit(system([], x, np.ones(4), quartic))
+    for _ in range(32):
+        split.add(0.1 * x)
+    found = split.result()
+    assert found.turn is None and found.internal is None and found.shifts == 12 and found.turns == 0
+    assert found.left_out == ("single atoms only: nothing turns",)
+
+
+TIED = {
+    "sphere": (Sphere([0], [0, 0, 0], 1.0), "tied to a place"),
+    "plane": (Plane([0], [0, 0, 1.0]), "tied to a place"),
+    "fixed": (FixedAtoms([0]), "tied to a place"),
+}
+
+
+@pytest.mark.parametrize("name", TIED)
+def test_what_is_tied_to_space_is_left_out(name):
+    """A dumbbell with one end held: it neither shifts nor turns, and its motion is internal; the other is free."""
+    item, text = TIED[name]
+    x = np.array([[1.0, 0, 0], [1.3, 0.9, 0.2], [4.0, 0, 0], [4.5, 0.8, -0.1]])
+    held = system([item, Distance([[0, 1], [2, 3]])], x, [1.0, 2.0, 1.0, 2.0], waves)
+    split = TemperatureSplit(held)
+    for _ in range(128):
+        split.add(x)
+    found = split.result()
+    assert (found.shifts, found.turns) == (3, 2)
+    assert found.internal is not None
+    assert any(text in note for note in found.left_out)
+    if name == "fixed":
+        assert "1 fixed atoms have no temperature" in found.left_out
+
+
+def test_a_direction_in_space():
+    """Two atoms at the same height: they shift, and do not turn."""
+    from kcons.constraints import Formula
+
+    x = np.array([[0.0, 0, 0], [1.0, 0.3, 0.0]])
+    held = system([Formula("z1 - z2", [0, 1])], x, [1.0, 2.0], waves)
+    split = TemperatureSplit(held)
+    for _ in range(32):
+        split.add(x)
+    found = split.result()
+    assert found.shifts == 3 and found.turns == 0 and found.turn is None and found.internal is not None
+    assert any("tied to a direction" in note for note in found.left_out)
+
+
+def test_molecules_across_the_border_of_a_box():
+    """A molecule in two pieces is the same molecule."""
+    from kcons import ConstraintSet
+    from kcons.motion import Motion
+    from kcons.steppers import System
+
+    box = 6.0
+    whole = np.array([[5.8, 1.0, 1.0], [6.5, 1.5, 1.0], [3.0, 3.0, 3.0], [3.6, 3.6, 3.1]])
+    broken = np.mod(whole, box)
+
+    def force(x: np.ndarray, t: float) -> np.ndarray:
+        return np.sin(2 * np.pi / box * (x + np.array([0.1, 0.3, 0.7])))
+
+    found = []
+    for x in (whole, broken):
+        held = ConstraintSet([Distance([[0, 1], [2, 3]])], x, np.array([1.0, 2, 1, 2]), cell=[box] * 3)
+        split = TemperatureSplit(System(Motion(held, x), force), displacement=1e-3)
+        split.add(x)
+        found.append(np.array(split._series))
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
+# -- bad input --------------------------------------------------------------------------------------
+
+
+def test_bad_input():
+    held, x = dumbbells(2)
+    split = TemperatureSplit(held)
+    with pytest.raises(InputError, match="positions must have shape"):
+        split.add(x[:2])
+    with pytest.raises(InputError, match="forces must have shape"):
+        split.add(x, np.zeros((2, 3)))
+    broken = x.copy()
+    broken[1, 2] = np.nan
+    with pytest.raises(InputError, match="positions of atom 1"):
+        split.add(broken)
+    with pytest.raises(NonFiniteError):
+        split.add(x, broken)
+    assert len(split) == 0
+    with pytest.raises(InputError, match="0 samples are too few"):
+        split.result()
+    with pytest.raises(InputError, match="group 'ends' has no first atom of a cluster"):
+        TemperatureSplit(held, groups={"all": [0, 1, 2, 3], "ends": [1, 3]}).add(x)
+    with pytest.raises(InputError, match="one atom only"):
+        TemperatureSplit(system([], [[0.0, 0, 0]], [1.0], quartic)).add([[0.1, 0, 0]])
+    fixed = system([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], quartic)
+    with pytest.raises(InputError, match="all atoms are fixed"):
+        TemperatureSplit(fixed).add([[0.0, 0, 0]])
+
+
+def test_frames_off_the_constraints():
+    """As of files in few digits, or of another cell."""
+    held, x = dumbbells(2)
+    split = TemperatureSplit(held)
+    split.add(x.astype(np.float32))
+    off = x.copy()
+    off[3] += 0.01 * (x[3] - x[2])
+    with pytest.raises(InputError, match=r"off row #1 .* by 0\.01 of its size; .* Motion\.restore_positions") as caught:
+        split.add(off)
+    assert len(split) == 1 and tuple(caught.value.atoms) == (2, 3)
+    split.add(held.motion.restore_positions(off))
+
+
+def test_refused():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    moving = system([Distance([[0, 1]], lambda t: np.array([1.0 + t]))], x, [1.0, 1.0], quartic)
+    with pytest.raises(UnsupportedError, match="targets rest"):
+        TemperatureSplit(moving)

@@ -1,4 +1,4 @@
-"""Geodesic BAOAB: exact friction and noise on the constraints, restarts, momentum, bad input."""
+"""Geodesic BAOAB: exact friction and noise on the constraints, momentum, moving targets; numbers drawn in kernels."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from thermostat_systems import dumbbells, quartic, quartic_potential, swirling, 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Plane, Sphere
 from kcons.steppers import State, System, run
 from kcons.thermostats import Langevin, thermal_velocities
+from kcons.thermostats.langevin import noise_generator
+from kcons.thermostats.noise import fill_normal
 
 
 def started(n=2, **options):
@@ -127,3 +129,13 @@ def test_each_substep_meets_targets_at_its_own_time(substeps):
     known = run(held, state, dt / (2 * substeps), 5 * 2 * substeps)
     np.testing.assert_allclose(end.positions, known.positions, rtol=0, atol=1e-13)
     np.testing.assert_allclose(end.velocities, known.velocities, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 7, 2**63, 2**64 - 1])
+@pytest.mark.parametrize(("number", "part"), [(1, 0), (10**9, 3), (0, 2**63)])
+def test_numbers_are_those_of_numpy_to_the_last_bit(seed, number, part) -> None:
+    """So many that all layers of the ziggurat and its tail are met."""
+    found = np.empty(20_001)
+    fill_normal(np.uint64(seed), np.uint64(number), np.uint64(part), found)
+    np.testing.assert_array_equal(found, noise_generator((seed, 0), number, part).standard_normal(20_001))
+    assert np.abs(found).max() > 3.66  # beyond the last layer

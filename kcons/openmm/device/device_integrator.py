@@ -20,7 +20,7 @@ from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, Plan, Spheres, plan
+from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
@@ -174,6 +174,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     """
 
     _program_type = DeviceProgram
+    program: DeviceProgram
     #: Rows of the Context, once they are known.
     rows: Any = None
     _seed = 0
@@ -384,7 +385,7 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     if integrator is not None:
         integrator.rows = rows
     platform = given.platform.decode()
-    done = _plan_of(described, platform, masses, given.groups, rows)
+    done = plan(described, platform, masses, given.groups, rows)
     compiled = build.kernels_library(done.source) if platform in PLAIN else ""
     library.kcons_plan_source(
         made, done.source.encode(), str(compiled).encode(), done.items, done.work_group, done.slots
@@ -401,28 +402,6 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
             )
     order = np.ascontiguousarray(done.order, dtype=np.int32)
     library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
-
-
-def _plan_of(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, rows: Any) -> Plan:
-    operations = [
-        Op(*(tuple(value) if isinstance(value, list) else value for value in op)) for op in described["operations"]
-    ]
-    names = list(dict.fromkeys(op.group for op in operations if op.verb == "evaluate"))
-    seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
-    return plan(
-        operations,
-        platform,
-        len(masses),
-        {name: 1 << int(name) if name else groups for name in names},
-        rows,
-        parameters=described["settings"],
-        memory=dict.fromkeys(described["memory"], 0.0),
-        seed=seed,
-        noisy=described["noisy"],
-        tidy=described["parts"],
-        spheres=Spheres(*described["spheres"]) if described["spheres"][0] else None,
-        moving=masses > 0,
-    )
 
 
 def choose(

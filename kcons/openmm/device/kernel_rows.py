@@ -18,7 +18,7 @@ from kcons.openmm.callback_rows.callbacks import Passage, cell_of
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows, rows_of
-from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.part import Part, Solver
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SystemRows, settled_rows
@@ -63,10 +63,12 @@ class KernelRows(CarriedConstraints):
     evaluates = lands_last = False
 
     def __init__(self, parts: Sequence[Any]) -> None:
+        self._parts = parts
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
-        plain = accepted([part for part in parts if isinstance(part, Constraint)])
-        self.given: list[Constraint] = [*constraints_of(carried), *plain]
+        self.given: list[Constraint] = list(accepted(constraints_of(parts)))
         self.groups = frozenset().union(*(part.groups for part in carried))
+        #: The engine of what `hold` made, until the Context is known.
+        self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
         self._bound: tuple[DeviceRows, _Engine] | None = None
@@ -131,6 +133,8 @@ class KernelRows(CarriedConstraints):
 
     @property
     def _engine(self) -> Any:  # type: ignore[override]
+        if self._bound is None and self._carried is not None:
+            return self._carried
         if self._bound is None:
             raise InputError(
                 "these rows are known at the first step of a Context; call integrator.attach(context) after its "
@@ -150,6 +154,10 @@ class KernelRows(CarriedConstraints):
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         self.bind(context)
+
+    def solver_at(self, context: openmm.Context) -> Solver:
+        self.bind(context)
+        return super().solver_at(context)
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         self.bind(context)
@@ -196,10 +204,10 @@ class KernelRows(CarriedConstraints):
         self._since = float(integrator.context.getTime()._value)
 
     def __deepcopy__(self, memo: dict[int, object]) -> KernelRows:
-        return KernelRows(self.given)
+        return KernelRows(self._parts)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return KernelRows, (self.given,)
+        return KernelRows, (self._parts,)
 
     def __repr__(self) -> str:
         return f"<KernelRows: {sum(item.n_rows for item in self.given)} rows and the constraints of the System>"

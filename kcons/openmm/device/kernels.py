@@ -1,8 +1,8 @@
 """Operations of a step as kernels: one text that OpenCL, CUDA, HIP and C++ compile.
 
-Operations that nobody looks between are joined. What is left is cut where forces are evaluated, where a sum over all
-particles is needed and, for constraints that stay with OpenMM, where its solvers come in; each piece is one kernel. A
-work-item has a cluster of atoms that rows join, or a single atom; a work-group has a large cluster.
+Operations that nobody looks between are joined. What is left is cut where forces are evaluated and where a sum over all
+particles is needed; each piece is one kernel. A work-item has a cluster of atoms that rows join, or a single atom; a
+work-group has a large cluster.
 """
 
 from __future__ import annotations
@@ -73,8 +73,6 @@ _COMMON = """
 #define ORDER(p) order[p]
 #define GET_V(a, p) {mixed4 q_ = velm[p]; v[3*(a)] = q_.x; v[3*(a)+1] = q_.y; v[3*(a)+2] = q_.z; w[a] = q_.w;}
 #define PUT_V(a, p) velm[p] = make_mixed4(v[3*(a)], v[3*(a)+1], v[3*(a)+2], w[a]);
-#define GET_D(a, p) {mixed4 q_ = delta[p]; d[3*(a)] = q_.x; d[3*(a)+1] = q_.y; d[3*(a)+2] = q_.z;}
-#define PUT_D(a, p) delta[p] = make_mixed4(d[3*(a)], d[3*(a)+1], d[3*(a)+2], 0);
 #ifdef USE_MIXED_PRECISION
 #define GET_X(a, p) {real4 q_ = posq[p], r_ = correction[p]; x[3*(a)] = q_.x+(mixed) r_.x; \\
   x[3*(a)+1] = q_.y+(mixed) r_.y; x[3*(a)+2] = q_.z+(mixed) r_.z;}
@@ -154,8 +152,6 @@ static inline real4 make_real4(double x, double y, double z, double w) {return r
 #define PUT_V(a, p) GET_3(velocities, p, v, a)
 #define GET_X(a, p) GET_3(x, a, positions, p)
 #define PUT_X(a, p) GET_3(positions, p, x, a)
-#define GET_D(a, p) GET_3(d, a, delta, p)
-#define PUT_D(a, p) GET_3(delta, p, d, a)
 """
 
 _BOX = ("box0", "box1", "box2")
@@ -163,7 +159,7 @@ _BOX = ("box0", "box1", "box2")
 _GIVEN = ["int padded", "int step", "int launch", "mixed dt", "mixed time", "mixed tolerance"]
 _GIVEN += [f"mixed4 {name}" for name in _BOX]
 _GIVEN += ["GLOBAL real4* RESTRICT posq", "GLOBAL real4* RESTRICT correction", "GLOBAL mixed4* RESTRICT velm"]
-_GIVEN += ["GLOBAL mixed4* RESTRICT delta", "GLOBAL const int* RESTRICT order"]
+_GIVEN += ["GLOBAL const int* RESTRICT order"]
 #: Arrays that functions of rows have, too.
 _PASSED = ("parameters", "failure", "failure_residual")
 
@@ -178,7 +174,7 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
     forces = [f"force{k}" for k in range(slots)]
     if plain:
         given = "void** pointers, const double* reals, const int* integers, int GROUP_ID, int NUM_GROUPS"
-        own = [("mixed", name) for name in ("positions", "velocities", "delta", "inverse_masses", *forces)]
+        own = [("mixed", name) for name in ("positions", "velocities", "inverse_masses", *forces)]
         own += [(array.kind, array.name) for array in arrays]
         lines = [
             f"{kind.replace('mixed', 'double')}* {name} = ({kind}*) pointers[{k}];"
@@ -209,14 +205,14 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
 
 
 def standard_arrays(
-    parameters: Sequence[float] = (), memory: Sequence[float] = (), seed: int = 0, particles: int = 1
+    parameters: Sequence[float] = (), memory: int = 0, seed: int = 0, particles: int = 1
 ) -> list[Array]:
     """Arrays of every program: settings, what belongs to the state, failures, sums, what is read at the end."""
     return [
         Array("parameters", "mixed", np.array([*parameters, 0.0])),
-        Array("memory", "mixed", np.array([*memory, 0.0]), saved=True),
-        Array("memory_before", "mixed", np.zeros(len(memory) + 1)),
-        Array("seed", "int", np.array([seed])),
+        Array("memory", "mixed", np.zeros(memory + 1), saved=True),
+        Array("memory_before", "mixed", np.zeros(memory + 1)),
+        Array("seed", "int", np.array([seed]), saved=True),
         Array("failure", "int", np.zeros(3, dtype=np.int64)),
         Array("failure_residual", "mixed", np.zeros(1)),
         Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
@@ -440,7 +436,7 @@ class Spheres(NamedTuple):
 
 
 class Action(NamedTuple):
-    """What the plugin does: launch a kernel, let a solver of OpenMM act on positions or velocities, evaluate forces."""
+    """What the plugin does: launch a kernel, evaluate forces."""
 
     verb: int
     kernel: str = ""
@@ -448,7 +444,7 @@ class Action(NamedTuple):
     slot: int = 0
 
 
-LAUNCH, POSITIONS, VELOCITIES, EVALUATE = range(4)
+LAUNCH, EVALUATE = range(2)
 
 
 class _Place(NamedTuple):
@@ -469,8 +465,6 @@ class Kernels:
         All atoms, each in one cluster.
     groups : mapping of str to int
         Bit masks of the groups of forces, by the name that operations have.
-    own : bool
-        Whether kernels hold the rows themselves; else OpenMM's solvers do.
     tidy : bool
         Whether noise is made tangent, so that multipliers are those of forces.
     spheres : Spheres, optional
@@ -487,7 +481,6 @@ class Kernels:
         self,
         shapes: Sequence[Shape],
         groups: Mapping[str, int],
-        own: bool,
         *,
         tidy: bool = False,
         fixed: IntArray = _NONE,
@@ -495,7 +488,7 @@ class Kernels:
         spheres: Spheres | None = None,
         moving: Any = None,
     ) -> None:
-        self.groups, self.own, self.tidy, self.resting = dict(groups), own, tidy, len(fixed) > 0
+        self.groups, self.tidy, self.resting = dict(groups), tidy, len(fixed) > 0
         self.placed, self.spheres, self.sphere_of, self.auxiliary = placed, spheres, list[Any](), 0
         self.places: list[_Place] = []
         self.order: list[IntArray] = []
@@ -552,22 +545,12 @@ class Kernels:
             moved = (
                 " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]/h;}\n }\n"
             )
-            if self.own:
-                solve = (
-                    f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {_time(op, end)}, x, d, w);\n if (failure[0] == 0)\n"
-                )
-                self._add(free, start + aim + solve + moved)
-            else:
-                self._add(f"{start}{aim} EACH PUT_D(a, AT)\n }}\n")
-                self._close(Action(POSITIONS))
-                self._add(f"{start} EACH GET_D(a, AT)\n{moved}")
+            solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {_time(op, end)}, x, d, w);\n if (failure[0] == 0)\n"
+            self._add(free, start + aim + solve + moved)
             self._moves = True
 
     def _project(self, op: Op) -> None:
-        if self.own:
-            self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")
-        else:
-            self._close(Action(VELOCITIES))
+        self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")
 
     def _exchange(self, op: Op) -> None:
         if self.spheres is not None:
@@ -618,14 +601,8 @@ class Kernels:
             " EACH {if (w[a] != 0) for (int c = 0; c < 3; c++) {mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a];"
             " acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;}\n PUT_U(a, AT)}\n }\n"
         )
-        if self.own:
-            start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {push};\n"
-            self._add(start + sums, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{sums}")
-        else:  # OpenMM's solver takes velocities only
-            self._add(f" EACH {{mixed* d = v; PUT_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] += {push};}}\n")
-            self._close(Action(VELOCITIES))
-            split = "{mixed s = d[3*a+c]; d[3*a+c] = v[3*a+c]-s; v[3*a+c] = s;}"
-            self._add(f" {{ROOM EACH {{GET_U(a, AT) for (int c = 0; c < 3; c++) {split}}}\n{sums}")
+        start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {push};\n"
+        self._add(start + sums, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{sums}")
         self._gather()
         named = _CLOSED_FORM.replace("WQ", "sum0").replace("QQ", "sum1").replace("WW", "sum2")
         self._before += named.replace("TWICE", "P_two_k") + (
@@ -794,58 +771,41 @@ class NoRows:
         return {}
 
 
-def plan(
-    operations: Sequence[Op],
-    platform: str,
-    particles: int,
-    groups: Mapping[str, int],
-    rows: Any,
-    *,
-    parameters: Mapping[str, float],
-    memory: Mapping[str, float],
-    seed: int = 0,
-    noisy: bool = False,
-    tidy: bool = False,
-    spheres: Spheres | None = None,
-    moving: Any = None,
-) -> Plan:
+def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any) -> Plan:
     """Everything that the plugin needs.
 
     Parameters
     ----------
-    operations : sequence of Op
-        Of a step.
+    described : mapping
+        What `DeviceIntegrator.describe` says of a step.
     platform : str
         Its name.
-    particles : int
-        How many the System has.
-    groups : mapping of str to int
-        Bit masks of the groups of forces, by the name that operations have.
-    rows : DeviceRows, NoRows or None
-        None where constraints stay with OpenMM.
-    parameters : mapping of str to float
-        Settings, which kernels know as P_name.
-    memory : mapping of str to float
-        What belongs to a state besides x and v, M_name: the place in the array.
-    seed : int
-    noisy : bool
-        Whether the kinetic energy that is told is that before the end of a step.
-    tidy, spheres
-        See `Kernels`.
-    moving : ndarray of bool
-        Which particles have a mass.
+    masses : ndarray, shape (n_particles,)
+    groups : int
+        Bit mask of the force groups that act.
+    held : DeviceRows or NoRows
     """
-    held = NoRows() if rows is None else rows
+    operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
+    names_of_groups = dict.fromkeys(op.group for op in operations if op.verb == "evaluate")
+    masks = {name: 1 << int(name) if name else groups for name in names_of_groups}
+    seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
+    spheres = Spheres(*described["spheres"]) if described["spheres"][0] else None
+    parameters, memory, particles = described["settings"], described["memory"], len(masses)
     loose = np.setdiff1d(np.arange(particles), np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
     shapes = [*held.shapes, *([Shape("", loose[:, None])] if len(loose) else [])]
-    if moving is not None:
-        moving = moving & ~np.isin(np.arange(particles), held.fixed)
-    made = {"tidy": tidy, "fixed": held.fixed, "placed": held.placed, "spheres": spheres, "moving": moving}
-    kernels = Kernels(shapes, groups, rows is not None, **made)
-    parts = divided(operations, noisy)
+    moving = (masses > 0) & ~np.isin(np.arange(particles), held.fixed)
+    made = {
+        "tidy": described["parts"],
+        "fixed": held.fixed,
+        "placed": held.placed,
+        "spheres": spheres,
+        "moving": moving,
+    }
+    kernels = Kernels(shapes, masks, **made)
+    parts = divided(operations, described["noisy"])
     actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
     order = np.concatenate(kernels.order)
-    arrays = standard_arrays([*parameters.values()], [*memory.values()], seed, particles)
+    arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
     if spheres is not None:
         if any(g + spheres.auxiliary < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
@@ -858,11 +818,11 @@ def plan(
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
     names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(particles)}
     look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
-    source = preamble(platform, arrays, held.scratch, held.work_group, len(groups))
+    source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
-    return Plan(source, arrays, actions, order, items, work_group, len(groups))  # type: ignore[arg-type]
+    return Plan(source, arrays, actions, order, items, work_group, len(masks))  # type: ignore[arg-type]
 
 
 def _of_dt(share: float) -> str:

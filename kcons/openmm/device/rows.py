@@ -244,4 +244,5 @@ def rows_of(
     for item in motion.constraint_set.constraints:
         if item.fixes_atoms and item.moving:
             raise UnsupportedError(f"{item!r} moves, which the device does not do; leave it to the host (device=False)")
-    return DeviceRows(motion, len(pairs), time)
+    # Rows that were converted stand in another order: then all are summed.
+    return DeviceRows(motion, 0 if motion.conversions else len(pairs), time)

@@ -132,7 +132,7 @@ class ProjectedIntegrator(Integrator):
     def __new__(cls, *args: Any, device: bool | None = False, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
         kind = cls._on_device(device, *args, **kwargs) if cls is ProjectedIntegrator and device is not False else cls
-        return cast(ProjectedIntegrator, object.__new__(kind))
+        return object.__new__(kind)
 
     def __init__(
         self,

@@ -174,11 +174,6 @@ class Isokinetic(Splitting):
     momentum : {'auto', 'conserved', 'free'}
         See `kcons.thermostats.freedom`.
 
-    Raises
-    ------
-    InputError
-        Temperature or energy not positive; an unknown order or convention.
-
     Warns
     -----
     UserWarning

@@ -212,7 +212,7 @@ class Barostat:
     Raises
     ------
     InputError
-        Numbers that are not finite, a pressure for each axis, an unknown kind, `every` below 1.
+        A pressure for each axis; a tension of a kind that has none.
     """
 
     #: What the trial is, in words.

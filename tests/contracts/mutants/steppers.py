@@ -215,7 +215,7 @@ MUTANTS = {
         ),
     ],
     "thermostats/configurational_temperature.py": [
-        ("if «not np.all(miss <= OFF)→False»:", "test_temperature_split.py::test_frames_off_the_constraints"),
+        ("if «not np.all(miss <= OFF)→False»:", "test_configurational_temperature.py::test_frames_off_the_constraints"),
     ],
     "thermostats/slow_share.py": [
         (

@@ -1,20 +1,34 @@
-"""What barostats have in common."""
+"""What barostats have in common; volumes and shapes of cells that are known exactly."""
 
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from pressure_systems import gas, no_force, started
+from pressure_systems import (
+    DUMBBELL,
+    METHANE,
+    TRIANGLE,
+    cells_of,
+    gas,
+    no_force,
+    p_value,
+    round_shape,
+    started,
+)
+from scipy import stats
 
 from kcons.constraints import FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
+from kcons.thermostats import autocorrelation_time, mean
 from kcons.thermostats.pressure import CellRescaling, CellSystem, MonteCarloBarostat
+from kcons.thermostats.pressure.barostat import Strains
 
 
 def test_widths_go_to_an_acceptance_of_one_half_and_trials_are_counted():
@@ -106,3 +120,88 @@ def test_copies_know_no_pieces_of_systems():
         system.set_cell(state.cell, x)
         assert repr(again) == repr(barostat)
         assert np.array_equal(again.move(system, state, 1.0, 1.0).barostat, after.barostat)
+
+
+@pytest.mark.parametrize("shape", [DUMBBELL, TRIANGLE, METHANE], ids=["dumbbell", "triangle", "methane of rank 9"])
+def test_volumes_of_a_rigid_ideal_gas(shape):
+    """V^N exp(-P V/kT): the N of molecules, whatever the number of their atoms and rows."""
+    n, side = 100, 12.0
+    system, x = gas(shape, n, side)
+    barostat = MonteCarloBarostat((n + 1) / side**3, rng=1, width=0.25)
+    volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 1200))
+    exact = stats.gamma(n + 1, scale=side**3 / (n + 1))
+    assert p_value(volumes, exact) > 0.01
+    error = exact.std() * np.sqrt(autocorrelation_time(volumes) / len(volumes))
+    assert abs(volumes.mean() - exact.mean()) < 3 * error
+    assert error < 0.01 * exact.mean()
+    # It could tell the number of molecules from that of atoms.
+    assert p_value(volumes, stats.gamma(n * len(shape) + 1, scale=side**3 / (n + 1))) < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["semi-isotropic", "anisotropic", "flexible"])
+def test_volumes_of_other_kinds(kind):
+    """The volume is spread as in cells of one shape."""
+    n, side = 100, 12.0
+    system, x = gas(DUMBBELL, n, side, force=no_force, potential=round_shape)
+    barostat = MonteCarloBarostat((n + 1) / side**3, kind=kind, rng=1, width=0.09)
+    cells = cells_of(system, started(system, x, barostat), barostat, 1500)
+    assert p_value(np.linalg.det(cells), stats.gamma(n + 1, scale=side**3 / (n + 1))) > 0.01
+    lengths = cells[-1][np.tril_indices(3)]
+    assert np.all(np.triu(cells, 1) == 0)
+    if kind != "flexible":
+        assert np.all(cells[-1] == np.diag(np.diag(cells[-1])))
+    if kind == "semi-isotropic":
+        assert cells[-1][0, 0] == pytest.approx(cells[-1][1, 1], rel=1e-12)
+        assert abs(cells[-1][0, 0] - cells[-1][2, 2]) > 1e-3
+    assert len(np.unique(lengths)) > 1
+
+
+def test_trials_of_few_pieces_end_at_what_a_trial_may_change():
+    """Two pieces would be accepted in half of the trials with far wider ones; volumes are right all the same."""
+    n, side = 2, 12.0
+    system, x = gas(n=n, side=side)
+    barostat = MonteCarloBarostat((n + 1) / side**3, every=1, rng=1, width=1.0)
+    state = started(system, x, barostat)
+    volumes = np.linalg.det(cells_of(system, state, barostat, 4000))
+    assert np.abs(np.diff(np.log(volumes))).max() <= 0.27
+    assert abs(mean(volumes).off(side**3)) < 3.5
+
+
+def chain(kind, n, log_weight, steps, size=0.5, seed=1):
+    """Metropolis' walk over cells, accepted as the barostats do."""
+    strains, rng = Strains(kind), np.random.default_rng(seed)
+    h, found = np.eye(3), np.empty((steps, 3, 3))
+    for k in range(steps):
+        e = size * (2 * rng.random(len(strains)) - 1)
+        other = h @ strains.matrix(e, strains.frame(h))
+        log = log_weight(other) - log_weight(h) + strains.log_measure(e, np.full(3, n))
+        if math.log(rng.random()) < log:
+            h = other
+        found[k] = h
+    return found
+
+
+def test_shapes_of_a_flexible_cell():
+    """V^N dV times the measure of shapes is dh for N = 2: under exp(-|h|^2/2) all nine entries are normal.
+
+    Of the lower triangular factor of such a matrix the diagonal is chi(3), chi(2), chi(1), the rest normal.
+    """
+    cells = chain("flexible", 2, lambda h: -0.5 * (h**2).sum(), 30000)
+    for i, expected in enumerate((stats.chi(3), stats.chi(2), stats.chi(1))):
+        assert p_value(cells[:, i, i], expected) > 0.01
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        assert p_value(cells[:, i, j], stats.norm()) > 0.01
+
+
+def test_a_turned_cell_is_strained_in_its_own_frame():
+    rng = np.random.default_rng(3)
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    strains = Strains("flexible")
+    h, e = np.tril(rng.standard_normal((3, 3))) + 3 * np.eye(3), 0.05 * rng.standard_normal(6)
+    assert strains.frame(h) is None
+    frame = strains.frame(h @ turn)
+    assert frame == pytest.approx(turn, abs=1e-14)
+    assert h @ turn @ strains.matrix(e, frame) == pytest.approx(h @ strains.matrix(e, None) @ turn, abs=1e-13)
+    turned = np.tensordot(e, strains.generators_in(frame), 1)
+    assert turned == pytest.approx(turn.T @ np.tensordot(e, strains.generators, 1) @ turn, abs=1e-15)

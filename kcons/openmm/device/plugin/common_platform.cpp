@@ -59,8 +59,6 @@ public:
 protected:
     void prepare(ContextImpl& c) override;
     void launch(const string& kernel) override;
-    void constrainPositions(ContextImpl&) override { cc.getIntegrationUtilities().applyConstraints(numbers.tolerance); }
-    void constrainVelocities(ContextImpl&) override { cc.getIntegrationUtilities().applyVelocityConstraints(numbers.tolerance); }
     void positionsMoved() override { cc.reorderAtoms(); }
     void keepForces(int slot) override { cc.getLongForceBuffer().copyTo(forces[slot]); }
 private:
@@ -123,7 +121,6 @@ void CommonStep::launch(const string& name) {
         kernel->addArg(cc.getPosq());
         kernel->addArg(cc.getUseMixedPrecision() ? cc.getPosqCorrection() : cc.getPosq());
         kernel->addArg(cc.getVelm());
-        kernel->addArg(cc.getIntegrationUtilities().getPosDelta());
         kernel->addArg(cc.getAtomIndexArray());
         for (int slot = 0; slot < plan.slots; slot++)
             if (forces.empty()) kernel->addArg(cc.getLongForceBuffer());

@@ -4,7 +4,6 @@
 #include "openmm/Platform.h"
 #include "openmm/System.h"
 #include "openmm/internal/ThreadPool.h"
-#include "openmm/reference/ReferenceConstraints.h"
 #include "openmm/reference/ReferencePlatform.h"
 #include <dlfcn.h>
 using namespace OpenMM;
@@ -45,7 +44,6 @@ protected:
         return it == arrays.end() ? nullptr : &it->second;
     }
     void prepare(ContextImpl& c) override {
-        delta.resize(inverse.size());
         forces.resize(plan.slots);
         for (auto& array : plan.arrays) {
             if (array.whole) integers[array.name].assign(array.values.begin(), array.values.end());
@@ -58,7 +56,7 @@ protected:
         PlainKernel& code = kernels[kernel];
         if (code == nullptr) code = (PlainKernel) dlsym(library, kernel.c_str());
         if (code == nullptr) throw OpenMMException("kcons: no kernel is called '"+kernel+"'");
-        vector<void*> pointers = {data.positions->data(), data.velocities->data(), delta.data(), inverse.data()};
+        vector<void*> pointers = {data.positions->data(), data.velocities->data(), inverse.data()};
         for (int slot = 0; slot < plan.slots; slot++)
             pointers.push_back(plan.slots == 1 ? data.forces->data() : forces[slot].data());
         for (auto& array : plan.arrays)
@@ -72,15 +70,6 @@ protected:
         data.threads.execute([&](ThreadPool&, int thread) { if (thread < groups) code(pointers.data(), given, whole, thread, groups); });
         data.threads.waitForThreads();
     }
-    void constrainPositions(ContextImpl&) override {
-        vector<Vec3> reached = *data.positions;
-        for (size_t k = 0; k < reached.size(); k++) reached[k] += delta[k];
-        data.constraints->apply(*data.positions, reached, inverse, numbers.tolerance);
-        for (size_t k = 0; k < reached.size(); k++) delta[k] = reached[k]-(*data.positions)[k];
-    }
-    void constrainVelocities(ContextImpl&) override {
-        data.constraints->applyToVelocities(*data.positions, *data.velocities, inverse, numbers.tolerance);
-    }
     void keepForces(int slot) override { forces[slot] = *data.forces; }
 private:
     ReferencePlatform::PlatformData& data;
@@ -90,7 +79,6 @@ private:
     map<string, vector<double>> reals;
     map<string, vector<int>> integers;
     vector<double> inverse;
-    vector<Vec3> delta;
     vector<vector<Vec3>> forces;
 };
 

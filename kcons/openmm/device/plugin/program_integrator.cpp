@@ -206,8 +206,6 @@ void StepKernel::run(ContextImpl& c, int part) {
     bool moved = false;
     for (auto& action : plan.parts[part]) {
         if (action.verb == Verb::Launch) { launch(action.kernel); moved = true; }
-        else if (action.verb == Verb::ConstrainPositions) constrainPositions(c);
-        else if (action.verb == Verb::ConstrainVelocities) constrainVelocities(c);
         else {
             // Atoms may take new places only where no forces are kept that are still needed.
             if (moved) { c.computeVirtualSites(); positionsMoved(); }

@@ -18,7 +18,7 @@ struct Array {
     std::vector<double> values;    // that it begins with
 };
 
-enum class Verb { Launch, ConstrainPositions, ConstrainVelocities, Evaluate };
+enum class Verb { Launch, Evaluate };
 
 struct Action {
     Verb verb;
@@ -108,8 +108,6 @@ protected:
     const Array& declared(const std::string& name, size_t size) const;
     virtual void prepare(OpenMM::ContextImpl& c) = 0;
     virtual void launch(const std::string& kernel) = 0;
-    virtual void constrainPositions(OpenMM::ContextImpl& c) = 0;
-    virtual void constrainVelocities(OpenMM::ContextImpl& c) = 0;
     virtual void positionsMoved() {}           // before the first evaluation at new positions
     virtual void keepForces(int slot) = 0;     // where there are several groups
 private:
