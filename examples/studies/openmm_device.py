@@ -107,7 +107,7 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     system, _ = protein(VILLIN, app.HBonds)
     move_constraints(system, "all")
     topology = app.PDBFile(str(VILLIN)).topology
-    held = constraints_of(topology, start.getPositions(), "bonds+angles", system=system)
+    held = constraints_of(topology, start.getPositions(), "allangles", system=system)
     integrator = ProjectedIntegrator(2 * STEP, parts=list(held), device=True)
     found = {"OpenMM beside rattle": openmm.VerletIntegrator(STEP)}
     rows = list(measured("Villin, HBonds", plain, start, found, place, full))
