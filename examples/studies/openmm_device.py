@@ -117,7 +117,8 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     integrator.applyConstraints(context)
     integrator.setVelocitiesToTemperature(context, TEMPERATURE, 1)
     now = context.getState(positions=True, velocities=True)
-    rows += measured("Villin, bonds and angles, 4 fs", system, now, {"rattle, device": integrator}, place, full)
+    again = ProjectedIntegrator(2 * STEP, parts=list(held), device=True)
+    rows += measured("Villin, bonds and angles, 4 fs", system, now, {"rattle, device": again}, place, full)
     rows[-1]["ratio"] = rows[0]["ms"] / rows[-1]["ms"]
     yield from rows
 
