@@ -81,7 +81,7 @@ class IsokineticSpheres(Ensemble):
                 "spheres='global' needs sums over all particles; choose 'split', 'axes' or 'cluster'"
             )
         levels = None if steps is None else {str(group): count for group, count in steps.items()}
-        made = {"spheres": spheres, "auxiliary": auxiliary, "order": order, "substeps": substeps}
+        made: dict[str, Any] = {"spheres": spheres, "auxiliary": auxiliary, "order": order, "substeps": substeps}
         bath = OnArrays(1.0, gamma, 0, steps=levels, slow_kicks=slow_kicks, **made)
         given = None if steps is None else tuple(steps.items())
         self._keep(temperature=kelvin, friction=gamma, steps=given, slow_kicks=slow_kicks, **made)
