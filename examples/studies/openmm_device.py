@@ -107,8 +107,8 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     system, _ = protein(VILLIN, app.HBonds)
     move_constraints(system, "all")
     topology = app.PDBFile(str(VILLIN)).topology
-    held = constraints_of(topology, start.getPositions(), "bonds+angles", system=system)
-    integrator = ProjectedIntegrator(2 * STEP, parts=list(held), device=True)
+    held = constraints_of(topology, start.getPositions(), "allangles", system=system)
+    integrator, again = (ProjectedIntegrator(2 * STEP, parts=list(held), device=True) for _ in range(2))
     found = {"OpenMM beside rattle": openmm.VerletIntegrator(STEP)}
     rows = list(measured("Villin, HBonds", plain, start, found, place, full))
     context = placed(system, integrator, place)
@@ -117,7 +117,7 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     integrator.applyConstraints(context)
     integrator.setVelocitiesToTemperature(context, TEMPERATURE, 1)
     now = context.getState(positions=True, velocities=True)
-    rows += measured("Villin, bonds and angles, 4 fs", system, now, {"rattle, device": integrator}, place, full)
+    rows += measured("Villin, bonds and angles, 4 fs", system, now, {"rattle, device": again}, place, full)
     rows[-1]["ratio"] = rows[0]["ms"] / rows[-1]["ms"]
     yield from rows
 

@@ -90,11 +90,11 @@ def test_example_runs(script, tmp_path, monkeypatch):
 
 
 def test_examples_are_short_and_listed_under_the_tutorials():
-    """Fourteen scripts that a user reads and changes; each says what it shows and how it is run."""
+    """Fifteen scripts that a user reads and changes; each says what it shows and how it is run."""
     scripts = sorted((ROOT / "examples").glob("*.py"))
     page = (ROOT / "docs" / "tutorials" / "index.md").read_text(encoding="utf-8")
     listed = re.findall(r"\]\(\.\./\.\./examples/(\w+\.py)\)", page)
-    assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 14
+    assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 15
     for script in scripts:
         text = script.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 60 and not re.search(r"\d", script.name), script.name

@@ -316,7 +316,7 @@ class CollectiveRows(GroupRows):
 
     def _beside(self, context: openmm.Context) -> list[Constraint]:
         """The constraints of the System in the clusters that the rows touch."""
-        held = SystemRows.of(context.getSystem())
+        held = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
         if not (self.meets_system and held.n_rows):
             return []
         body = _components(len(held.masses), held.pairs)

@@ -4,7 +4,7 @@
 // rows_cluster  first row, first atom, first level of each cluster
 // rows_row      of each row: function, first slot, first parameter, how its atoms are gathered (0 as stored, 1 relative
 //               to the first, 2 by shortest images along the list, 3 with cells that are given), first entry, first
-//               earlier entry, flags (1 of velocities, 2 depends on others, 4 is summed), number of its
+//               earlier entry, flags (1 of velocities, 2 may depend on others, 4 is summed), number of its
 //               moving target or -1, its first cell
 // rows_number   of each row: target, scale, period
 // rows_slot     of each slot (an atom of a row): the atom in its cluster, its row

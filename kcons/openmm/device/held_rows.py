@@ -197,6 +197,8 @@ class HeldRows:
         The scale is what tolerances are relative to: the length held, 1 for all that is no length.
     parameters : list of ndarray
         Of each row.
+    doubtful : ndarray of bool, shape (n_rows,)
+        Rows of clusters in which rows depend on others.
     moving, in_cells : list of int
         Rows whose targets move, and rows whose atoms stand in cells that are given, in the order of tables.
     """
@@ -214,6 +216,9 @@ class HeldRows:
         atoms: list[IntArray] = []
         rows: list[Row] = []
         last = motion.plan.eliminate_last
+        self.doubtful = last.copy()
+        for some in motion.plan.dependent:
+            self.doubtful[some] = True
         known: dict[Function, int] = {}
         for item, start in zip(held.constraints, held.starts, strict=False):
             self.parameters += list(item.parameters().reshape(item.n_rows, -1))

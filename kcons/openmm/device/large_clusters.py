@@ -109,10 +109,12 @@ def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, list[int]]:
                 updates[numbers[i, j]].append([numbers[m, i], numbers[m, j], m])
     begins = np.concatenate([[0], np.cumsum([len(each) for each in updates])])
     places = np.concatenate([[0], np.cumsum([len(each) for each in earlier])])
+    # In clusters where rows may depend on others any pivot may vanish: not all of them are marked in large ones.
+    doubtful = bool(held.doubtful[pattern.clusters].any())
     table = []
     parameter = cells = 0
     for k, row in enumerate(rows):
-        flags = row.rolls + 2 * row.depends + 4 * row.summed
+        flags = row.rolls + 2 * doubtful + 4 * row.summed
         table.append([row.function, slots[k], parameter, row.how, numbers[k, k], places[k], flags, -1, cells])
         parameter += len(held.parameters[pattern.clusters[0, order.rows[k]]])
         cells += 3 * len(row.atoms) if row.how == IN_CELLS else 0

@@ -55,8 +55,8 @@ class Precision:
 
     @property
     def solvers(self) -> float:
-        """What the arithmetic of OpenMM's solvers adds to a relative distance: GPUs keep lengths as single numbers."""
-        return 5e-7 if self.rounds_lengths else 1e-12
+        """What the arithmetic of OpenMM's solvers adds to a relative distance."""
+        return 5e-7 if self.name == "single" else 1e-12
 
     @property
     def speeds(self) -> float:

@@ -21,6 +21,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Integrator
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 
@@ -80,6 +81,11 @@ class SystemRows:
         Which constraint of the System each row is. OpenMM ignores those between massless particles.
     settled : ndarray of bool, shape (n_rows,)
         Rows that SETTLE holds.
+    others : ndarray, shape (n_rows,)
+        What a GPU's SHAKE holds instead where it is responsible, which stores squares of lengths in single precision.
+    slack : ndarray, shape (n_rows,)
+        By how much a relative distance may differ from `lengths` although it is held exactly: what a GPU's SETTLE
+        makes of its distances in single precision.
     """
 
     masses: FloatArray
@@ -87,10 +93,12 @@ class SystemRows:
     lengths: FloatArray
     numbers: IntArray
     settled: NDArray[np.bool_]
+    others: FloatArray
+    slack: FloatArray
 
     @classmethod
-    def of(cls, system: openmm.System) -> SystemRows:
-        """Those of a System.
+    def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
+        """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`.
 
         Raises
         ------
@@ -117,7 +125,9 @@ class SystemRows:
         given = np.array(lengths, dtype=float)
         settled = settled_rows(table, given, len(masses))
         held = np.where(settled, given.astype(np.float32).astype(float), given)
-        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled)
+        shaken = np.sqrt((given**2).astype(np.float32).astype(float)) if rounded else held
+        slack = np.where(settled & rounded, 2.0**-23, 0.0)
+        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled, shaken, slack)
 
     @property
     def n_rows(self) -> int:
@@ -135,9 +145,11 @@ class SystemRows:
         return bool((2 * rows == particles * (particles - 1)).all())
 
     def stretches(self, x: FloatArray) -> FloatArray:
-        """(d - d0)/d0 of each row at positions x, shape (n_rows,)."""
+        """(d - d0)/d0 of each row at positions x, shape (n_rows,), d0 being the nearer of what may be held."""
         r = x[self.pairs[:, 0]] - x[self.pairs[:, 1]]
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", r, r)) / self.lengths - 1)
+        d = np.sqrt(np.einsum("ij,ij->i", r, r))
+        first, second = d / self.lengths - 1, d / self.others - 1
+        return np.where(np.abs(second) < np.abs(first), second, first)
 
     def speeds(self, x: FloatArray, v: FloatArray) -> FloatArray:
         """A v of each row, the rate of its distance, shape (n_rows,)."""
@@ -192,7 +204,7 @@ def worst_length(context: openmm.Context) -> tuple[str, float]:
         No Context.
     """
     require_context(context)
-    rows = SystemRows.of(context.getSystem())
+    rows = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
     if not rows.n_rows:
         return "no constraint of the System", 0.0
     off = np.abs(rows.stretches(np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)))

@@ -7,10 +7,10 @@ parted by blanks; parameters in brackets are left out where any will do.
 
 from pathlib import Path
 
-from mutants import ase_dynamics, files, free_energies, models, openmm_programs, solvers, steppers, studies
+from mutants import ase_dynamics, device, files, free_energies, models, openmm_programs, solvers, steppers, studies
 
 TESTS = Path(__file__).resolve().parents[2]
-MODULES = (solvers, openmm_programs, models, steppers, files, studies, free_energies, ase_dynamics)
+MODULES = (solvers, openmm_programs, models, steppers, files, studies, free_energies, ase_dynamics, device)
 
 
 def both(text: str) -> tuple[str, str]:

@@ -37,6 +37,7 @@ from kcons.openmm import (
     surface_parts,
 )
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.system_checks import SystemRows
 from kcons.openmm.surfaces.landings import ImplicitRows
 
 less_than_double = pytest.mark.parametrize("platform", [p for p in on_gpus("single") if "double" not in str(p.id)])
@@ -157,12 +158,34 @@ def test_no_integrator_is_off_by_more_than_twice_what_openmm_is(make, kind, plat
     assert integrator.getConstraintTolerance() == tolerance
 
 
+@pytest.mark.parametrize("platform", on_gpus("single", "mixed"))
+def test_lengths_of_a_gpu_are_known_to_rounding(platform):
+    """Squares of lengths in single precision where its SHAKE is responsible, the lengths themselves elsewhere."""
+    precision = Precision(*platform.split())
+    for make in (hydrogens, bonds):
+        system, x, v = make()
+        tolerance = 1e-6 if precision.name == "single" else 1e-12
+        context = started(system, openmm.VerletIntegrator(STEP), x, v, platform)
+        for _ in range(3):
+            context.applyConstraints(tolerance)
+        rows = SystemRows.of(system, rounded=precision.rounds_lengths)
+        y = state_of(context)[0]
+        reach = np.abs(y).max() / rows.lengths.min()
+        off = np.abs(rows.stretches(y)).max()
+        assert off <= 2 * tolerance + precision.solvers + 4 * precision.place * reach
+        if precision.name != "single" and make is hydrogens:
+            assert np.abs(SystemRows.of(system).stretches(y)).max() > 1e-9  # the lengths that were given
+
+
 def test_openmm_in_double_holds_the_lengths_that_were_given():
     system = hydrogens()[0]
     for platform in PLATFORMS:
         precision = Precision.of(context_of(copy.deepcopy(system), openmm.VerletIntegrator(STEP), platform))
         assert (precision.platform, precision.name) == (platform, "double")
         assert not precision.rounds_lengths
+    rows = SystemRows.of(system)
+    np.testing.assert_array_equal(rows.others, rows.lengths)
+    assert not rows.slack.any()
 
 
 def test_tolerances_that_were_given_stay():

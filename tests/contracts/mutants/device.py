@@ -1,0 +1,28 @@
+"""Mutants of steps on the device."""
+
+MUTANTS = {
+    "openmm/device/kernels.py": [
+        (
+            "done[-1]._replace(share=done[-1].share «+→-» op.share)",
+            "test_device_integrator.py::test_operations_are_joined_where_nobody_looks",
+        ),
+        (
+            "step+({op.begun}), {op.use}, «seed[0]→7»);",
+            "test_device_integrator.py::test_noise_belongs_to_particle_and_step",
+        ),
+        (
+            "link[k] = (link[k]*damp+h*push«/2→»)*damp;",
+            "test_device_integrator.py::test_settings_change_what_is_done",
+        ),
+        (
+            "scale = 1+(1«-→+»cosine)*twice/2;",
+            "test_molecule_spheres.py::test_trajectories_are_those_on_arrays",
+        ),
+    ],
+    "openmm/device/device_integrator.py": [
+        (
+            "if told[_FAILED]«→ and False»:",
+            "test_device_integrator.py::test_rows_without_solution_are_told_and_taken_back",
+        ),
+    ],
+}
