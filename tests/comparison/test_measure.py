@@ -149,14 +149,14 @@ def test_what_a_finalizer_swallows_is_raised_again(monkeypatch):
         lingering = Lingering()
         del lingering
         assert len(lost) == 1 and lost[0] is measure.OverBudgetError  # Python goes on
-        time.sleep(60.0)
+        time.sleep(10.0)
 
     lost, before = [], signal.getsignal(signal.SIGALRM)
     monkeypatch.setattr(sys, "unraisablehook", lambda said: lost.append(said.exc_type))
     begun = time.perf_counter()
     with pytest.raises(measure.OverBudgetError), measure.InterruptedAfter(0.05):
         body()
-    assert time.perf_counter() - begun < 10
+    assert time.perf_counter() - begun < 5
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and signal.getsignal(signal.SIGALRM) is before
 
 

@@ -21,6 +21,22 @@ MUTANTS = {
             "test_scan_result.py::test_an_attempt_of_another_scan_is_refused",
         ),
     ],
+    "free_energy/windows/input_file.py": [
+        (
+            "np.where([item.held «is ANGLE→is not None» for item",
+            "free_energy/windows/test_input_file.py::test_a_difference_of_distances",
+        ),
+        (
+            'return np.radians(places) if «family in ("angle", "dihedral")→family != "distance"» else places',
+            "free_energy/windows/test_input_file.py::test_a_difference_of_distances",
+        ),
+    ],
+    "cli/scan.py": [
+        (
+            'values.append(np.radians(axis) if «family in ("angle", "dihedral")→family != "distance"» else axis)',
+            "cli/test_scan.py::test_a_difference_of_distances",
+        ),
+    ],
     "free_energy/windows/driver.py": [
         (
             "self._failed.«pop(job.name, None→clear(»)",

@@ -32,6 +32,10 @@ MUTANTS = {
     ],
     "comparison/measure.py": [
         ("if «method.name not in ther→Tru»e:", "test_measure.py::test_methods_that_are_there_are_not_run_again"),
+        (
+            "setitimer(signal.ITIMER_REAL, max(self.seconds, 1e-3)«, RING_AGAIN→»)",
+            "comparison/test_measure.py::test_what_a_finalizer_swallows_is_raised_again",
+        ),
         ('«row["seconds"] *= step / row["step_seconds"]→pass»', "test_measure.py::test_a_row_a_method_and_setting"),
     ],
     "comparison/report.py": [
