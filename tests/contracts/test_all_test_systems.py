@@ -133,7 +133,7 @@ def test_solution_stays_on_the_constraints(name):
         ("sphere", 0, {}, "size is 0"),
         ("ethanol", 2, {}, "cannot be built at size 2"),
         ("rotor", 2, {}, "rotor is one rigid body; it cannot be built at size 2"),
-        ("triple-pendulum", 0, {}, "triple-pendulum is one pendulum"),
+        ("triple-pendulum", 2, {}, "triple-pendulum is one pendulum"),
         ("butane", 3, {}, "one molecule"),
         ("chain", 4, {"forces": "x"}, "chain takes no options, not forces"),
         ("dumbbells", 3, {}, "cannot be built at size 3"),
