@@ -33,6 +33,7 @@ import result_tables  # noqa: E402
 #: Which study has made a result file.
 MADE_BY = {
     "hard_cases": "hard_cases",
+    "openmm_device": "openmm_device",
     "precision": "solvers_alone",
     "scaling": "solvers_alone",
     "stability": "stability",

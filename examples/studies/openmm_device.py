@@ -45,6 +45,10 @@ KINDS: dict[str, tuple[Any, Callable[[float], openmm.Integrator] | None]] = {
     ),
     "Isokinetic": (Isokinetic(TEMPERATURE), None),
 }
+#: By plugin or not.
+WAYS = {True: "device", False: "program"}
+#: Steps of a timed call, rounds, and picoseconds for the drift, by whether it is the full study.
+LENGTH = {True: (400, 15, 100.0), False: (3, 3, 0.1)}
 
 
 def integrators() -> dict[str, openmm.Integrator]:
@@ -54,17 +58,27 @@ def integrators() -> dict[str, openmm.Integrator]:
         if other is not None:
             made[f"OpenMM beside {name}"] = other(STEP)
         for device in (True, False):
-            made[f"{name}, {'device' if device else 'program'}"] = ProjectedIntegrator(
-                STEP, ensemble=ensemble, device=device
-            )
+            made[f"{name}, {WAYS[device]}"] = ProjectedIntegrator(STEP, ensemble=ensemble, device=device)
     return made
+
+
+def without_forces(place: str, full: bool) -> Iterator[dict[str, Any]]:
+    """Rigid water whose forces cost nothing: what is beside the forces in a step, here of order 4 as well."""
+    system, positions = water(2.4)
+    start = start_of(system, positions, place, 20)
+    while system.getNumForces():
+        system.removeForce(0)
+    made = integrators()
+    for device in (True, False):
+        made[f"blanes-moan4, {WAYS[device]}"] = ProjectedIntegrator(STEP, "blanes-moan4", device=device)
+    yield from measured("rigid water without forces", system, start, made, place, *LENGTH[full])
 
 
 def side_by_side(title: str, make: Callable[[], Any], place: str, full: bool) -> Iterator[dict[str, Any]]:
     """All integrators on one System."""
     system, positions = make()
     start = start_of(system, positions, place, 2000 if full else 20)
-    yield from measured(title, system, start, integrators(), place, full)
+    yield from measured(title, system, start, integrators(), place, *LENGTH[full])
 
 
 def measured(
@@ -73,11 +87,12 @@ def measured(
     start: openmm.State,
     made: Mapping[str, openmm.Integrator],
     place: str,
-    full: bool,
+    steps: int,
+    rounds: int,
+    picoseconds: float,
 ) -> Iterator[dict[str, Any]]:
     """Milliseconds a step, residual, and drift at constant energy."""
     contexts = {name: placed(system, integrator, place) for name, integrator in made.items()}
-    steps, rounds = (400, 15) if full else (3, 3)
     for name, context in contexts.items():
         context.setState(start)
         made[name].step(2 * steps)
@@ -96,7 +111,7 @@ def measured(
         if name.startswith("rattle"):
             contexts[name].setState(start)
             freedom = made[name].degrees_of_freedom()
-            moved = drift(made[name], contexts[name], 100.0 if full else 0.1, freedom)
+            moved = drift(made[name], contexts[name], picoseconds, freedom)
         yield {**about, "integrator": name, **row, "residual": off, **moved}
 
 
@@ -110,14 +125,14 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     held = constraints_of(topology, start.getPositions(), "allangles", system=system)
     integrator, again = (ProjectedIntegrator(2 * STEP, parts=list(held), device=True) for _ in range(2))
     found = {"OpenMM beside rattle": openmm.VerletIntegrator(STEP)}
-    rows = list(measured("Villin, HBonds", plain, start, found, place, full))
+    rows = list(measured("Villin, HBonds", plain, start, found, place, *LENGTH[full]))
     context = placed(system, integrator, place)
     context.setPositions(start.getPositions())
     context.setPeriodicBoxVectors(*start.getPeriodicBoxVectors())
     integrator.applyConstraints(context)
     integrator.setVelocitiesToTemperature(context, TEMPERATURE, 1)
     now = context.getState(positions=True, velocities=True)
-    rows += measured("Villin, bonds and angles, 4 fs", system, now, {"rattle, device": again}, place, full)
+    rows += measured("Villin, bonds and angles, 4 fs", system, now, {"rattle, device": again}, place, *LENGTH[full])
     rows[-1]["ratio"] = rows[0]["ms"] / rows[-1]["ms"]
     yield from rows
 
@@ -130,20 +145,22 @@ def pieces(chosen: argparse.Namespace) -> dict[str, Callable[[], Iterator[dict[s
     found: dict[str, Callable[[], Iterator[dict[str, Any]]]] = {}
     for place in chosen.platform or ["CPU"]:
         found |= {f"{place}, {name}": partial(side_by_side, name, make, place, full) for name, make in systems.items()}
+        found[f"{place}, without forces"] = partial(without_forces, place, full)
         found[f"{place}, angles"] = partial(bonds_and_angles, place, full)
-    return found
+    return {name: piece for name, piece in found.items() if name.endswith(chosen.part)}
 
 
 def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Milliseconds a step, speed relative to Verlet's, largest residual, drift in kT/ns a degree of freedom."""
     columns = {"system": "{}", "precision": "{}", "integrator": "{}", "ms": "{:.3f}", "ratio": "{:.2f}"}
     moved = {"residual": "{:.0e}", "slope": "{:+.1e}", "error": "{:.0e}"}
-    title = "ms a step, speed of Verlet's, largest residual, drift in kT/ns/dof"
-    return {title: harness.shown(table, "speed", **columns, **moved)}
+    return {"speed": harness.shown(table, "speed", **columns, **moved)}
 
 
 def main() -> None:
     parser = harness.options(__doc__, "openmm-device")
     parser.add_argument("--platform", action="append", help="such as 'CUDA mixed'; may be given several times")
+    parser.add_argument("--part", default="", help="one of: rigid water, HBonds, AllBonds, without forces, angles")
     parser.add_argument("--device", default="", help="the name of the processor, where that is a GPU")
     harness.main("openmm_device", parser, pieces, tables)
 
