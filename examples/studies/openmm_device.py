@@ -1,6 +1,6 @@
 """Steps on the device: speed, residual and drift beside OpenMM's own integrators and those without the plugin.
 
-    python openmm_device.py --quick --out DIR                     some minutes on the CPU platform
+    python openmm_device.py --quick --out DIR                     water alone, a minute on the CPU platform
     python openmm_device.py --platform "CUDA mixed" --device "H100" --out DIR    a quarter of an hour on a GPU
 
 Speeds are medians of runs that take turns, relative to openmm.VerletIntegrator at 2 fs on the same System. Of villin in
@@ -152,7 +152,8 @@ def pieces(chosen: argparse.Namespace) -> dict[str, Callable[[], Iterator[dict[s
         found |= {f"{place}, {name}": partial(side_by_side, name, make, place, full) for name, make in systems.items()}
         found[f"{place}, without forces"] = partial(without_forces, place, full)
         found[f"{place}, angles"] = partial(bonds_and_angles, place, full)
-    return {name: piece for name, piece in found.items() if name.endswith(chosen.part)}
+    wanted = chosen.part or ("" if full else ("rigid water", "without forces"))
+    return {name: piece for name, piece in found.items() if name.endswith(wanted)}
 
 
 def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
