@@ -145,7 +145,7 @@ def test_dumbbells_in_a_trap_by_the_general_estimator():
             held,
             state,
             0.02,
-            1_000_000,
+            1_500_000,
             stepper=thermostat,
             observers=[lambda s, seen=samples: seen.append(configurational_sample(held, s, rng))],
             every=10,
