@@ -7,6 +7,7 @@ import json
 import logging
 import weakref
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 from uuid import uuid4
 
@@ -33,6 +34,7 @@ from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.states import box_of, positions_of
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, listed
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
@@ -404,7 +406,16 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
 
 
+class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):
+    """`SurfaceIntegrator` whose steps are kernels of a plugin."""
+
+    def _surface_parts(self, surfaces: Any, system: openmm.System | None, positions: Any) -> Sequence[Any]:
+        return listed(surfaces, positions, 2**31 if positions is None else len(positions))
+
+
 def choose(
+    here: type[ProjectedIntegrator],
+    there: type[DeviceIntegrator],
     device: bool | None,
     timestep: Any,
     scheme: str | Splitting = "rattle",
@@ -413,7 +424,7 @@ def choose(
     ensemble: Ensemble | None = None,
     **others: Any,
 ) -> type[ProjectedIntegrator]:
-    """The class of an integrator that may run on the device: `DeviceIntegrator` if it can, see `ProjectedIntegrator`.
+    """The class of an integrator that may run on the device: `there` if it can, see `ProjectedIntegrator`.
 
     Raises
     ------
@@ -424,13 +435,14 @@ def choose(
     if not why:
         try:
             build.library()
-            return DeviceIntegrator
+            return there
         except UnsupportedError as error:
             why = str(error)
     if device:
         raise UnsupportedError(f"no steps on the device: {why}; leave out device=True for a CustomIntegrator")
     logger.info("steps are those of a CustomIntegrator: %s", why)
-    return ProjectedIntegrator
+    return here
 
 
-ProjectedIntegrator._on_device = staticmethod(choose)
+ProjectedIntegrator._on_device = staticmethod(partial(choose, ProjectedIntegrator, DeviceIntegrator))
+SurfaceIntegrator._on_device = staticmethod(partial(choose, SurfaceIntegrator, DeviceSurfaceIntegrator))

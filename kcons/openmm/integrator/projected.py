@@ -15,7 +15,7 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
-from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
+from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
@@ -131,7 +131,8 @@ class ProjectedIntegrator(Integrator):
 
     def __new__(cls, *args: Any, device: bool | None = False, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
-        kind = cls._on_device(device, *args, **kwargs) if cls is ProjectedIntegrator and device is not False else cls
+        own = "_on_device" in vars(cls)
+        kind = cls._on_device(device, *args, **kwargs) if own and device is not False else cls
         return object.__new__(kind)
 
     def __init__(
@@ -372,7 +373,9 @@ class ProjectedIntegrator(Integrator):
                 return
             guard.since_check += done
             failure = self._failure(code, first + done + 1)
-            if "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
+            if isinstance(failure, NonFiniteError) and not np.isfinite(motion_of(context)).all():
+                guard.put_back()  # a force is seen in the step after the one whose velocities it has spoilt
+            elif "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
                 self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             guard.leave()
