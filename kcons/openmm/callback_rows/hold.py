@@ -6,7 +6,6 @@ atoms with each other are solved as one, so that whole clusters of them change h
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -22,15 +21,13 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_movers
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
 from kcons.openmm.quantities import masses_of
 
 #: Hydrogens, also heavy ones, are lighter than this (dalton).
 _HYDROGEN = 4.5
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
-#: Forces whose particles OpenMM counts as bonded.
-_BONDING = (openmm.HarmonicBondForce, openmm.CustomBondForce, openmm.CustomCentroidBondForce)
 
 Choice = Literal["all", "hbonds", "touched"] | Iterable[int]
 
@@ -82,7 +79,6 @@ def hold(
     take: Choice = "touched",
     keep_water: bool = True,
     periodic: bool | None = None,
-    degenerate: Literal["convert", "raise"] = "convert",
     join: bool = False,
     time: unit.Quantity | float = 0.0,
 ) -> CarriedConstraints:
@@ -104,7 +100,7 @@ def hold(
         Which clusters of the System's constraints move over besides those that a row touches.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
-    periodic, degenerate, time
+    periodic, time
         As for `CarriedConstraints`.
     join : bool
         Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
@@ -118,7 +114,7 @@ def hold(
     Raises
     ------
     KconsError
-        As `CarriedConstraints`; a barostat that would break a row. The System was not changed.
+        As `CarriedConstraints`. The System was not changed.
     """
     given = constraints_in(constraints, "constraints")
     table = _table(system)
@@ -127,10 +123,9 @@ def hold(
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
     taken = _as_rows(table, chosen)
-    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
+    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, time=time)
     links = [_neighbors(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
-    refuse_movers(system, part.motion.constraint_set, lambda: _molecules(system, joined))
     # Nothing can fail from here on.
     _release(system, table, chosen)
     _tie(system, joined)
@@ -247,21 +242,3 @@ def _tie(system: openmm.System, pairs: IntArray) -> None:
 def _neighbors(atoms: IntArray) -> IntArray:
     """Pairs of atoms that follow each other in rows, shape (n, 2)."""
     return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
-
-
-def _molecules(system: openmm.System, joined: IntArray) -> list[list[int]]:
-    """What Context.getMolecules() will say, from a Context of bonds alone."""
-    bare = openmm.System()
-    for _ in range(system.getNumParticles()):
-        bare.addParticle(1.0)
-    for k in range(system.getNumParticles()):
-        if system.isVirtualSite(k):
-            site = system.getVirtualSite(k)
-            parents = [[k, site.getParticle(m)] for m in range(site.getNumParticles())]
-            joined = np.concatenate([joined, parents])
-    _tie(bare, np.concatenate([joined, _table(system).pairs]))
-    for force in system.getForces():
-        if isinstance(force, _BONDING):
-            bare.addForce(copy.deepcopy(force))
-    context = openmm.Context(bare, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
-    return [list(atoms) for atoms in context.getMolecules()]

@@ -100,12 +100,10 @@ class GroupRows(Part):
 
     def declare(self, p: Program) -> None:
         c, integrator = self.code, p.integrator
-        if isinstance(integrator, Integrator):
-            _HOLDING[int(integrator.this)] = integrator
-        scheme = getattr(integrator, "scheme", None)
-        alone = len(getattr(integrator, "parts", (self,))) == 1
-        self._leapfrog = scheme is None
-        self._single = scheme is None or len(scheme.drifts) * len(scheme.flight) == 1
+        _HOLDING[int(integrator.this)] = integrator
+        scheme = integrator.scheme
+        alone = len(integrator.parts) == 1
+        self._single = len(scheme.drifts) * len(scheme.flight) == 1
         numbers = [
             ("push", "L: x moves by L times the row", 0.0),
             ("more", "change of L", 0.0),
@@ -172,9 +170,8 @@ class GroupRows(Part):
 
     def begin(self, p: Program) -> None:
         """Gradients where x is not where the last step ended."""
-        if not self._leapfrog:
-            self._gradients(p)
-            p.let(f"known{self.code}", "0", "no projection was here")
+        self._gradients(p)
+        p.let(f"known{self.code}", "0", "no projection was here")
 
     def renew(self, p: Program) -> None:
         """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
@@ -191,8 +188,6 @@ class GroupRows(Part):
             p.let(f"clock{c}", f"clock{c}+{first}*({kept})*flown{c}", "the step before was kept")
             p.let(f"flown{c}", f"select({first}, 0, flown{c})", "a step begins")
             p.let(f"began{c}", "good_steps", "to see whether it is kept")
-        if self._leapfrog:  # no velocity projection has computed them
-            self._gradients(p)
         if self._start == f"start{c}":
             p.each(self._start, "x", "to start again from")
         for k in range(self.n_rows):
@@ -293,8 +288,6 @@ class GroupRows(Part):
         self._note_multipliers(p, h)
         if not self._single:
             self._gradients(p)
-        if self._leapfrog:
-            self._end_step(p)
 
     def _push(self, p: Program) -> None:
         if self.meets_system:
@@ -373,9 +366,6 @@ class GroupRows(Part):
             if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
                 before = f"-select(behind*looked, 0.5*dt*{end}, 0)"
             p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
-            if self._leapfrog:
-                p.let(multiplier, f"{push}/({h}*{h})", "multiplier where the drift began")
-                continue
             at = f"select(known{c}, 0.5*({end}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
             if self.lean:
                 at = f"select(behind, {push}/({h}*{h}), {at})"
@@ -467,8 +457,8 @@ def _halved(integrator: Any, scheme: Any) -> bool:
 
 def _last_share(integrator: openmm.CustomIntegrator) -> float:
     """Length of the last drift as a fraction of the step."""
-    scheme = getattr(integrator, "scheme", None)
-    return 1.0 if scheme is None else float(scheme.drifts[-1] * scheme.flight[-1])
+    scheme = integrator.scheme
+    return float(scheme.drifts[-1] * scheme.flight[-1])
 
 
 def _sum(terms: Iterable[str]) -> str:

@@ -74,8 +74,6 @@ _REFUSALS: list[Exception] = []
 
 def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
     """Why steps of this kind are not made on the device; empty if they are."""
-    if scheme is None:
-        return "the leapfrog has velocities half a step behind; use scheme='rattle'"
     if type(ensemble) not in ENSEMBLES:
         return f"{type(ensemble).__name__} has no kernels"
     if getattr(ensemble, "atoms", None) is not None:

@@ -18,7 +18,6 @@ from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
 from kcons.openmm.integrator.ensemble import Integrator, Step
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of, positions_of
 from kcons.steppers.operations import Kick, Operation, Project, Turn
@@ -68,8 +67,7 @@ class Isokinetic(CountsMomenta):
 
     Notes
     -----
-    Schemes: 'rattle', 'geodesic', 'leapfrog' (order 2), 'isokinetic4' and 'isokinetic6'. Targets must rest. Of the
-    leapfrog, K at half steps is constant, and is what the Context tells as kinetic energy.
+    Schemes: 'rattle', 'geodesic' (order 2), 'isokinetic4' and 'isokinetic6'. Targets must rest.
 
     References
     ----------
@@ -115,7 +113,7 @@ class Isokinetic(CountsMomenta):
             given.append(f"atoms=<{len(self.atoms)} atoms>")
         return f"Isokinetic({', '.join(given)})"
 
-    def check(self, scheme: Splitting | None) -> None:
+    def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for schemes whose order is lost with kicks that are quadratic in v."""
         if isinstance(scheme, RungeKuttaNystrom) or (isinstance(scheme, Composition) and scheme.order > 2):
             raise UnsupportedError(
@@ -123,15 +121,15 @@ class Isokinetic(CountsMomenta):
                 "'isokinetic4' or 'isokinetic6'"
             )
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         """The kicks of the scheme turn velocities, which are tangent before and stay so."""
         done: list[Operation] = []
-        for operation in operations_of(scheme):
+        for operation in scheme.operations():
             if isinstance(operation, Kick):
                 done += [Project(), Turn(operation.fraction)]
             elif not (isinstance(operation, Project) and isinstance(done[-1], Turn)):
                 done.append(operation)
-        return tuple(done if scheme is None else done[isinstance(done[0], Project) :])
+        return tuple(done[isinstance(done[0], Project) :])
 
     # -- program --------------------------------------------------------------------------------
 
@@ -158,8 +156,6 @@ class Isokinetic(CountsMomenta):
             p.number(name, words)
         if self.atoms is not None:
             p.vector("share", "1 for thermostatted particles, 0 for others")
-        if "impulse" in p.vectors:  # of the leapfrog
-            p.kinetic_energy = "m*u*u/2; u=v-impulse"
 
     def kick(self, step: Step, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
         """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
@@ -209,8 +205,6 @@ class Isokinetic(CountsMomenta):
         UnsupportedError
             A constraint couples thermostatted particles to others.
         """
-        if integrator.parts and integrator.scheme is None:
-            raise UnsupportedError("the isokinetic leapfrog holds constraints of the System only; use scheme='rattle'")
         found = float(masses @ np.einsum("ij,ij->i", v, v))
         if not found > 0:
             raise InputError(

@@ -62,11 +62,6 @@ class ReversedDrifts(ConstantEnergy):
     start.
     """
 
-    def check(self, scheme: Splitting | None) -> None:
-        """Refuse the leapfrog."""
-        if scheme is None:
-            raise UnsupportedError("the leapfrog makes no reversible steps; use 'rattle' or 'blanes-moan4'")
-
     def declare(self, program: Program) -> None:
         program.number("missed", "square of how far the worst way back has missed its start")
         program.number("miss", "the same for one drift")
@@ -135,7 +130,7 @@ class HamiltonianMonteCarlo:
     InputError
         Temperature not positive, fewer than one step, `keep` out of range; a file of other particles.
     UnsupportedError
-        Another integrator, one with an ensemble, or the leapfrog; parts that move; barostats, AndersenThermostat or
+        Another integrator, one with an ensemble; parts that move; barostats, AndersenThermostat or
         CMMotionRemover in the System.
 
     Notes
@@ -260,7 +255,6 @@ class HamiltonianMonteCarlo:
             No proposal of the second half could be made, however small the step became.
         """
         integrator = self.integrator
-        assert integrator.scheme is not None
         search = DualAveraging(
             integrator.getStepSize().value_in_unit(unit.picosecond),
             best_acceptance(integrator.scheme.order) if wanted is None else wanted,
@@ -403,7 +397,7 @@ def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:
             f"{type(integrator).__name__} is no ProjectedIntegrator: make the Context or Simulation with "
             "HamiltonianMonteCarlo.reversing_integrator(0.009, 'blanes-moan4')"
         )
-    if integrator.scheme is None or not (integrator.scheme.reversible and integrator.scheme.symplectic):
+    if not (integrator.scheme.reversible and integrator.scheme.symplectic):
         raise UnsupportedError(f"{integrator!r} makes no reversible steps; use 'rattle' or 'blanes-moan4'")
     if not isinstance(integrator.ensemble, ConstantEnergy):
         raise UnsupportedError(f"{integrator.ensemble!r} has no energy to accept or reject by; leave out ensemble")

@@ -12,9 +12,8 @@ from kcons.constraints.arguments import Count, checked, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
-from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step, refuse_leapfrog, use
+from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step, use
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of
 from kcons.steppers.operations import Operation
@@ -61,7 +60,7 @@ class NoseHoover(CountsMomenta):
 
     Notes
     -----
-    Schemes of order 2 but the leapfrog. Targets must rest. Single oscillators and other small systems without
+    Schemes of order 2. Targets must rest. Single oscillators and other small systems without
     collisions need not visit all states, whatever the length of the chain: use Langevin there.
 
     References
@@ -100,11 +99,9 @@ class NoseHoover(CountsMomenta):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.temperature:g} K, {self.frequency:g}/ps, length={self.length})"
 
-    def check(self, scheme: Splitting | None) -> None:
-        """Raise `UnsupportedError` for the leapfrog and for schemes of another order than 2."""
-        if scheme is None:
-            refuse_leapfrog(self)
-        elif scheme.order != 2:
+    def check(self, scheme: Splitting) -> None:
+        """Raise `UnsupportedError` for schemes of another order than 2."""
+        if scheme.order != 2:
             raise UnsupportedError(f"{scheme!r} has order {scheme.order}, the chain 2; use scheme='rattle'")
 
     def check_timestep(self, dt: float) -> None:
@@ -116,9 +113,9 @@ class NoseHoover(CountsMomenta):
                 item="frequency",
             )
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         """The chain moves before the scheme's own operations and after them."""
-        return HALF, *operations_of(scheme), HALF
+        return HALF, *scheme.operations(), HALF
 
     # -- program --------------------------------------------------------------------------------
 

@@ -132,11 +132,6 @@ class Guard:
         assert integrator is not None
         return integrator
 
-    @property
-    def late(self) -> bool:
-        """Whether velocities are those of half a step before, and on no constraints at x."""
-        return self.integrator.scheme is None
-
     def _refuse_old_positions(self) -> None:
         """Raise where rows would be computed at old positions."""
         integrator, precision = self.integrator, self.precision
@@ -257,9 +252,9 @@ class Guard:
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
                 if not self.started:
-                    part.check(context, velocities=not self.late)
+                    part.check(context)
                 elif not part.steered:  # a context parameter moves rows, and the next drift follows
-                    self._refuse(part.worst_violation(context, velocities=not self.late))
+                    self._refuse(part.worst_violation(context))
             if not self.started:
                 warn_of_barostat(context, getattr(integrator.ensemble, "temperature", None), stacklevel=5)
                 integrator.ensemble.begin(integrator, context)
@@ -313,14 +308,8 @@ class Guard:
     def _make_tangent(self, v: FloatArray) -> None:
         """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""
         integrator, context = self.integrator, self.context
-        if self.late:
-            # What is taken away here the first drift would take away: the leapfrog's way is the same, but the first
-            # impulse, which enters the kinetic energy, is that of a smooth motion.
-            off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
-        else:
-            off = self.speed_violation(positions_of(context), v) is not None
-            off = off or any(part.worst_violation(context) is not None for part in integrator.parts)
-        if off:
+        off = self.speed_violation(positions_of(context), v) is not None
+        if off or any(part.worst_violation(context) is not None for part in integrator.parts):
             integrator.applyVelocityConstraints(context)
 
     # -- after steps ----------------------------------------------------------------------------
@@ -412,9 +401,7 @@ class Guard:
             v = np.asarray(now.getVelocities(asNumpy=True)._value)
             check_finite(x, v, step, self.rows.n_rows > 0)
             self.check_lengths(x, step)
-            misses = [] if self.late else [self.speed_violation(x, v)]
-            misses += [part.worst_violation(context, velocities=not self.late) for part in integrator.parts]
-            for miss in misses:
+            for miss in (self.speed_violation(x, v), *(part.worst_violation(context) for part in integrator.parts)):
                 self.certify(miss, f"at step {step} ")
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
             error.step = step

@@ -324,8 +324,7 @@ def refuse_forgotten_parts(system: openmm.System, row_groups: Iterable[int]) -> 
             raise InputError(
                 f"the System has a force {force.getName()!r}, which carries rows that are held, and the integrator has "
                 "no part for it: pass what hold, CollectiveRows or surface_parts returned, "
-                "ProjectedIntegrator(..., parts=[rows]). For a System that was copied or read from XML, the rows of "
-                "hold are CarriedConstraints.of(system)",
+                "ProjectedIntegrator(..., parts=[rows])",
                 item="parts",
             )
 
@@ -401,14 +400,14 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     """
     system, platform = context.getSystem(), context.getPlatform().getName()
     sites = virtual_sites(system)
-    if not sites or integrator.scheme is None:
+    if not sites:
         return False
     late = platform in _LATE
     where = f"particle {sites[0]} is a virtual site"
     if integrator.parts and not any(part.sited for part in integrator.parts):
         raise UnsupportedError(
             f"{where}, of which {integrator.parts[0]!r} does not know; hold rows after the sites were added, by hold "
-            "or CollectiveRows, or use scheme='leapfrog'"
+            "or CollectiveRows"
         )
     if integrator.parts and late and "phase" not in integrator.program.idle:
         raise UnsupportedError(
@@ -418,8 +417,7 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     if late and type(context.getIntegrator()) is openmm.CompoundIntegrator:
         raise UnsupportedError(
             f"{where}: {platform} places virtual sites at the end of a program only, and within a CompoundIntegrator "
-            "OpenMM runs it as a whole, with forces of sites that are one step old. Use scheme='leapfrog', or the "
-            "integrator alone"
+            "OpenMM runs it as a whole, with forces of sites that are one step old. Use the integrator alone"
         )
     return late
 

@@ -366,10 +366,7 @@ def test_explosions_are_told():
 
 
 def test_what_the_device_has_not_is_refused_or_left_to_the_custom_integrator(monkeypatch):
-    for made in (
-        {"scheme": "leapfrog"},
-        {"ensemble": Isokinetic(300.0, atoms=[0, 1])},
-    ):
+    for made in ({"ensemble": Isokinetic(300.0, atoms=[0, 1])},):
         with pytest.raises(UnsupportedError, match="device"):
             ProjectedIntegrator(0.001, device=True, **made)
         assert type(ProjectedIntegrator(0.001, device=None, **made)) is ProjectedIntegrator

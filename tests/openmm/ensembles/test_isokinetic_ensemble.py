@@ -306,16 +306,6 @@ def test_gpus_wait_for_two_sums_a_step(platform):
 # -- isokinetic: with what is held -------------------------------------------------------------------
 
 
-def test_leapfrog_keeps_the_kinetic_energy_of_half_steps():
-    system, x, v = alanine()
-    integrator = ProjectedIntegrator(1e-3, "leapfrog", ensemble=Isokinetic(300.0))
-    context = started(system, integrator, x, v)
-    for _ in range(5):
-        integrator.step(10)
-        found = context.getState(energy=True).getKineticEnergy().value_in_unit(unit.kilojoule_per_mole)
-        assert abs(2 * found / (41 * GAS_CONSTANT * 300) - 1) <= 1e-13
-
-
 def test_a_part_of_the_particles():
     system, x, v = water_box()[0], water_box()[1], np.random.default_rng(0).normal(size=(81, 3))
     chosen = np.arange(12)

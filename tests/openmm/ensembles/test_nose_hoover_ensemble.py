@@ -177,8 +177,8 @@ def test_a_chain_in_the_middle_is_time_reversible():
 
 
 def test_a_chain_in_the_middle_takes_rattle_and_stays_itself():
-    for scheme in ("leapfrog", "suzuki4", "geodesic"):
-        with pytest.raises(UnsupportedError, match=r"leapfrog|order|another form"):
+    for scheme in ("suzuki4", "geodesic"):
+        with pytest.raises(UnsupportedError, match=r"order|another form"):
             ProjectedIntegrator(1e-3, scheme, ensemble=NoseHooverMiddle(300.0, 20.0))
     ensemble = NoseHooverMiddle(300.0, 20.0, length=2)
     assert ensemble != NoseHoover(300.0, 20.0, length=2)
@@ -347,8 +347,8 @@ def test_frequency_or_relaxation_time():
 
 
 def test_what_cannot_be_thermostatted_is_refused():
-    for scheme in ("leapfrog", "suzuki4", "blanes-moan6", "isokinetic4"):
-        with pytest.raises(UnsupportedError, match=r"leapfrog|order"):
+    for scheme in ("suzuki4", "blanes-moan6", "isokinetic4"):
+        with pytest.raises(UnsupportedError, match="order"):
             ProjectedIntegrator(1e-3, scheme, ensemble=NoseHoover(300.0, 20.0))
     system, x, v = dumbbell()
     with pytest.raises(InputError, match="take a frequency of at most 100/ps"):
