@@ -25,7 +25,6 @@ from kcons.openmm import (
     CarriedConstraints,
     CollectiveRows,
     ExpressionSurface,
-    Isokinetic,
     Langevin,
     NoseHoover,
     ProjectedIntegrator,
@@ -155,14 +154,12 @@ def test_arguments_of_integrators_and_ensembles():
         (lambda: ProjectedIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
         (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
         (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in 1/ps"),
-        (lambda: Isokinetic(kinetic_energy=1 * nm), r"kinetic_energy is 1 nm; give it in kJ/mol"),
         (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in 1/ps"),
         (lambda: ProjectedIntegrator("soon"), "timestep is 'soon'; give a number of ps, or a Quantity"),
         (lambda: Langevin([300], 1.0), "temperature is"),
     ):
         with pytest.raises(InputError, match=words):
             make()
-    assert Isokinetic(kinetic_energy=1 * unit.kilocalorie_per_mole).kinetic_energy == pytest.approx(4.184)
 
 
 def test_arguments_of_methods():

@@ -22,14 +22,11 @@ from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-from kcons.openmm.quantities import masses_of
 
-#: Hydrogens, also heavy ones, are lighter than this (dalton).
-_HYDROGEN = 4.5
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
 
-Choice = Literal["all", "hbonds", "touched"] | Iterable[int]
+Choice = Literal["all", "touched"] | Iterable[int]
 
 
 def move_constraints(
@@ -47,9 +44,8 @@ def move_constraints(
     ----------
     system : openmm.System
         Changed in place, before a Context is made of it.
-    which : 'all', 'hbonds' or iterable of int
-        Clusters of constraints that share atoms are taken whole: all, those with a hydrogen (lighter than
-        4.5 dalton), or those that touch one of the given atoms.
+    which : 'all' or iterable of int
+        Clusters of constraints that share atoms are taken whole: all, or those that touch one of the given atoms.
     keep_water : bool
         Whether rigid water stays with OpenMM, whose SETTLE is fastest there; molecules among given atoms are taken
         all the same.
@@ -65,7 +61,7 @@ def move_constraints(
         Unknown choice or atoms; nothing was changed.
     """
     table = _table(system)
-    chosen = _chosen(system, table, which, keep_water)
+    chosen = _chosen(table, which, keep_water)
     rows = _as_rows(table, chosen)
     _release(system, table, chosen)
     return rows
@@ -96,7 +92,7 @@ def hold(
         are to move over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints; targets left at None are taken from them.
-    take : 'touched', 'all', 'hbonds' or iterable of int
+    take : 'touched', 'all' or iterable of int
         Which clusters of the System's constraints move over besides those that a row touches.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
@@ -119,7 +115,7 @@ def hold(
     given = constraints_in(constraints, "constraints")
     table = _table(system)
     n = system.getNumParticles()
-    chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
+    chosen = _chosen(table, () if take == "touched" else take, keep_water)
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
     taken = _as_rows(table, chosen)
@@ -182,18 +178,12 @@ def _table(system: openmm.System) -> _Table:
     return _Table(pairs, lengths, clusters)
 
 
-def _chosen(system: openmm.System, table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
+def _chosen(table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
     """Which constraints to take, in whole clusters."""
     if isinstance(which, str):
-        if which == "all":
-            chosen = np.ones(len(table.pairs), dtype=bool)
-        elif which == "hbonds":
-            masses = masses_of(system)[table.pairs]
-            with_hydrogen = ((masses > 0) & (masses < _HYDROGEN)).any(axis=1)
-            chosen = np.isin(table.cluster, table.cluster[with_hydrogen])
-        else:
-            raise InputError(f"no choice {which!r}; give 'all', 'hbonds' or the numbers of atoms", item="which")
-        return chosen & ~table.water if keep_water else chosen
+        if which != "all":
+            raise InputError(f"no choice {which!r}; give 'all' or the numbers of atoms", item="which")
+        return ~table.water if keep_water else np.ones(len(table.pairs), dtype=bool)
     atoms = np.asarray(list(which))
     if atoms.size == 0:
         return np.zeros(len(table.pairs), dtype=bool)

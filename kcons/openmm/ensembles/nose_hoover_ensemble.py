@@ -20,6 +20,8 @@ from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import HALF, ChainOrder, chain_fractions
 
+#: Of the motion of the chain at fixed velocities.
+CHAIN_ORDER: ChainOrder = 4
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
 
@@ -41,17 +43,13 @@ class NoseHoover(CountsMomenta):
         relaxation time, 1/frequency. At most a tenth of a step's inverse.
     length : int
         Links of the chain.
-    chain_order : {2, 4, 6}
-        Of the motion of the chain at fixed velocities.
-    repeats : int
-        In how many parts of the time it is made.
     momentum : {'auto', 'conserved', 'free'}
         As for `Isokinetic`.
 
     Raises
     ------
     InputError
-        Temperature or frequency not positive, no links, an unknown order.
+        Temperature or frequency not positive, no links.
 
     Warns
     -----
@@ -72,8 +70,6 @@ class NoseHoover(CountsMomenta):
     temperature: float
     frequency: float
     length: int
-    chain_order: ChainOrder
-    repeats: int
     momentum: Momentum
 
     @checked
@@ -83,16 +79,12 @@ class NoseHoover(CountsMomenta):
         frequency: unit.Quantity | float,
         *,
         length: Count = 3,
-        chain_order: ChainOrder = 4,
-        repeats: Count = 1,
         momentum: Momentum = "auto",
     ) -> None:
         self._keep(
             temperature=positive(kelvins(temperature), "temperature"),
             frequency=positive(_per_picosecond(frequency), "frequency"),
             length=length,
-            chain_order=chain_order,
-            repeats=repeats,
             momentum=momentum,
         )
 
@@ -135,7 +127,7 @@ class NoseHoover(CountsMomenta):
             ("chain_h", "its length"),
         ):
             p.number(name, words)
-        shares = chain_fractions(self.chain_order, self.repeats)
+        shares = chain_fractions(CHAIN_ORDER, 1)
         p.table("chain_share", (*shares, *shares), "length of part k as a fraction of the time, twice")
         if "between" in p.numbers:
             use(p, "behind")
@@ -235,7 +227,7 @@ class NoseHooverMiddle(BetweenHalves, NoseHoover):
 
     Parameters
     ----------
-    temperature, frequency, length, chain_order, repeats, momentum
+    temperature, frequency, length, momentum
         As for `NoseHoover`.
 
     Notes

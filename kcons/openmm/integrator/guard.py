@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 import openmm
-from numpy.typing import NDArray
 
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.certificate import MOST, SHARE
@@ -146,13 +144,13 @@ class Guard:
 
     # -- constraints of the System ---------------------------------------------------------------
 
-    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
+    def limit(self, x: FloatArray) -> FloatArray:
         """What each relative residual may be, given the tolerance and the size of the coordinates.
 
-        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
-        positions there to single numbers then, until the next step.
+        In mixed precision OpenMM rounds positions of molecules that it moves back into the box to single numbers, until
+        the next step.
         """
-        coarse = wrapped and self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
+        coarse = self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
         place = SINGLE if coarse else self.precision.place
         inside = width_of(self.context) if coarse else 0.0
         reach = np.maximum(np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0), inside) / self.rows.lengths
@@ -167,8 +165,6 @@ class Guard:
             return
         miss = np.abs(self.rows.stretches(x))
         limit = self.limit(x)
-        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
-            limit = self.limit(x, wrapped=True)
         excess = miss / limit
         row = int(np.argmax(excess))
         if not excess[row] <= 1:  # also NaN
@@ -198,7 +194,7 @@ class Guard:
         if not rows.n_rows:
             return None
         allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
-        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
+        allowed += (self.limit(x) + self.precision.speeds) * np.sqrt(np.mean(v * v))
         return Violation.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
 
     # -- calls ----------------------------------------------------------------------------------
@@ -478,26 +474,6 @@ def _size(system: openmm.System) -> tuple[int, int, int]:
 def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Violation]:
     """Rows whose positions are off, the worst of each part."""
     return [found for part in parts if (found := part.worst_violation(context, velocities=False)) is not None]
-
-
-def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:
-    """Whether what is off may be molecules that were just moved back into the box: few of them cross a face at a time.
-
-    Parameters
-    ----------
-    context : openmm.Context
-    first : ndarray of int, shape (n_rows,)
-        A particle of each row.
-    off : ndarray of bool, shape (n_rows,)
-        Rows that are off.
-    """
-    if not off.any():
-        return False
-    of_particle = np.zeros(context.getSystem().getNumParticles(), dtype=np.int64)
-    for number, molecule in enumerate(context.getMolecules()):
-        of_particle[list(molecule)] = number
-    molecules = of_particle[first]
-    return 2 * len(np.unique(molecules[off])) <= max(len(np.unique(molecules)), 2)
 
 
 def _smaller_step(held: bool) -> str:

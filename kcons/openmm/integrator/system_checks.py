@@ -257,17 +257,17 @@ def groups_in(integrator: openmm.Integrator) -> set[int]:
 
 def forces_alone(
     system: openmm.System,
-    rows: Sequence[Sequence[openmm.Force]],
+    forces: Sequence[openmm.Force],
     box: Sequence | None = None,
     parameters: Mapping[str, float] | None = None,
 ) -> openmm.Context:
-    """A Context of copies of some Forces alone, each row of them in the group of its number, in double precision.
+    """A Context of copies of some Forces alone, each in the group of its number, in double precision.
 
     Parameters
     ----------
     system : openmm.System
         Of its particles.
-    rows : sequence of sequences of Force
+    forces : sequence of Force
     box : sequence of three vectors, optional
         In place of the System's default.
     parameters : mapping of str to float, optional
@@ -282,14 +282,13 @@ def forces_alone(
     for k in range(system.getNumParticles()):
         alone.addParticle(system.getParticleMass(k))
     alone.setDefaultPeriodicBoxVectors(*(system.getDefaultPeriodicBoxVectors() if box is None else box))
-    for group, forces in enumerate(rows):
-        for force in forces:
-            try:
-                taken = copy.deepcopy(force)
-            except openmm.OpenMMException as error:
-                raise UnsupportedError(f"{force.getName()}: {error} Define the function in a module") from error
-            taken.setForceGroup(group)
-            alone.addForce(taken)
+    for group, force in enumerate(forces):
+        try:
+            taken = copy.deepcopy(force)
+        except openmm.OpenMMException as error:
+            raise UnsupportedError(f"{force.getName()}: {error} Define the function in a module") from error
+        taken.setForceGroup(group)
+        alone.addForce(taken)
     context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
     for name in context.getParameters():
         if parameters is not None:

@@ -77,8 +77,6 @@ def test_all_constraints_change_hands(constraints):
     [
         ((), {}, [[9, 10]], 9),  # rigid water stays with OpenMM
         (([4],), {}, [[3, 4], [3, 5], [4, 5]], 7),
-        (("hbonds",), {"keep_water": False}, WATERS, 1),
-        (("hbonds",), {}, [], 10),
         (([],), {}, [], 10),
         (("all",), {"keep_water": False}, [*WATERS, [9, 10]], 0),
     ],

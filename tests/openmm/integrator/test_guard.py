@@ -9,7 +9,6 @@ import openmm
 import pytest
 from openmm import unit
 from openmm_systems import (
-    GPUS,
     PLATFORMS,
     alanine,
     dumbbell,
@@ -322,53 +321,6 @@ def test_clock_follows_the_step_size():
     integrator.step(4)
     assert context.getTime() / PS == pytest.approx(0.005, rel=1e-12)
     assert context.getStepCount() == 7
-
-
-# -- molecules that cross the box ---------------------------------------------------------------------
-
-
-EDGE = 8.0
-
-
-@pytest.mark.parametrize("platform", [g for g in GPUS if "mixed" in str(g)])
-@pytest.mark.parametrize(
-    "crossed, molecules, seen, refused",
-    [(1, 1, 0.0, False), (2, 4, EDGE, False), (3, 4, 0.0, True)],
-)
-def test_positions_rounded_to_single_numbers_are_excused_where_few_molecules_crossed(
-    platform, crossed, molecules, seen, refused
-):
-    """In mixed precision OpenMM rounds positions of molecules that it moves back into the box.
-
-    A State has them where they were before, which may be near the origin (`seen` is what comes off).
-    """
-    system = openmm.System()
-    system.setDefaultPeriodicBoxVectors(*(EDGE * np.eye(3)))
-    force = openmm.NonbondedForce()
-    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    inside = np.zeros((2 * molecules, 3))
-    for k in range(molecules):
-        inside[2 * k] = (7.9 + 0.01 * np.pi, 7.9 + 0.001 * k * np.pi, 7.9 + np.e / 100)
-        inside[2 * k + 1] = inside[2 * k] + 0.1 * np.array([2, 3, 6]) / 7
-        system.addConstraint(system.addParticle(12.0), system.addParticle(1.0), 0.1)
-        for _ in range(2):
-            force.addParticle(0.0, 0.3, 0.0)
-        force.addException(2 * k, 2 * k + 1, 0.0, 0.3, 0.0)
-    x = inside - seen
-    system.addForce(force)
-    integrator = ProjectedIntegrator(0.001)
-    context = started(system, integrator, x, platform=platform)
-    integrator.step(1)
-    given = x.copy()
-    given[: 2 * crossed] = inside[: 2 * crossed].astype(np.float32) - seen
-    assert integrator.context is context
-    watch = integrator._guard
-    assert (np.abs(watch.rows.stretches(given)) > watch.limit(given))[:crossed].all()
-    if refused:
-        with pytest.raises(ConvergenceError):
-            watch.check_lengths(given, 1)
-    else:
-        watch.check_lengths(given, 1)
 
 
 def external(n):

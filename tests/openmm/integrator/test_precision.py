@@ -333,21 +333,6 @@ def test_dependent_rows_are_found_in_any_precision(platform):
     del context
 
 
-@less_than_double
-def test_a_tolerance_that_forces_do_not_have_is_named(platform):
-    precision = Precision(*platform.split())
-    system, x, v = free_alanine()
-    force = openmm.CustomTorsionForce("theta")
-    force.addTorsion(4, 6, 8, 14)
-    part = CollectiveRows(system, [Row(force)], positions=x, tolerance=1e-12)
-    integrator = ProjectedIntegrator(STEP, parts=[part])
-    context = started(system, integrator, x, v, platform)
-    words = rf"Forces tell no more than [\d.]+e-07 here in {precision}: leave the tolerance open"
-    with pytest.raises(ConvergenceError, match=words):
-        integrator.step(200)
-    del context
-
-
 # -- rows of constraint objects ---------------------------------------------------------------------
 
 
