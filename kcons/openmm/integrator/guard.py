@@ -342,16 +342,10 @@ class Guard:
             self._go_back(error)
             raise
 
-    def count(self, steps: int, *, ends: bool = False) -> None:
+    def count(self, steps: int) -> None:
         """Count steps that were made; check where a check is due.
 
         Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
-
-        Parameters
-        ----------
-        steps : int
-        ends : bool
-            Whether a call ends that is checked at its end.
 
         Raises
         ------
@@ -359,14 +353,12 @@ class Guard:
             The Context is put back to where it was checked last.
         """
         self.since_check += steps
-        due = 0 < self.integrator.check_every <= self.since_check
-        if not (due or ends):
+        if not 0 < self.integrator.check_every <= self.since_check:
             return
-        spare = self.integrator.spare and (not due or self._put_off < MOST)
+        spare = self.integrator.spare and self._put_off < MOST
         if spare and self._cost > SHARE * (perf_counter() - self._checked):
-            if due:
-                self._put_off += 1
-                self.since_check = 0
+            self._put_off += 1
+            self.since_check = 0
             return
         begun = perf_counter()
         try:
