@@ -23,7 +23,7 @@ from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
@@ -74,12 +74,8 @@ _REFUSALS: list[Exception] = []
 
 def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
     """Why steps of this kind are not made on the device; empty if they are."""
-    if scheme is None:
-        return "the leapfrog has velocities half a step behind; use scheme='rattle'"
     if type(ensemble) not in ENSEMBLES:
         return f"{type(ensemble).__name__} has no kernels"
-    if getattr(ensemble, "atoms", None) is not None:
-        return "a thermostat on some of the particles has no kernels"
     if parts and isinstance(ensemble, LangevinRespa):
         return f"{type(ensemble).__name__} holds no parts"
     if why := rows_refusal(parts):
@@ -105,7 +101,7 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
             now = ends[-1]
         elif isinstance(operation, Chain):
             assert isinstance(ensemble, NoseHoover)
-            flights = tuple(operation.fraction * f for f in chain_fractions(ensemble.chain_order, ensemble.repeats))
+            flights = tuple(operation.fraction * f for f in chain_fractions(CHAIN_ORDER, 1))
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
             done.append(Op("rescale"))

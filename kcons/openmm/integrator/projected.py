@@ -22,7 +22,7 @@ from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import TOLERANCES, Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
 from kcons.openmm.quantities import kelvins, number, relative_tolerance
@@ -77,8 +77,7 @@ class ProjectedIntegrator(Integrator):
         In ps if a float; more than 0. OpenMM refuses negative steps: to go back, turn the velocities round.
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
-        'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
-        openmm.VerletIntegrator.
+        'blanes-moan6a', 'isokinetic4', 'isokinetic6', or a splitting of kcons.steppers.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float, optional
@@ -95,8 +94,7 @@ class ProjectedIntegrator(Integrator):
 
     Attributes
     ----------
-    scheme : Splitting or None
-        None for the leapfrog.
+    scheme : Splitting
     parts : tuple of Part
     row_groups : frozenset of int
         Force groups that carry rows, not forces.
@@ -191,9 +189,8 @@ class ProjectedIntegrator(Integrator):
     _own_step: Callable[[Step], bool] | None = None
 
     def __repr__(self) -> str:
-        scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
         held = "".join(f", {part!r}" for part in self.parts)
-        return f"<ProjectedIntegrator: {scheme}, {self._dt * 1e3:g} fs{held}>"
+        return f"<ProjectedIntegrator: {self.scheme!r}, {self._dt * 1e3:g} fs{held}>"
 
     def __str__(self) -> str:
         return f"{self!r}\n{self.listing()}"
@@ -420,7 +417,7 @@ class ProjectedIntegrator(Integrator):
             self.program.write("failed", 0.0)
             raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
         for part in self.parts:
-            part.check(guard.context, velocities=not guard.late)
+            part.check(guard.context)
         guard.check()
 
     # -- states on constraints ------------------------------------------------------------------
@@ -538,12 +535,11 @@ class ProjectedIntegrator(Integrator):
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """As a State has it: of the velocities at x; with a bath that has noise, of those in the middle of the step.
 
-        With such a bath, and with the leapfrog, the next step computes forces anew, as after any State with energies.
+        With such a bath the next step computes forces anew, as after any State with energies.
         """
         guard = self._watch(context)
-        if self.scheme is None or self.ensemble.noisy:
-            groups = self.getIntegrationForceGroups() if self.scheme is None else 0
-            return guard.context.getState(energy=True, groups=groups).getKineticEnergy()
+        if self.ensemble.noisy:
+            return guard.context.getState(energy=True, groups=0).getKineticEnergy()
         v = velocities_of(guard.context)
         return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
 
@@ -754,9 +750,8 @@ class ProjectedIntegrator(Integrator):
         return made
 
     def _making(self) -> tuple[Any, ...]:
-        scheme = LEAPFROG if self.scheme is None else self.scheme
         every = None if self.spare else self.check_every
-        made_with = (self.getStepSize(), scheme, self.parts, self.asked_tolerance, every, self.ensemble)
+        made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
         program = self.program
         # What belongs to a state or a step a copy starts without; clocks of targets that move go by the good steps.
         left = {*program.settings, *program.idle, *program.memory, *VARIABLES} - {"good_steps"}
