@@ -19,8 +19,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
-from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
+from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row
 from kcons.openmm.callback_rows.callbacks import cell_of
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
 from kcons.openmm.callback_rows.hold import constraints_about
@@ -127,7 +127,9 @@ class HeldCoordinatesReporter:
         assert self._held is not None and self._set is not None
         if self._set.lattice is not None:
             self._set.with_cell(cell_of(state.getPeriodicBoxVectors()))
-        self.series.isokinetic_degrees_of_freedom = _isokinetic(simulation.integrator)
+        ensemble = getattr(simulation.integrator, "ensemble", None)
+        if isinstance(ensemble, Isokinetic):
+            self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
         sample = self._held.sample(x, v, f, time)
         self._work += self.series.append(sample)
         pairs = [n for pair in zip(sample.value.tolist(), sample.multiplier.tolist(), strict=True) for n in pair]
@@ -253,14 +255,12 @@ class _Simulation:
         self._sampler, self.held, self._settings = sampler, held, settings
         self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
         if settings.relax:
-            self.hold(window.start, window.start, "langevin", window.seed, None)
+            self.hold(window.start, window.start, window.seed, None)
             integrator: Any = self.simulation.integrator
             integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
             self._x = positions_of(self.simulation.context)
 
-    def hold(
-        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
-    ) -> None:
+    def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
         duration, wraps = max(settings.pull, 1) * dt, system.usesPeriodicBoundaryConditions()
@@ -268,9 +268,7 @@ class _Simulation:
             Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, period=item.period, name=name)
             for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
         ]
-        ensemble: Any = Isokinetic(settings.temperature)
-        if thermostat != "isokinetic":
-            ensemble = (Langevin if thermostat == "langevin" else NoseHoover)(settings.temperature, settings.friction)
+        ensemble = Langevin(settings.temperature, settings.friction)
         part = CollectiveRows(system, rows, positions=sampler.positions)
         integrator = ProjectedIntegrator(dt * unit.picosecond, parts=[part], ensemble=ensemble)
         integrator.setRandomNumberSeed(seed % 2**31 + 1)
@@ -289,11 +287,6 @@ class _Simulation:
             integrator.applyVelocityConstraints()
         else:
             integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
-            if thermostat != "langevin" and not self.held.knows_place:
-                # Thermostats that scale velocities never forget the total momentum.
-                masses, v = masses_of(system), velocities_of(context)
-                v[masses > 0] -= masses @ v / masses.sum()
-                context.setVelocities(v)
 
     def step(self, steps: int) -> None:
         self.simulation.step(steps)
@@ -308,10 +301,6 @@ class _Simulation:
         groups = self.simulation.integrator.getIntegrationForceGroups()
         return _state(self.simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups))
 
-    @property
-    def isokinetic_degrees_of_freedom(self) -> int:
-        return _isokinetic(self.simulation.integrator)
-
 
 def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Positions, velocities, forces and time in nm and ps; Quantities take longer to make than the sample."""
@@ -319,12 +308,6 @@ def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, flo
     for kind, array in zip((openmm.State.Positions, openmm.State.Velocities, openmm.State.Forces), arrays, strict=True):
         state._getVectorAsNumpy(kind, array)
     return arrays[0], arrays[1], arrays[2], state.getTime()._value
-
-
-def _isokinetic(integrator: Any) -> int:
-    """Degrees of freedom under an isokinetic thermostat; 0 under others."""
-    ensemble = getattr(integrator, "ensemble", None)
-    return ensemble.count(integrator) if isinstance(ensemble, Isokinetic) else 0
 
 
 def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
