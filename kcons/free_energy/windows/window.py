@@ -143,7 +143,8 @@ class Sampler(ABC):
         It has ``hold(begin, end, thermostat, seed, velocities)``, to go on with the coordinates moving from `begin` to
         `end` in the steps of a pull, or at rest where these agree (`velocities` is the seed of new ones at the
         temperature of the settings, or None to keep those that there are); ``step(steps)``; ``run(steps, every,
-        take)``, to call `take` after every so many steps; ``state()``: positions, velocities, forces and time; and
+        take)``, to call `take` with the state after every so many steps; ``state()``: positions, velocities, forces
+        and time; and
         ``isokinetic_degrees_of_freedom``.
         """
 
@@ -186,7 +187,7 @@ class Sampler(ABC):
         collector = Collector(held, series)
         if start:
             collector.add(*run.state())
-        run.run(steps, every, lambda: collector.add(*run.state()))
+        run.run(steps, every, collector.add)
         collector.look()
         series.isokinetic_degrees_of_freedom = run.isokinetic_degrees_of_freedom
         return series

@@ -195,6 +195,7 @@ def test_andersen_thermostat_acts_on_velocities_at_x():
     assert residuals(system, context)[1] < 1e-9
 
 
+@pytest.mark.usefixtures("without_device")
 def test_steps_without_python():
     """What OpenMM makes of it where Python is not asked is RATTLE as well."""
     system, x, v = alanine()
