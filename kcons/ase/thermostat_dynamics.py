@@ -38,7 +38,7 @@ from kcons.thermostats import (
     thermal_velocities,
     tune,
 )
-from kcons.thermostats.freedom import Momentum, open_directions
+from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.isokinetic.isokinetic import Convention
 from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
 
@@ -116,8 +116,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
     def _made(self, motion: Motion) -> System:
         if self.barostat is None:
             return super()._made(motion)
-        if np.any(self._friction):
-            raise UnsupportedError("friction takes out heat beside the thermostat; leave it out")
         system = AtomsSystem(self, motion)
         self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
         return system
@@ -564,7 +562,6 @@ def draw_velocities(
     temperature_K: float,
     rng: Rng = None,
     *,
-    exact: bool = False,
     zero_momentum: bool = False,
     constraints: Constraint | Iterable[Constraint] = (),
 ) -> None:
@@ -579,8 +576,6 @@ def draw_velocities(
         On their constraints.
     temperature_K : float
     rng : int, numpy.random.Generator or None
-    exact : bool
-        Scale to 2K = g kT exactly.
     zero_momentum : bool
         Take total momentum out, in the directions in which no constraint knows a place in space.
     constraints : sequence of Constraint, optional
@@ -599,15 +594,8 @@ def draw_velocities(
     try:
         atoms.set_momenta(np.zeros_like(momenta), apply_constraint=False)
         held = ConstrainedDynamics(atoms, 0.0, constraints=constraints)
-        system = held._systems()
-        wanted = None
-        if exact:
-            count = held.degrees_of_freedom
-            if zero_momentum:
-                count -= len(open_directions(system.motion, atoms.positions))
-            wanted = 0.5 * count * thermal or None
         v = thermal_velocities(
-            system, atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum, kinetic_energy=wanted
+            held._systems(), atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum
         )
         momenta = v * held._masses
     finally:
