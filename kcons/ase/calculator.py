@@ -47,8 +47,6 @@ class ConstrainedCalculator(Calculator):
         At the first use: rows that need time or velocities.
     ConvergenceError
         Positions from which the constraints cannot be reached.
-    InputError
-        The inner calculator returned forces of a wrong shape, or NaN.
 
     Notes
     -----

@@ -80,11 +80,6 @@ class PressureReporter:
     values : list of ndarray, shape (3, 3)
         Pressure tensors in eV/A^3.
     volumes : list of float
-
-    Raises
-    ------
-    InputError
-        An unknown virial; `temperature_K` with 'atomic'; dynamics of ASE, which do not know all rows.
     """
 
     def __init__(

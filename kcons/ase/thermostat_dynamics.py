@@ -181,12 +181,8 @@ class IsokineticDynamics(ThermostattedDynamics):
 
     Raises
     ------
-    InputError
-        Temperature not positive, all momenta zero.
     OverdeterminedError
         g is 1.
-    UnsupportedError
-        A constraint couples `indices` to other atoms.
     """
 
     def __init__(
@@ -270,13 +266,6 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         Links of the chain.
     momentum : {'auto', 'conserved', 'free'}
         As for `IsokineticDynamics`.
-
-    Raises
-    ------
-    InputError
-        Temperature or time constant not positive.
-    UnsupportedError
-        Targets that move.
     """
 
     def __init__(
@@ -318,13 +307,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     tolerance : float
         Largest difference of a time step taken back.
-
-    Raises
-    ------
-    InputError
-        Temperature not positive, fewer than one step, `keep` out of range, a negative time step.
-    UnsupportedError
-        A stepper that is not reversible and symplectic; targets that move, rows that hold velocities, friction.
     """
 
     def __init__(
@@ -373,13 +355,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         return found
 
     def get_conserved_energy(self) -> NoReturn:
-        """Nothing is conserved.
-
-        Raises
-        ------
-        UnsupportedError
-            Always.
-        """
+        """`UnsupportedError`: nothing is conserved."""
         raise UnsupportedError(
             "Monte Carlo conserves no energy; look at counts.mean_square, that of its change over kT"
         )
@@ -418,11 +394,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; calculators of other atoms; bad numbers of steps, friction or
-        temperature; options of the other bath. The atoms are then as they were. While it runs: the atoms got another
-        calculator.
-    UnsupportedError
-        Spheres with constraints that move or that hold velocities.
+        One calculator given twice; calculators of other atoms; options of the other bath. While it runs: the atoms got
+        another calculator.
     """
 
     @checked
@@ -521,13 +494,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
 
     def get_conserved_energy(self) -> float:
-        """Total energy less the heat in eV, for Langevin dynamics.
-
-        Raises
-        ------
-        UnsupportedError
-            On spheres, where forces of the bath do work.
-        """
+        """Total energy less the heat in eV; `UnsupportedError` on spheres, whose bath does work."""
         if isinstance(self.stepper, IsokineticSpheres):
             raise UnsupportedError("nothing like an energy is conserved on spheres; look at averages instead")
         return super().get_conserved_energy()
@@ -584,7 +551,7 @@ def draw_velocities(
     Raises
     ------
     InputError
-        Temperature not positive; atoms off their constraints.
+        Atoms off their constraints.
     UnsupportedError
         `zero_momentum` where atoms are held in space.
     """

@@ -42,6 +42,7 @@ MUTANTS = {
             "test_linear.py::test_errors_hold_and_are_not_much_too_large",
         ),
         ("np.all(real > «off→0»)", "test_linear.py::test_what_is_said_is_so"),
+        ("«p.quo(common) * →»once", "test_linear.py::test_eigenvalues_on_the_axis_are_counted_in_integers"),
         (
             "certain = «closer == 1.0 and →»kept",
             "test_linear.py::test_neighbors_that_rounding_joins_are_told_as_uncertain",
