@@ -27,7 +27,6 @@ from kcons.openmm import (
     Langevin,
     NoseHoover,
     ProjectedIntegrator,
-    RattleIntegrator,
     hold,
 )
 from kcons.steppers.files import text
@@ -46,12 +45,12 @@ MADE = {
     "Langevin": lambda: ProjectedIntegrator(2e-3, ensemble=Langevin(300, 1.0)),
     "Isokinetic": lambda: ProjectedIntegrator(2e-3, ensemble=Isokinetic(300, momentum="conserved")),
     "NoseHoover": lambda: ProjectedIntegrator(2e-3, ensemble=NoseHoover(300, 1.0)),
-    "RattleIntegrator": lambda: RattleIntegrator(2e-3),
+    "constant energy": lambda: ProjectedIntegrator(2e-3),
 }
 CASES = [
     *((name, "isotropic", platform) for name in MADE for platform in PLATFORMS),
     *(("Langevin", barostat, "Reference") for barostat in BAROSTATS if barostat != "isotropic"),
-    ("RattleIntegrator", "flexible", "CPU"),
+    ("constant energy", "flexible", "CPU"),
 ]
 
 
@@ -85,7 +84,7 @@ def test_volumes_change_and_all_is_held(name, barostat, platform):
 
 
 @pytest.mark.parametrize("platform", [p for p in GPUS if "mixed" in p.id or "none" in p.id])
-@pytest.mark.parametrize("name", ["Langevin", pytest.param("RattleIntegrator", marks=pytest.mark.validation)])
+@pytest.mark.parametrize("name", ["Langevin", pytest.param("constant energy", marks=pytest.mark.validation)])
 def test_on_gpus(name, platform):
     system, x = pressed("isotropic")
     there = started(system, openmm.VerletIntegrator(1e-3), x, None, "CPU")

@@ -328,7 +328,6 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("kcons.openmm.Langevin(300, -1.0)", InputError, "friction"),
     ("kcons.openmm.Isokinetic(0)", InputError, "temperature"),
     ("kcons.openmm.NoseHoover(300, 0)", InputError, "frequency"),
-    ("RattleIntegrator(0.0)", InputError, "timestep"),
     ("SurfaceIntegrator(0.001, [])", InputError, "surfaces"),
     ("hold(3, Distance([0, 1]), X)", InputError, "system"),
     ("hold(openmm_system(), Distance([0, 9]), X)", InputError, "atoms"),

@@ -6,7 +6,6 @@ atoms with each other are solved as one, so that whole clusters of them change h
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -22,17 +21,12 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_movers
-from kcons.openmm.quantities import masses_of
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
 
-#: Hydrogens, also heavy ones, are lighter than this (dalton).
-_HYDROGEN = 4.5
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
-#: Forces whose particles OpenMM counts as bonded.
-_BONDING = (openmm.HarmonicBondForce, openmm.CustomBondForce, openmm.CustomCentroidBondForce)
 
-Choice = Literal["all", "hbonds", "touched"] | Iterable[int]
+Choice = Literal["all", "touched"] | Iterable[int]
 
 
 def move_constraints(
@@ -50,9 +44,8 @@ def move_constraints(
     ----------
     system : openmm.System
         Changed in place, before a Context is made of it.
-    which : 'all', 'hbonds' or iterable of int
-        Clusters of constraints that share atoms are taken whole: all, those with a hydrogen (lighter than
-        4.5 dalton), or those that touch one of the given atoms.
+    which : 'all' or iterable of int
+        Clusters of constraints that share atoms are taken whole: all, or those that touch one of the given atoms.
     keep_water : bool
         Whether rigid water stays with OpenMM, whose SETTLE is fastest there; molecules among given atoms are taken
         all the same.
@@ -68,7 +61,7 @@ def move_constraints(
         Unknown choice or atoms; nothing was changed.
     """
     table = _table(system)
-    chosen = _chosen(system, table, which, keep_water)
+    chosen = _chosen(table, which, keep_water)
     rows = _as_rows(table, chosen)
     _release(system, table, chosen)
     return rows
@@ -82,7 +75,6 @@ def hold(
     take: Choice = "touched",
     keep_water: bool = True,
     periodic: bool | None = None,
-    degenerate: Literal["convert", "raise"] = "convert",
     join: bool = False,
     time: unit.Quantity | float = 0.0,
 ) -> CarriedConstraints:
@@ -100,11 +92,11 @@ def hold(
         are to move over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints; targets left at None are taken from them.
-    take : 'touched', 'all', 'hbonds' or iterable of int
+    take : 'touched', 'all' or iterable of int
         Which clusters of the System's constraints move over besides those that a row touches.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
-    periodic, degenerate, time
+    periodic, time
         As for `CarriedConstraints`.
     join : bool
         Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
@@ -118,19 +110,18 @@ def hold(
     Raises
     ------
     KconsError
-        As `CarriedConstraints`; a barostat that would break a row. The System was not changed.
+        As `CarriedConstraints`. The System was not changed.
     """
     given = constraints_in(constraints, "constraints")
     table = _table(system)
     n = system.getNumParticles()
-    chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
+    chosen = _chosen(table, () if take == "touched" else take, keep_water)
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
     taken = _as_rows(table, chosen)
-    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
+    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, time=time)
     links = [_neighbors(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
-    refuse_movers(system, part.motion.constraint_set, lambda: _molecules(system, joined))
     # Nothing can fail from here on.
     _release(system, table, chosen)
     _tie(system, joined)
@@ -187,18 +178,12 @@ def _table(system: openmm.System) -> _Table:
     return _Table(pairs, lengths, clusters)
 
 
-def _chosen(system: openmm.System, table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
+def _chosen(table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
     """Which constraints to take, in whole clusters."""
     if isinstance(which, str):
-        if which == "all":
-            chosen = np.ones(len(table.pairs), dtype=bool)
-        elif which == "hbonds":
-            masses = masses_of(system)[table.pairs]
-            with_hydrogen = ((masses > 0) & (masses < _HYDROGEN)).any(axis=1)
-            chosen = np.isin(table.cluster, table.cluster[with_hydrogen])
-        else:
-            raise InputError(f"no choice {which!r}; give 'all', 'hbonds' or the numbers of atoms", item="which")
-        return chosen & ~table.water if keep_water else chosen
+        if which != "all":
+            raise InputError(f"no choice {which!r}; give 'all' or the numbers of atoms", item="which")
+        return ~table.water if keep_water else np.ones(len(table.pairs), dtype=bool)
     atoms = np.asarray(list(which))
     if atoms.size == 0:
         return np.zeros(len(table.pairs), dtype=bool)
@@ -247,21 +232,3 @@ def _tie(system: openmm.System, pairs: IntArray) -> None:
 def _neighbors(atoms: IntArray) -> IntArray:
     """Pairs of atoms that follow each other in rows, shape (n, 2)."""
     return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
-
-
-def _molecules(system: openmm.System, joined: IntArray) -> list[list[int]]:
-    """What Context.getMolecules() will say, from a Context of bonds alone."""
-    bare = openmm.System()
-    for _ in range(system.getNumParticles()):
-        bare.addParticle(1.0)
-    for k in range(system.getNumParticles()):
-        if system.isVirtualSite(k):
-            site = system.getVirtualSite(k)
-            parents = [[k, site.getParticle(m)] for m in range(site.getNumParticles())]
-            joined = np.concatenate([joined, parents])
-    _tie(bare, np.concatenate([joined, _table(system).pairs]))
-    for force in system.getForces():
-        if isinstance(force, _BONDING):
-            bare.addForce(copy.deepcopy(force))
-    context = openmm.Context(bare, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
-    return [list(atoms) for atoms in context.getMolecules()]

@@ -40,10 +40,6 @@ class _Engine:
             self.motion.set_cell(cell)
             self.cell = cell
 
-    def rounded(self, x: FloatArray) -> bool:
-        """Whether molecules may have been moved back into the box, which rounds them."""
-        return self.passage.precision.name != "double" and self.cell is not None
-
 
 class KernelRows(CarriedConstraints):
     """All rows of a Context that its kernels hold: those of parts and the System's constraints.
@@ -97,6 +93,8 @@ class KernelRows(CarriedConstraints):
         """
         pairs, lengths = system_rows
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
+        moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
+        pairs, lengths = pairs[moving], lengths[moving]
         lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
         system_rows = pairs, lengths
         made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
@@ -166,9 +164,6 @@ class KernelRows(CarriedConstraints):
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
-
-    def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Nothing: velocities come from multipliers, and not from rounded positions."""
 
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
         self._engine.passage.precision = precision

@@ -184,7 +184,7 @@ class LangevinRespa(Langevin):
         """Groups from the slowest to the fastest, see `kcons.thermostats.multistep.respa`."""
         return levels_of({str(group): count for group, count in zip(self.groups, self.counts, strict=True)})
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         return nested(self.levels, (1.0,), middle=self.slow_kicks == "middle")
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:

@@ -10,7 +10,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step, refuse_leapfrog
+from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Operation
@@ -89,14 +89,12 @@ class IsokineticSpheres(Ensemble):
     def __repr__(self) -> str:
         return f"IsokineticSpheres({self.temperature:g} K, {self.friction:g}/ps, spheres={self.spheres!r})"
 
-    def check(self, scheme: Splitting | None) -> None:
+    def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for all schemes but 'rattle': the bath has its own."""
-        if scheme is None:
-            refuse_leapfrog(self)
-        elif scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
+        if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
             raise UnsupportedError(f"{self!r} has a scheme of its own; leave out {scheme!r}")
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         found: tuple[Operation, ...] = vars(self)["_operations"]
         return found
 

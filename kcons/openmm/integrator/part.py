@@ -212,11 +212,8 @@ class Part(ABC):
     # -- in a Context ---------------------------------------------------------------------------
 
     @abstractmethod
-    def check(self, context: openmm.Context, velocities: bool = True) -> None:
-        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
-
-        `velocities` is False for the leapfrog, whose velocities belong to half a step before.
-        """
+    def check(self, context: openmm.Context) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
 
     @abstractmethod
     def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:

@@ -30,7 +30,7 @@ from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 
 ForceFunction = Callable[[FloatArray, float], ArrayLike]
 
-#: Difference of the forces of a state from the sum of those of its groups, relative to these, that is their rounding.
+#: Forces of a state that differ from the sum of its groups by at most this fraction are taken for the same.
 SAME = 1e-12
 
 

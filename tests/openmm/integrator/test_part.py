@@ -72,7 +72,7 @@ def held(kind):
     ("kind", "first", "second"),
     [
         ("carried", {"ensemble": Isokinetic(300, momentum="free")}, {"ensemble": Isokinetic(200, momentum="free")}),
-        ("carried", {"scheme": "leapfrog"}, {"scheme": "blanes-moan4"}),
+        ("carried", {"scheme": "suzuki4"}, {"scheme": "blanes-moan4"}),
         ("moving", {"scheme": "blanes-moan4"}, {"scheme": "rattle"}),
         ("moving", {"ensemble": Langevin(300, 0.0)}, {"scheme": "rattle"}),
         ("collective", {"scheme": "blanes-moan4"}, {"scheme": "rattle"}),
