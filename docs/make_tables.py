@@ -84,7 +84,7 @@ def results(name: str) -> tuple[str, dict[str, pd.DataFrame]]:
         )
         return made, study(name).tables(table)
     data = json.loads((harness.RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-    machine = machine_of(data)
+    machine = machine_of(data) or {"commit": data.get("commit"), "cpu": data.get("machine")}
     words = [f"Commit {machine['commit'][:8]}" if machine.get("commit") else "", str(machine.get("date", ""))[:10]]
     place = f"{data['device'] + ' with ' if data.get('device') else ''}{machine.get('cpu', '')}"
     made = f"{', '.join(filter(None, words))}; {place}; [all numbers](RESULTS/{name}.json)."

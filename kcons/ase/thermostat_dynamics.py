@@ -135,10 +135,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         """g: 3 N less the rank of the rows and less the components of total momentum that are left alone."""
         if isinstance(self.stepper, Isokinetic | NoseHooverChain):
             return int(self._variables()[-1])
-        count = self.degrees_of_freedom
-        if getattr(self.stepper, "conserve_momentum", False):
-            count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
-        return count
+        return self.degrees_of_freedom
 
     def _variables(self) -> FloatArray:
         """Those of the thermostat, which begins anew where masses or constraints have changed."""
@@ -237,8 +234,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
     rng : int, numpy.random.Generator or None
         A seed, or what one is drawn from, which `seed` then tells; None takes it from the operating system. A run
         continued from a trajectory needs another; with `restart` the noise goes on.
-    fixcm : bool
-        Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
     """
@@ -251,13 +246,12 @@ class ConstrainedLangevin(ThermostattedDynamics):
         friction: float,
         *,
         rng: Rng = None,
-        fixcm: bool = False,
         substeps: int = 3,
         **kwargs: Any,
     ) -> None:
         #: Seed of the noise.
         self.seed = seed_from(rng)
-        make = partial(Langevin, friction=friction, rng=self.seed, substeps=substeps, conserve_momentum=fixcm)
+        make = partial(Langevin, friction=friction, rng=self.seed, substeps=substeps)
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
 
@@ -315,7 +309,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms, timestep, temperature_K, rng, fixcm, **kwargs
+    atoms, timestep, temperature_K, rng, **kwargs
         As for `ConstrainedLangevin`; forces of the calculator are the gradient of its energy, and `tune` finds a time
         step.
     steps : int or (int, int)
@@ -345,20 +339,13 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         stepper: Stepper | None = None,
         keep: float = 0.0,
         rng: Rng = None,
-        fixcm: bool = False,
         tolerance: float = 1e-9,
         **kwargs: Any,
     ) -> None:
         #: Seed of the random numbers.
         self.seed = seed_from(rng)
         make = partial(
-            HamiltonianMonteCarlo,
-            steps=steps,
-            rng=self.seed,
-            stepper=stepper,
-            keep=keep,
-            conserve_momentum=fixcm,
-            tolerance=tolerance,
+            HamiltonianMonteCarlo, steps=steps, rng=self.seed, stepper=stepper, keep=keep, tolerance=tolerance
         )
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
@@ -424,10 +411,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     spheres : {'split', 'axes', 'cluster', 'global'}
     auxiliary : int
         For spheres, see `IsokineticSpheres`.
-    order : {2, 4}
-        Of the small steps, with 1 or 6 calls of `fast` in each.
     substeps : int
-        Flights along the constraints in each half of a small step, for order 2.
+        Flights along the constraints in each half of a small step.
     slow_kicks : {'ends', 'middle'}
         With 'middle' the atoms are halfway between two slow kicks at the end of a step, where averages are better; what
         is logged there costs a call of `slow`.

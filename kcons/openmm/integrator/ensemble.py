@@ -365,10 +365,10 @@ class Step:
         return f"(x-xu)/{h}"
 
     def _filtered_flight(self, h: str) -> str:
-        """What a drift does to v lies along the gradients where it began: the rest of (x-xu)/h is rounding.
+        """The drift, with rounding kept out of v: of (x-xu)/h only what is along the gradients at its start is added.
 
-        (x-xu)/h has the rounding errors of x, divided by h. The projector where the drift began tells what of it is
-        along the constraints.
+        (x-xu)/h is the change of v by the constraint forces, plus the rounding errors of x divided by h. Constraint
+        forces act along the gradients where the drift began, so that whatever else (x-xu)/h has is rounding.
         """
         p = self.program
         use(p, "x_start", "v_next")
