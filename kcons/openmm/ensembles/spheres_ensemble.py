@@ -91,15 +91,8 @@ class IsokineticSpheres(Ensemble):
 
     def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for all schemes but 'rattle': the bath has its own."""
-<<<<<<< HEAD
         if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
-            raise UnsupportedError(f"{self!r} has a scheme of its own, see order=; leave out {scheme!r}")
-=======
-        if scheme is None:
-            refuse_leapfrog(self)
-        elif scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
             raise UnsupportedError(f"{self!r} has a scheme of its own; leave out {scheme!r}")
->>>>>>> 052aa599ae8c83e5e777719764b6b0c38d376db9
 
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         found: tuple[Operation, ...] = vars(self)["_operations"]
