@@ -80,7 +80,7 @@ def test_where_rows_are_and_how_fast():
     arm = x[3] - x[0]
     length = float(np.linalg.norm(arm))
     assert part.values(context) == pytest.approx([length], rel=1e-12)
-    assert part.targets(context) == pytest.approx([0.3]) and part.driven and not part.steered
+    assert part.targets(context) == pytest.approx([0.3]) and part.driven
     assert part.residuals(context) == pytest.approx([length - 0.3], rel=1e-10)
     assert part.rates(context) == pytest.approx([arm @ (v[3] - v[0]) / length - 0.5], rel=1e-10)
     assert part.rank(context) == 1
