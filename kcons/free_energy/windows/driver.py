@@ -239,10 +239,10 @@ class FreeEnergy:
         """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
         best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
         numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
-        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski", "jarzynski_backward")}
+        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski")}
         numbers |= {key: [*estimate] for key, estimate in estimates.items() if estimate is not None}
-        numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
-        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol lost)"
+        numbers["overlap"] = pulled.overlap
+        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name})"
         if self._profile()[0] is not None:
             windows = self.between(float(start[0]), float(end[0]))
             if windows is None:
@@ -418,7 +418,6 @@ class Windows:
         error: float,
         most: int,
         *,
-        between: tuple[float, float] | None = None,
         below: float | None = None,
         at_once: int = 1,
     ) -> FreeEnergy:
@@ -429,8 +428,8 @@ class Windows:
         error : float
         most : int
             Never more than so many windows.
-        between, below
-            Of `Profile.next_windows`. With `below`, errors higher up do not count.
+        below : float, optional
+            Of `Profile.next_windows`: errors higher up do not count.
         at_once : int
             How many are added before the profile is looked at again: as many as there are workers.
         """
@@ -442,7 +441,7 @@ class Windows:
                 profile = result.profile
                 if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
                     break
-                places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
+                places = profile.next_windows(min(at_once, most - len(self._targets)), below=below)
                 known = len(self._failed)
                 result = self._run(self._added([place] for place in places))
                 if len(self._failed) > known:

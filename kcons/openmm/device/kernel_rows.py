@@ -93,6 +93,8 @@ class KernelRows(CarriedConstraints):
         """
         pairs, lengths = system_rows
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
+        moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
+        pairs, lengths = pairs[moving], lengths[moving]
         lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
         system_rows = pairs, lengths
         made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)

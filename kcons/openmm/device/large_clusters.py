@@ -188,7 +188,9 @@ def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, IntArray]:
         np.searchsorted(slots[touch, 0], np.arange(pattern.atoms.shape[1])),
         touch,
     )
-    return _Tables(*(table.astype(np.int64).reshape(len(table), math.prod(table.shape[1:])) for table in found)), order.rows
+    return _Tables(
+        *(table.astype(np.int64).reshape(len(table), math.prod(table.shape[1:])) for table in found)
+    ), order.rows
 
 
 def _pairs(some: IntArray) -> IntArray:

@@ -207,6 +207,11 @@ class Guard:
             return False
         return self._left is None or self._left == (context.getStepCount(), box_of(context))
 
+    @property
+    def in_run(self) -> bool:
+        """Whether a call of `step` has ended, or failed, before this one."""
+        return self._left is not None
+
     def enter(self) -> None:
         """A call of `step` begins."""
         if not self.started:

@@ -89,8 +89,9 @@ class ProjectedIntegrator(Integrator):
     ensemble : Ensemble, optional
         How velocities change between drifts; constant energy by default.
     device : bool, optional
-        Whether a compiled plugin makes the steps, see `kcons.openmm.device`: True demands it, None takes it where it
-        can be had and has this step, False is the program of a CustomIntegrator.
+        Whether a compiled plugin makes the steps, see `kcons.openmm.device`: True demands it, False is the program of a
+        CustomIntegrator. None takes the plugin if it has this step, and OpenMM has a platform for GPUs here (CUDA, HIP,
+        OpenCL) or the plugin was compiled already; `listing` says why not.
 
     Attributes
     ----------
@@ -124,13 +125,19 @@ class ProjectedIntegrator(Integrator):
     asked_tolerance: float | None = None
     _guard: Guard | None = None
     _program_type = Program
-    #: Makes integrators whose steps are made on the device; given by `kcons.openmm.device`.
-    _on_device: ClassVar[Callable[..., type[ProjectedIntegrator]]]
+    #: Chooses the class, and says why it is not that whose steps are made on the device; of `kcons.openmm.device`.
+    _on_device: ClassVar[Callable[..., tuple[type[ProjectedIntegrator], str]]]
+    #: Why steps are not made on the device, where that was asked.
+    _refused = ""
 
-    def __new__(cls, *args: Any, device: bool | None = False, **kwargs: Any) -> ProjectedIntegrator:
+    def __new__(cls, *args: Any, device: bool | None = None, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
-        kind = cls._on_device(device, *args, **kwargs) if cls is ProjectedIntegrator and device is not False else cls
-        return object.__new__(kind)
+        kind, why = cls, ""
+        if cls is ProjectedIntegrator and device is not False:
+            kind, why = cls._on_device(device, *args, **kwargs)
+        made = object.__new__(kind)
+        made._refused = why
+        return made
 
     def __init__(
         self,
@@ -141,7 +148,7 @@ class ProjectedIntegrator(Integrator):
         tolerance: float | None = None,
         check_every: int | None = None,
         ensemble: Ensemble | None = None,
-        device: bool | None = False,
+        device: bool | None = None,
     ) -> None:
         self._make(picoseconds(timestep))
         self.asked_tolerance = None if tolerance is None else relative_tolerance(tolerance)
@@ -203,7 +210,8 @@ class ProjectedIntegrator(Integrator):
         elif self.asked_tolerance is None:
             held += ", or what the precision of the Context allows"
         step = "\n".join(f"  {operation}" for operation in self.operations())
-        return f"{held}\na step of {self!r}\n{step}\n{self.program.listing()}"
+        refused = f"not on the device: {self._refused}\n" if self._refused else ""
+        return f"{held}\na step of {self!r}\n{step}\n{refused}{self.program.listing()}"
 
     def operations(self) -> tuple[Operation, ...]:
         """What a step consists of, as for steppers on arrays; `listing` adds how OpenMM computes it."""
@@ -679,7 +687,7 @@ class ProjectedIntegrator(Integrator):
             raise UnsupportedError(
                 f"{name} is a setting of the integrator: use setTemperature, setFriction, or set_target of a part"
             )
-        super().setGlobalVariableByName(name, value)
+        self.program.write(name, float(value))
 
     def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
         """Choose the force groups that act; groups that carry rows never do.
@@ -733,16 +741,25 @@ class ProjectedIntegrator(Integrator):
         InputError
             The file has another program.
         """
+        device = 'type="KconsProgram"' in xml
+        if device and cls is ProjectedIntegrator:
+            cls = cls._on_device(True, 0.0, scheme, **arguments)[0]  # loads what the file is read by
         plain = openmm.XmlSerializer.deserialize(xml)
-        made = cls(plain.getStepSize(), scheme, **{"tolerance": plain.getConstraintTolerance(), **arguments})
-        if not isinstance(plain, openmm.CustomIntegrator) or _computations(plain) != _computations(made):
+        given = {"tolerance": plain.getConstraintTolerance(), "device": False, **arguments}
+        made = cls(plain.getStepSize(), scheme, **given)
+        if not (made._has_written(xml) if device else _computations(plain) == _computations(made)):
             raise InputError(
                 f"the file has another program than {made!r}; give the scheme, ensemble and parts it was made with",
                 item="integrator",
             )
-        made.setRandomNumberSeed(plain.getRandomNumberSeed())
+        if not device:
+            made.setRandomNumberSeed(plain.getRandomNumberSeed())
         openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
         return made
+
+    def _has_written(self, xml: str) -> bool:
+        """Whether a file of steps on the device has the step of this integrator; takes the seed of it."""
+        return False
 
     def _making(self) -> tuple[Any, ...]:
         every = None if self.spare else self.check_every
@@ -773,7 +790,8 @@ def _remade(
     seed: int,
 ) -> ProjectedIntegrator:
     dt, scheme, parts, tolerance, check_every, ensemble = made_with
-    made = kind(dt, scheme, parts=parts, tolerance=tolerance, check_every=check_every, ensemble=ensemble)
+    options = {"tolerance": tolerance, "check_every": check_every, "ensemble": ensemble, "device": False}
+    made = kind(dt, scheme, parts=parts, **options)
     made.setRandomNumberSeed(seed)
     openmm.Integrator.setIntegrationForceGroups(made, groups)
     for name, value in settings.items():
@@ -782,7 +800,9 @@ def _remade(
     return made
 
 
-def _computations(integrator: openmm.CustomIntegrator) -> list[tuple[Any, ...]]:
+def _computations(integrator: openmm.Integrator) -> list[tuple[Any, ...]]:
+    if not isinstance(integrator, openmm.CustomIntegrator):
+        return []
     return [tuple(integrator.getComputationStep(k)) for k in range(integrator.getNumComputations())]
 
 
