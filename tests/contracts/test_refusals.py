@@ -332,7 +332,7 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("hold(3, Distance([0, 1]), X)", InputError, "system"),
     ("hold(openmm_system(), Distance([0, 9]), X)", InputError, "atoms"),
     ("hold(openmm_system(), Distance([0, 1]), X[:2])", InputError, "positions"),
-    ('hold(openmm_system(), Distance([0, 1]), X, take="some")', InputError, "which"),
+    ('hold(openmm_system(), Distance([0, 1]), X, take="some")', InputError, "take"),
     ("ConstraintSet(Distance([0, 1], -1.0), X, M)", InputError, "target"),
     ("ConstraintSet(Distance([0, 1], 0.0), X, M)", InputError, "target"),
     ("ConstraintSet(Angle([0, 1, 2], 4.0), X, M)", InputError, "target"),
