@@ -93,7 +93,7 @@ class Part:
 
 FEW = ("extrapolation",)
 LONG = ("ase-internals",)
-LARGE = (*FEW, "ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853")
+LARGE = (*FEW, "ase-bonds", "ase-internals", "openmm-verlet-", "openmm-kcons-rattle-", "openmm-held", "dop853")
 CCMA = (
     "ase-bonds",
     "ase-internals",
@@ -101,7 +101,6 @@ CCMA = (
     "openmm-middle",
     "openmm-nose",
     "openmm-kcons-",
-    "openmm-rattle",
 )
 WATER = (*FEW, "ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6")
 

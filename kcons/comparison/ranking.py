@@ -32,7 +32,7 @@ RESOLVED, ROUNDING = 3.0, 1e-13
 #: Errors, times and evaluations that differ by these fractions are the same, unless rounds of timing say more.
 SAME_ERROR, SAME_TIME, SAME_EVALUATIONS = 0.05, 0.05, 0.02
 #: Methods whose error is what is usually accepted, and the step of it where time is in fs.
-USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-rattle", "openmm-verlet")
+USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-verlet")
 USUAL_STEP = 2.0
 #: Steps are predicted for this part of the error, since the prediction may be off; one that makes less than `WASTE` of
 #: it was too short. So many runs of one method, and so many methods, are tried.

@@ -232,10 +232,10 @@ class _Simulation:
     def step(self, steps: int) -> None:
         self._dynamics.run(steps)
 
-    def run(self, steps: int, every: int, take: Callable[[], None]) -> None:
+    def run(self, steps: int, every: int, take: Callable[..., None]) -> None:
         first = self._dynamics.nsteps
         # Before the first step ASE calls it, too.
-        self._dynamics.attach(lambda: take() if self._dynamics.nsteps > first else None, interval=every)
+        self._dynamics.attach(lambda: take(*self.state()) if self._dynamics.nsteps > first else None, interval=every)
         self._dynamics.run(steps)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:

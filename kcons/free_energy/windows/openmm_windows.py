@@ -20,11 +20,12 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
-from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row
+from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, Row
 from kcons.openmm.callback_rows.callbacks import cell_of
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
 from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
+from kcons.openmm.device.device_integrator import choose
 from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
 from kcons.openmm.states import positions_of, velocities_of
 from kcons.openmm.topology import bonds_of
@@ -254,6 +255,7 @@ class _Simulation:
     def __init__(self, sampler: OpenMMWindows, held: Held, window: Window, settings: Settings) -> None:
         self._sampler, self.held, self._settings = sampler, held, settings
         self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
+        self._seen = held.measured(window.target).seen
         if settings.relax:
             self.hold(window.start, window.start, window.seed, None)
             integrator: Any = self.simulation.integrator
@@ -264,13 +266,25 @@ class _Simulation:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
         duration, wraps = max(settings.pull, 1) * dt, system.usesPeriodicBoundaryConditions()
-        rows = [
-            Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, period=item.period, name=name)
-            for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
-        ]
         ensemble = Langevin(settings.temperature, settings.friction)
-        part = CollectiveRows(system, rows, positions=sampler.positions)
-        integrator = ProjectedIntegrator(dt * unit.picosecond, parts=[part], ensemble=ensemble)
+        moves = tuple(begin) != tuple(end)
+        parts: list[Any] = self.held.towards(begin, end, duration) if moves else self.held.at(begin)
+        self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
+        if not self._on_device:
+            rows = [
+                Row(
+                    _force_of(name, item, wraps),
+                    float(a),
+                    (float(b) - float(a)) / duration,
+                    period=item.period,
+                    name=name,
+                )
+                for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
+            ]
+            parts = [CollectiveRows(system, rows, positions=sampler.positions)]
+        integrator: Any = ProjectedIntegrator(dt * unit.picosecond, parts=parts, ensemble=ensemble)
+        if self._on_device:
+            integrator.record(self._seen)
         integrator.setRandomNumberSeed(seed % 2**31 + 1)
         platform = sampler.platform
         chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform), sampler.properties]
@@ -292,10 +306,17 @@ class _Simulation:
         self.simulation.step(steps)
         self._x, self._v = positions_of(self.simulation.context), velocities_of(self.simulation.context)
 
-    def run(self, steps: int, every: int, take: Callable[[], None]) -> None:
-        for _ in range(steps // every):
-            self.simulation.step(every)
-            take()
+    def run(self, steps: int, every: int, take: Callable[..., None]) -> None:
+        if not self._on_device:
+            for _ in range(steps // every):
+                self.simulation.step(every)
+                take(*self.state())
+            return
+        whole: FloatArray = np.zeros((3, *self._x.shape))
+        integrator: Any = self.simulation.integrator
+        for *seen, time in integrator.records(steps // every * every, every):
+            whole[:, self._seen] = seen
+            take(*whole, time)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         groups = self.simulation.integrator.getIntegrationForceGroups()

@@ -138,7 +138,7 @@ class Sampler(ABC):
         It has ``hold(begin, end, seed, velocities)``, to go on with the coordinates moving from `begin` to `end` in the
         steps of a pull, or at rest where these agree (`velocities` is the seed of new ones at the temperature of the
         settings, or None to keep those that there are); ``step(steps)``; ``run(steps, every, take)``, to call `take`
-        after every so many steps; and ``state()``: positions, velocities, forces and time.
+        with the state after every so many steps; and ``state()``: positions, velocities, forces and time.
         """
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
@@ -180,7 +180,7 @@ class Sampler(ABC):
         collector = Collector(held, series)
         if start:
             collector.add(*run.state())
-        run.run(steps, every, lambda: collector.add(*run.state()))
+        run.run(steps, every, collector.add)
         collector.look()
         return series
 
