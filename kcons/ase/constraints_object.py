@@ -58,9 +58,6 @@ class Constraints(FixConstraint):
     constraints : sequence of Constraint
         What is held (or the plain data that `todict` writes). Fixed atoms belong here too, as
         `FixedAtoms`.
-    degenerate : {'convert', 'raise'}
-        What to do about rows that are singular to first order, such as three distances in a collinear
-        triatomic: hold the same with linear rows, or refuse.
     repeated : optional
         Set in files that were written between `repeat` and the first use; not for people.
 
@@ -82,11 +79,9 @@ class Constraints(FixConstraint):
         self,
         constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = (),
         *,
-        degenerate: Literal["convert", "raise"] = "convert",
         repeated: tuple[Sequence[int], int] | None = None,
     ) -> None:
         self.constraints = listed(constraints)
-        self.degenerate = degenerate
         self._repeated: tuple[tuple[int, int, int], int] | None = None
         if repeated is not None:
             (a, b, c), n = repeated
@@ -141,7 +136,7 @@ class Constraints(FixConstraint):
     def _bind(self, atoms: Atoms, make: Callable[..., Binding] = shared) -> Binding:
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
-        bound = make(given, atoms, self.degenerate)
+        bound = make(given, atoms)
         if bound.owner() is None:
             bound.owner = ref(self)
         if make is bind:  # for another cell alone: rows, and what knows them, stay
@@ -437,11 +432,11 @@ def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
     repeated, bound = held._repeated, held._binding
     # ASE counts rows as they are given, also those that depend on others.
     independent = bound is None or bound.motion.rank == sum(item.n_rows for item in held.constraints)
-    if repeated is None and held.degenerate == "convert" and independent:
+    if repeated is None and independent:
         form = file_form(held.constraints)
         if form is not None:
             return form
-    kwargs: dict[str, Any] = {"constraints": rows, "degenerate": held.degenerate}
+    kwargs: dict[str, Any] = {"constraints": rows}
     if repeated is not None:
         kwargs["repeated"] = [list(repeated[0]), repeated[1]]
     return {"name": REGISTERED_NAME, "kwargs": kwargs}
@@ -499,7 +494,6 @@ def constrain(
     constraints: str | Constraint | Iterable[Constraint],
     *,
     project: bool = False,
-    degenerate: Literal["convert", "raise"] = "convert",
 ) -> Constraints:
     """Hold `constraints` on `atoms` from now on, checked at once.
 
@@ -515,8 +509,6 @@ def constrain(
     project : bool
         Whether to move atoms that are off their explicit targets onto them instead of raising; see
         `Constraints.restore`.
-    degenerate : {'convert', 'raise'}
-        See `Constraints`.
 
     Returns
     -------
@@ -534,7 +526,7 @@ def constrain(
     named = None
     if isinstance(constraints, str):
         constraints = named = named_rows(atoms, constraints)
-    held = Constraints(constraints, degenerate=degenerate)
+    held = Constraints(constraints)
     with unchanged_on_failure(atoms):
         atoms.set_constraint([*atoms.constraints, held])
         if project:

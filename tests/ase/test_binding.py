@@ -396,7 +396,7 @@ def test_frames_that_differ_have_engines_of_their_own(tmp_path):
     frames[3].pbc = False
     other = frames[4].constraints[0].constraints
     frames[4].set_constraint(Constraints([item.with_target(1.001 * item.target) for item in other]))
-    frames[5].set_constraint(Constraints(other, degenerate="raise"))
+    frames[5].set_constraint(Constraints([item.select(range(item.n_rows - 1)) for item in other]))
     engines = [engine_of(frame) for frame in frames]
     assert len({id(each) for each in engines[:6]}) == 6
     assert np.array_equal(engines[1].masses, [16, 2, 2] * 2)

@@ -263,9 +263,9 @@ def test_files_open_without_kcons_where_ase_can_hold_the_same(opened_by_ase, nam
 
 def test_what_no_file_of_ase_tells_is_written_under_the_name_of_kcons():
     atoms = molecule("CH3CH2OH")
-    for held in (Constraints([Distance([0, 1], 1.5)], degenerate="raise"), Constraints([Distance([0, 1], [1.5])])):
+    for name, row in (("KconsConstraints", Sphere([0], [0, 0, 9.0])), ("FixBondLengths", Distance([0, 1], [1.5]))):
+        held = Constraints([row])
         atoms.set_constraint(held)
-        name = "FixBondLengths" if held.degenerate == "convert" else "KconsConstraints"
         held.engine(molecule("CH3CH2OH"))
         assert held.todict()["name"] == name
         assert dict2constraint(held.todict()).todict()["name"] == name

@@ -27,7 +27,7 @@ import re
 import uuid
 import weakref
 from collections.abc import Callable
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import openmm
@@ -158,16 +158,15 @@ class Engine:
         positions: FloatArray,
         masses: FloatArray,
         cell: FloatArray | None,
-        degenerate: Literal["convert", "raise"],
         time: unit.Quantity | float,
     ) -> None:
         self.key = key
         time = number(time, unit.picosecond, "time")
         held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
-        self.motion = Motion(held, positions, degenerate=degenerate, time=time)
+        self.motion = Motion(held, positions, time=time)
         self.masses, self.cell = masses, cell
         #: What it takes to build this again; targets taken from the positions are in the set.
-        self.recipe = (held.constraints, positions, masses, cell, degenerate, time)
+        self.recipe = (held.constraints, positions, masses, cell, time)
         self.atoms: IntArray = held.touched
         self.whole = len(self.atoms) == len(masses)
         #: Where the carried particles are in arrays of all.

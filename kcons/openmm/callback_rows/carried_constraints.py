@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 import warnings
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import openmm
@@ -62,8 +62,6 @@ class CarriedConstraints(Part):
     periodic : bool, optional
         Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
         half the box among molecules that are never cut.
-    degenerate : {'convert', 'raise'}
-        As for `Motion`.
     time : float
         Time of `positions` in ps, for targets that move.
 
@@ -90,7 +88,6 @@ class CarriedConstraints(Part):
         positions: unit.Quantity | ArrayLike,
         *,
         periodic: bool | None = None,
-        degenerate: Literal["convert", "raise"] = "convert",
         time: unit.Quantity | float = 0.0,
     ) -> None:
         given = tuple(accepted((constraints,) if isinstance(constraints, Constraint) else constraints))
@@ -102,7 +99,7 @@ class CarriedConstraints(Part):
         x = nanometers(positions, len(masses))
         wraps = system.usesPeriodicBoundaryConditions() if periodic is None else periodic
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
-        engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, degenerate, time)
+        engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, time)
         refuse_virtual_sites(system, engine.atoms, masses)
         self._bind(engine, free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1])
 

@@ -82,7 +82,6 @@ def hold(
     take: Choice = "touched",
     keep_water: bool = True,
     periodic: bool | None = None,
-    degenerate: Literal["convert", "raise"] = "convert",
     join: bool = False,
     time: unit.Quantity | float = 0.0,
 ) -> CarriedConstraints:
@@ -104,7 +103,7 @@ def hold(
         Which clusters of the System's constraints move over besides those that a row touches.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
-    periodic, degenerate, time
+    periodic, time
         As for `CarriedConstraints`.
     join : bool
         Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
@@ -127,7 +126,7 @@ def hold(
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
     taken = _as_rows(table, chosen)
-    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
+    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, time=time)
     links = [_neighbors(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
     refuse_movers(system, part.motion.constraint_set, lambda: _molecules(system, joined))
