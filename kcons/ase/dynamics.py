@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from operator import is_
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from ase import Atoms, units
@@ -78,12 +78,10 @@ class ConstrainedDynamics(MolecularDynamics):
     state : State, optional
         Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time and the number
         of steps are taken from it, `time` and `forces` are not looked at. Forces are asked of the calculator.
-    degenerate : {'convert', 'raise'}
-        See `Constraints`.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
-    friction : array_like, shape () or (n_atoms,)
-        Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
+    friction : float
+        Rate at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
         come to rest; for a temperature use `ConstrainedLangevin`.
     trajectory, logfile, loginterval, **kwargs
         As for all dynamics of ASE; the log is a `ConstraintLogger`, with the temperature of `get_temperature`.
@@ -120,9 +118,8 @@ class ConstrainedDynamics(MolecularDynamics):
         time: float = 0.0,
         forces: ArrayLike | None = None,
         state: State | None = None,
-        degenerate: Literal["convert", "raise"] = "convert",
         check_every: int | None = None,
-        friction: ArrayLike = 0.0,
+        friction: float = 0.0,
         **kwargs: Any,
     ) -> None:
         require_atoms(atoms)
@@ -131,7 +128,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time = finite_number(time, "time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
-        self._degenerate, self._friction = degenerate, friction
+        self._friction = friction
         self._more = listed(constraints)
         self._present: Company | None = None
         self._bound: Binding | None = None
@@ -382,7 +379,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if bound is None or not bound.fits(atoms):
             self._refuse_fewer(len(atoms))
             rows = [*_rows(atoms, present), *self._more]
-            bound = bind(rows, atoms, self._degenerate, self.time)
+            bound = bind(rows, atoms, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, company(present), None
@@ -400,9 +397,9 @@ class ConstrainedDynamics(MolecularDynamics):
     def _refuse_fewer(self, now: int) -> None:
         """Refuse fewer atoms than before where something was given by their numbers."""
         before, self._size = self._size, now
-        if now < before and (self._more or np.ndim(self._friction) or getattr(self.stepper, "atoms", None) is not None):
+        if now < before and (self._more or getattr(self.stepper, "atoms", None) is not None):
             raise InputError(
-                f"{before - now} of {before} atoms were removed, and constraints, friction or indices that the "
+                f"{before - now} of {before} atoms were removed, and constraints or indices that the "
                 "dynamics was given name atoms by their numbers, which are others now; make a new one",
                 item="atoms",
             )
