@@ -92,7 +92,7 @@ class Part:
 
 
 LONG = ("ase-internals",)
-LARGE = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853")
+LARGE = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-kcons-rattle-", "openmm-held", "dop853")
 CCMA = (
     "ase-bonds",
     "ase-internals",
@@ -100,7 +100,6 @@ CCMA = (
     "openmm-middle",
     "openmm-nose",
     "openmm-kcons-",
-    "openmm-rattle",
 )
 WATER = ("ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6")
 

@@ -117,7 +117,11 @@ def refuse_not_finite(values: FloatArray, what: str) -> None:
         )
 
 
-def bind(given: Sequence[Constraint], atoms: Atoms, time: float = 0.0) -> Binding:
+def bind(
+    given: Sequence[Constraint],
+    atoms: Atoms,
+    time: float = 0.0,
+) -> Binding:
     """A new engine for `given` on `atoms`."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]

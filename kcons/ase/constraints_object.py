@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 from weakref import ref
 
 import ase.constraints
@@ -29,7 +29,7 @@ from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions,
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import as_float_array, checked
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
@@ -74,7 +74,6 @@ class Constraints(FixConstraint):
     velocities from the difference of positions, which loses accuracy far from the origin.
     """
 
-    @checked
     def __init__(
         self,
         constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = (),
@@ -547,8 +546,7 @@ def constrain(
     return held
 
 
-@checked
-def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] = "raise") -> list[FixConstraint]:
+def to_ase_constraints(atoms: Atoms) -> list[FixConstraint]:
     """Objects of ASE that hold what the constraints of kcons on `atoms` hold, for programs that know ASE's alone.
 
     Fixed atoms become FixAtoms; distances FixBondLengths, or with their differences, angles and dihedrals FixInternals;
@@ -563,13 +561,11 @@ def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] =
     Parameters
     ----------
     atoms : ase.Atoms
-    missing : {'raise', 'leave out'}
-        What to do about rows that no object of ASE holds.
 
     Raises
     ------
     UnsupportedError
-        Such rows, named.
+        Rows that no object of ASE holds, named.
     """
     require_atoms(atoms)
     result: list[FixConstraint] = []
@@ -579,11 +575,8 @@ def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] =
             continue
         item.engine(atoms)  # settles targets that are open
         forms, left = ase_forms(item.constraints)
-        if left and missing == "raise":
-            raise UnsupportedError(
-                f"no object of ASE holds {left[0]!r}; leave it out with missing='leave out', or keep the constraints "
-                "of kcons"
-            )
+        if left:
+            raise UnsupportedError(f"no object of ASE holds {left[0]!r}; keep the constraints of kcons")
         result += [ase.constraints.dict2constraint(form) for form in forms]
     return result
 

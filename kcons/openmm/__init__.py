@@ -28,7 +28,6 @@ try:
     from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
-    from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
     from kcons.openmm.integrator.schemes import SCHEMES
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
@@ -54,7 +53,6 @@ __all__ = [
     "NoseHooverMiddle",
     "Precision",
     "ProjectedIntegrator",
-    "RattleIntegrator",
     "Row",
     "SurfaceIntegrator",
     "constraints_of",

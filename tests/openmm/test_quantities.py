@@ -25,11 +25,9 @@ from kcons.openmm import (
     CarriedConstraints,
     CollectiveRows,
     ExpressionSurface,
-    Isokinetic,
     Langevin,
     NoseHoover,
     ProjectedIntegrator,
-    RattleIntegrator,
     Row,
     constraints_of,
     hold,
@@ -153,17 +151,15 @@ def test_collective_variables_of_composite_units():
 def test_arguments_of_integrators_and_ensembles():
     for make, words in (
         (lambda: ProjectedIntegrator(1 * kelvin), "timestep is 1 K; give it in ps"),
-        (lambda: RattleIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
+        (lambda: ProjectedIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
         (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
         (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in 1/ps"),
-        (lambda: Isokinetic(kinetic_energy=1 * nm), r"kinetic_energy is 1 nm; give it in kJ/mol"),
         (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in 1/ps"),
         (lambda: ProjectedIntegrator("soon"), "timestep is 'soon'; give a number of ps, or a Quantity"),
         (lambda: Langevin([300], 1.0), "temperature is"),
     ):
         with pytest.raises(InputError, match=words):
             make()
-    assert Isokinetic(kinetic_energy=1 * unit.kilocalorie_per_mole).kinetic_energy == pytest.approx(4.184)
 
 
 def test_arguments_of_methods():

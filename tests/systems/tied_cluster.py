@@ -13,7 +13,6 @@ from kcons.openmm import (
     Isokinetic,
     Langevin,
     ProjectedIntegrator,
-    RattleIntegrator,
     Row,
     SurfaceIntegrator,
     hold,
@@ -82,10 +81,6 @@ def bond(i=0, j=7):
     return force
 
 
-def rattle(strength=200.0):
-    return begun(cluster(strength, bonded=True), RattleIntegrator(0.002))
-
-
 def on_a_sphere(radius=RADIUS, strength=200.0, **options):
     system = cluster(strength)
     surface = Sphere([0], CENTER, radius)
@@ -109,16 +104,13 @@ def carried_at(target=0.30, strength=200.0, **options):
 KINDS = {
     "constant energy": thermostatted(None),
     "suzuki4": thermostatted(None, scheme="suzuki4"),
-    "leapfrog": thermostatted(None, scheme="leapfrog"),
     "Langevin": thermostatted(Langevin(300, 1.0)),
     "Isokinetic": thermostatted(Isokinetic(300)),
     "isokinetic4": thermostatted(Isokinetic(300), scheme="isokinetic4"),
-    "RattleIntegrator": rattle,
     "sphere": on_a_sphere,
     "sphere, compiled": lambda **given: on_a_sphere(compiled=True, **given),
     "sphere, Langevin": lambda **given: on_a_sphere(ensemble=Langevin(300, 1.0), **given),
     "collective": row_at,
-    "collective, leapfrog": lambda **given: row_at(scheme="leapfrog", **given),
     "collective, Langevin": lambda **given: row_at(ensemble=Langevin(300, 1.0), **given),
     "carried": carried_at,
     "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),

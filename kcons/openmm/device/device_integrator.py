@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import ctypes
 import json
-import logging
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 from uuid import uuid4
+from xml.etree import ElementTree
 
 import numpy as np
 import openmm
 
 from kcons.constraints.arguments import whole_number
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan
+from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
@@ -36,8 +37,6 @@ from kcons.openmm.states import box_of, positions_of
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
-
-logger = logging.getLogger("kcons.openmm")
 
 #: Ensembles whose operations kernels have.
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
@@ -74,12 +73,8 @@ _REFUSALS: list[Exception] = []
 
 def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
     """Why steps of this kind are not made on the device; empty if they are."""
-    if scheme is None:
-        return "the leapfrog has velocities half a step behind; use scheme='rattle'"
     if type(ensemble) not in ENSEMBLES:
         return f"{type(ensemble).__name__} has no kernels"
-    if getattr(ensemble, "atoms", None) is not None:
-        return "a thermostat on some of the particles has no kernels"
     if parts and isinstance(ensemble, LangevinRespa):
         return f"{type(ensemble).__name__} holds no parts"
     if why := rows_refusal(parts):
@@ -105,7 +100,7 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
             now = ends[-1]
         elif isinstance(operation, Chain):
             assert isinstance(ensemble, NoseHoover)
-            flights = tuple(operation.fraction * f for f in chain_fractions(ensemble.chain_order, ensemble.repeats))
+            flights = tuple(operation.fraction * f for f in chain_fractions(CHAIN_ORDER, 1))
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
             done.append(Op("rescale"))
@@ -133,10 +128,16 @@ class DeviceProgram(Program):
 
     def write(self, name: str, value: float) -> None:
         """Change a variable that is no setting; settings go over at the next call of `step`."""
-        if name in self.kept and self.integrator.bound:
+        if self.known(name) in self.kept and self.integrator.bound:
             values = self.integrator.read("memory")
             values[self.kept.index(name)] = value
             self.integrator.write("memory", values)
+
+    def known(self, name: str) -> str:
+        """The name of a variable, if it is one."""
+        if name not in self.numbers:
+            raise UnsupportedError(f"no variable of these steps is called {name!r}; see listing()")
+        return name
 
     def push(self) -> None:
         """Settings, where they are others than the plugin has."""
@@ -179,6 +180,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     rows: Any = None
     _seed = 0
     _described = ""
+    _recorded: Sequence[int] = ()
 
     def _make(self, dt: float) -> None:
         build_planner()
@@ -212,6 +214,7 @@ class DeviceIntegrator(ProjectedIntegrator):
                 "spheres": [getattr(self.ensemble, name, None) for name in ("spheres", "auxiliary")],
                 "integrator": self._key,
                 "parts": bool(self.parts),
+                "recorded": self._recorded,
             }
         )
         if description == self._described:
@@ -258,35 +261,85 @@ class DeviceIntegrator(ProjectedIntegrator):
         self._run(guard, steps, ends)
 
     def _run(self, guard: Guard, steps: int, ends: bool) -> None:
-        context = guard.context
-        first = context.getStepCount()
+        if guard.in_run and build.library().kcons_was_moved(self._address):
+            guard.begin()
+        first = guard.context.getStepCount()
         try:
-            for done in range(0, steps, self.rows.block):
-                block = min(steps - done, self.rows.block)
-                self._renew(context, block)
-                openmm.Integrator.step(self, block)
+            self._advance(guard.context, steps)
         except openmm.OpenMMException as error:
             told = self._look()
             guard.put_back()
             if told[_FAILED]:
-                raise self._unsolved(told, context.getStepCount()) from error
+                raise self._unsolved(told, guard) from error
             if "NaN" in str(error):
                 raise guard.explosion(str(error), first) from error
             raise
         if ends:
             guard.look()
 
-    def _renew(self, context: openmm.Context, steps: int) -> None:
-        """Targets and cells of the steps that follow."""
-        positions = positions_of(context) if self.rows.looks else None
-        cell = np.array(box_of(context)) if self.rows.looks else None
-        for name, values in self.rows.renew(context.getTime()._value, self._dt, steps, positions, cell).items():
-            self.write(name, values)
+    def _advance(self, context: openmm.Context, steps: int) -> None:
+        """Make steps in blocks, before each of which targets and cells are computed."""
+        rows = self.rows
+        for done in range(0, steps, rows.block):
+            block = min(steps - done, rows.block)
+            positions = positions_of(context) if rows.looks else None
+            cell = np.array(box_of(context)) if rows.looks else None
+            for name, values in rows.renew(context.getTime()._value, self._dt, block, positions, cell).items():
+                self.write(name, values)
+            openmm.Integrator.step(self, block)
 
-    def _unsolved(self, told: Sequence[float], good: int) -> KconsError:
-        error: KconsError = self.rows.failure(int(told[3]), told[4], int(told[2]))
-        error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
+    def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:
+        """The error for a row in a step that the Context is then just before.
+
+        It is at the last check; the steps from there are made again, the same where nothing random acts beside the
+        noise of the kernels. Where they are not, it stays there.
+        """
+        step, context = int(told[2]), guard.context
+        error: KconsError = self.rows.failure(int(told[3]), told[4], step)
+        again = step - 1 - context.getStepCount()
+        if again > 0 and guard.undisturbed and not guard.moving:
+            try:
+                self._advance(context, again)
+                guard.since_check += again
+                guard.leave()
+            except openmm.OpenMMException:
+                guard.put_back()
+        error.args = (f"{error}. The Context is at step {context.getStepCount()}", *error.args[1:])
         return error
+
+    # -- records ---------------------------------------------------------------------------------
+
+    def record(self, atoms: IntArray) -> None:
+        """Choose particles of which `records` tells; before the first step of a Context."""
+        self._recorded = np.unique(atoms).tolist()
+        self.describe()
+
+    def records(self, steps: int, every: int) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, float]]:
+        """Make steps, and give what was recorded on the device after each `every` of them.
+
+        It is read when the device has no more room for it: a thousand records, or 8 MB of them.
+
+        Yields
+        ------
+        x, v, f : ndarray, shape (n, 3)
+            Positions, velocities and applied forces of the particles of `record`, in ascending order.
+        time : float
+        """
+        room, n = room_for(len(self._recorded)), len(self._recorded)
+        for done in range(0, steps, room * every):
+            context = self._watch().context
+            time, since = context.getTime()._value, context.getStepCount()
+            self.write("recorded", np.array([every, since]))
+            build.library().kcons_record_every(self._address, every, since)
+            try:
+                self.step(min(steps - done, room * every))
+            finally:
+                build.library().kcons_record_every(self._address, 0, 0)
+            made = (context.getStepCount() - since) // every
+            found = self.read("records").reshape(room, n, 3, 3)
+            for k in range(made):
+                x, v, f = found[k].swapaxes(0, 1)
+                yield x, v, f, time + (k + 1) * every * self._dt
 
     def _look(self) -> list[float]:
         told = (ctypes.c_double * 5)()
@@ -307,21 +360,7 @@ class DeviceIntegrator(ProjectedIntegrator):
             return 0.0
         if name in program.kept and self.bound:
             return float(self.read("memory")[program.kept.index(name)])
-        if name in program.settings:
-            return program.settings[name]
-        return program.numbers[name]
-
-    def setGlobalVariableByName(self, name: str, value: float) -> None:
-        """Set what belongs to a state; settings have methods of their own."""
-        if name not in self.program.kept:
-            raise UnsupportedError(
-                f"{name} cannot be set on the device: use setTemperature or setFriction, or device=False"
-            )
-        self.program.write(name, float(value))
-
-    def getNumComputations(self) -> int:
-        """None: the plugin has kernels."""
-        return 0
+        return {**program.numbers, **program.settings}[program.known(name)]
 
     def setRandomNumberSeed(self, seed: int) -> None:
         """The seed of noise, before the Context is made; 0 for one that nobody knows."""
@@ -331,14 +370,25 @@ class DeviceIntegrator(ProjectedIntegrator):
     def getRandomNumberSeed(self) -> int:
         return self._seed
 
-    @classmethod
-    def from_xml(cls, xml: str, scheme: Any = "rattle", **arguments: Any) -> DeviceIntegrator:
-        """As `ProjectedIntegrator.from_xml`."""
-        build_planner()
-        plain = openmm.XmlSerializer.deserialize(xml)
-        made = cls(plain.getStepSize(), scheme, **{"tolerance": plain.getConstraintTolerance(), **arguments})
-        openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
-        return made
+    def _has_written(self, xml: str) -> bool:
+        found = json.loads(ElementTree.fromstring(xml).attrib["description"])
+        mine = json.loads(self._described)
+        self.setRandomNumberSeed(found["seed"])
+        return all(found[name] == mine[name] for name in ("operations", "memory", "noisy", "spheres", "parts"))
+
+
+def _refuse_of_programs(name: str) -> Any:
+    def refuse(self: DeviceIntegrator, *args: Any, **options: Any) -> None:
+        raise UnsupportedError(
+            f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
+        )
+
+    return refuse
+
+
+for _name, _method in vars(openmm.CustomIntegrator).items():
+    if _name[0].islower() and getattr(DeviceIntegrator, _name) is _method and not hasattr(openmm.Integrator, _name):
+        setattr(DeviceIntegrator, _name, _refuse_of_programs(_name))
 
 
 # -- plans for a Context ------------------------------------------------------------------------------
@@ -412,8 +462,8 @@ def choose(
     parts: Sequence[Any] = (),
     ensemble: Ensemble | None = None,
     **others: Any,
-) -> type[ProjectedIntegrator]:
-    """The class of an integrator that may run on the device: `DeviceIntegrator` if it can, see `ProjectedIntegrator`.
+) -> tuple[type[ProjectedIntegrator], str]:
+    """The class of an integrator that may run on the device, see `ProjectedIntegrator`, and why it is not this one.
 
     Raises
     ------
@@ -421,16 +471,17 @@ def choose(
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
     why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
+    if not why and device is None:
+        why = build.reluctance()
     if not why:
         try:
             build.library()
-            return DeviceIntegrator
+            return DeviceIntegrator, ""
         except UnsupportedError as error:
             why = str(error)
     if device:
         raise UnsupportedError(f"no steps on the device: {why}; leave out device=True for a CustomIntegrator")
-    logger.info("steps are those of a CustomIntegrator: %s", why)
-    return ProjectedIntegrator
+    return ProjectedIntegrator, why
 
 
 ProjectedIntegrator._on_device = staticmethod(choose)

@@ -371,6 +371,16 @@ _LOOK = (
  }
 """
 )
+#: What is kept of some particles, whose places come last in `atoms`, until the host reads it.
+_RECORD = """ if (failure[0] != 0) return;
+ GLOBAL mixed* to = records+9*COUNT*((step-recorded[1])/recorded[0]-1);
+ for (int k = GLOBAL_ID; k < COUNT; k += GLOBAL_SIZE) {
+  mixed x[3], v[3], w[1];
+  int p = atoms[FIRST+k];
+  GET_V(0, p) GET_X(0, p)
+  for (int c = 0; c < 3; c++) {to[9*k+c] = x[c]; to[9*k+3+c] = v[c]; to[9*k+6+c] = FORCES;}
+ }
+"""
 
 
 #: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
@@ -804,7 +814,8 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     kernels = Kernels(shapes, masks, **made)
     parts = divided(operations, described["noisy"])
     actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
-    order = np.concatenate(kernels.order)
+    recorded, room = described["recorded"], room_for(len(described["recorded"]))
+    order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
     arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
     if spheres is not None:
@@ -813,16 +824,27 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))
     arrays += [Array("cells", "int", np.zeros(3 * particles))] * (len(held.placed) > 0)
+    if recorded:
+        arrays += [Array("records", "mixed", np.zeros(9 * len(recorded) * room)), Array("recorded", "int", np.ones(2))]
     work_group = 1 if platform in PLAIN else held.work_group
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
     names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(particles)}
     look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
+    if recorded:
+        forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
+        text = _RECORD.replace("COUNT", str(len(recorded))).replace("FIRST", str(kernels.particles))
+        look += f"KERNEL void record(ARGUMENTS) {{\n UNPACK\n{text.replace('FORCES', forces)}}}\n"
     source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
     return Plan(source, arrays, actions, order, items, work_group, len(masks))  # type: ignore[arg-type]
+
+
+def room_for(particles: int) -> int:
+    """How many records of so many particles the device keeps: 8 MB of them, 1,000 at most."""
+    return min(1000, 1 + 2**20 // (9 * max(particles, 1)))
 
 
 def _of_dt(share: float) -> str:

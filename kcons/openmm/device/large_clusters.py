@@ -1,11 +1,13 @@
 """Large clusters: tables for a work-group, with an order of elimination by levels (see `clusters.c`).
 
-In each level rows of about the lowest degree are eliminated that share no entry, so that all of them can go at once;
-rows that depend on others come last.
+Rows are ordered by nested dissection: rows that cross a cut of the molecule come after those on its sides, which share no
+entry. In each level are rows whose earlier ones are all eliminated.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,8 +17,6 @@ from kcons.constraints.constraint import IntArray
 from kcons.openmm.device.held_rows import IN_CELLS, HeldRows, Pattern
 from kcons.openmm.device.kernels import Array
 
-#: Rows of one level have at most this many times the lowest degree, or this many neighbors more.
-_ABOUT, _MORE = 1.5, 2
 #: Numbers of a row in `rows_row`.
 _ROW = 9
 
@@ -24,46 +24,102 @@ _ROW = 9
 class Order(NamedTuple):
     """Rows in the order of elimination, where levels begin in it, and the later rows that each is coupled to."""
 
-    rows: list[int]
-    levels: list[int]
-    later: list[list[int]]
+    rows: IntArray
+    levels: IntArray
+    later: list[IntArray]
 
 
-def elimination(neighbors: list[set[int]], last: set[int]) -> Order:
+def elimination(atoms: Sequence[Sequence[int]], last: set[int]) -> Order:
     """Order of elimination of rows by levels.
 
     Parameters
     ----------
-    neighbors : list of set of int
-        Rows that share a moving atom with each.
+    atoms : sequence of sequence of int
+        Atoms of each row; rows that share one are coupled.
     last : set of int
-        Rows that come after all others.
+        Rows that come after those that they cross a cut with.
     """
-    left, coupled = set(range(len(neighbors))), [set(each) for each in neighbors]
-    order: list[int] = []
-    levels = [0]
-    found: dict[int, set[int]] = {}
+    backwards: list[int] = []
+    left = [list(range(len(atoms)))]
     while left:
-        candidates = sorted(left - last or left, key=lambda row: (len(coupled[row]), row))
-        limit = max(_ABOUT * len(coupled[candidates[0]]), len(coupled[candidates[0]]) + _MORE)
-        blocked: set[int] = set()
-        chosen = []
-        for row in candidates:
-            if len(coupled[row]) > limit:
-                break
-            if row not in blocked:
-                chosen.append(row)
-                blocked |= coupled[row]
-        for row in chosen:
-            found[row] = around = coupled[row]
-            for other in around:
-                coupled[other] |= around
-                coupled[other] -= {other, row}
-        left -= set(chosen)
-        order += chosen
-        levels.append(len(order))
-    place = {row: k for k, row in enumerate(order)}
-    return Order(order, levels, [sorted(place[other] for other in found[row]) for row in order])
+        one, other, across = _cut(atoms, left.pop())
+        backwards += sorted(across, key=lambda k: (k in last, k), reverse=True)
+        left += [part for part in (one, other) if part]
+    order = np.array(backwards[::-1])
+    users: dict[int, list[int]] = {}
+    later: list[set[int]] = [set() for _ in atoms]
+    level = np.zeros(len(atoms), dtype=np.int64)
+    for place, k in enumerate(order):
+        for a in atoms[k]:
+            for earlier in users.setdefault(a, []):
+                later[earlier].add(place)
+            users[a].append(place)
+    for place, mine in enumerate(later):
+        if mine:
+            later[min(mine)] |= mine - {min(mine)}
+            level[min(mine)] = max(level[min(mine)], level[place] + 1)
+    by_level = np.argsort(level, kind="stable")
+    new = np.argsort(by_level)
+    counts = np.bincount(level)
+    return Order(
+        order[by_level],
+        np.concatenate([[0], np.cumsum(counts)]),
+        [np.sort(new[list(later[place])]) for place in by_level],
+    )
+
+
+def _cut(atoms: Sequence[Sequence[int]], rows: list[int]) -> tuple[list[int], list[int], list[int]]:
+    """Rows on both sides of a cut, which share no atom, and rows that cross it; it parts a subtree of the atoms."""
+    users: dict[int, list[int]] = {}
+    for k in rows:
+        for a in atoms[k]:
+            users.setdefault(a, []).append(k)
+    above = _tree(atoms, users, next(iter(users)))
+    found = {k for a in above for k in users[a]}
+    if len(found) < len(rows):
+        return sorted(found), [k for k in rows if k not in found], []
+    above = _tree(atoms, users, list(above)[-1])
+    place = {a: m for m, a in enumerate(above)}
+    parent = [place.get(a, 0) for a in above.values()]
+    crossing, inside = [0] * len(parent), [0] * len(parent)
+    for k in rows:
+        left = {place[a] for a in atoms[k]}
+        while len(left) > 1:
+            m = max(left)
+            crossing[m] += 1
+            left = left - {m} | {parent[m]}
+        inside[min(left)] += 1
+    for m in range(len(parent) - 1, 0, -1):
+        inside[parent[m]] += inside[m]
+
+    cuts = [m for m in range(1, len(parent)) if 0 < inside[m] < len(rows) - crossing[m]]
+    if not cuts:
+        return [], [], rows
+    best = min(cuts, key=lambda m: crossing[m] / min(inside[m], len(rows) - inside[m] - crossing[m]))
+    within = [m == best for m in range(len(parent))]
+    for m in range(best + 1, len(parent)):
+        within[m] = within[parent[m]]
+    sides: tuple[list[int], list[int], list[int]] = [], [], []
+    for k in rows:
+        some = [within[place[a]] for a in atoms[k]]
+        sides[0 if all(some) else 2 if any(some) else 1].append(k)
+    return sides
+
+
+def _tree(atoms: Sequence[Sequence[int]], users: dict[int, list[int]], root: int) -> dict[int, int]:
+    """Atoms that hang together with one, by distance, and the one before each; neighbors in a row are joined."""
+    above, seen = {root: -1}, set[int]()
+    for a in (line := [root]):
+        for k in users[a]:
+            if k not in seen:
+                seen.add(k)
+                at = atoms[k].index(a)
+                for way in (atoms[k][at:], atoms[k][at::-1]):
+                    for before, b in zip(way, way[1:], strict=False):
+                        if b not in above:
+                            above[b] = before
+                            line.append(b)
+    return above
 
 
 class _Tables(NamedTuple):
@@ -80,59 +136,66 @@ class _Tables(NamedTuple):
     touch: IntArray
 
 
-def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, list[int]]:
+def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, IntArray]:
     """Tables of a pattern, and its rows in the order of elimination."""
-    count, n_atoms = len(pattern.rows), pattern.atoms.shape[1]
-    users: list[set[int]] = [set() for _ in range(n_atoms)]
-    for k, row in enumerate(pattern.rows):
-        for atom in row.atoms:
-            users[atom].add(k)
-    coupled = [set().union(*(users[a] for a in row.atoms)) - {k} for k, row in enumerate(pattern.rows)]
-    order = elimination(coupled, {k for k, row in enumerate(pattern.rows) if row.depends})
+    count = len(pattern.rows)
+    order = elimination([row.atoms for row in pattern.rows], {k for k, r in enumerate(pattern.rows) if r.depends})
     rows = [pattern.rows[k] for k in order.rows]
-    slots = np.concatenate([[0], np.cumsum([len(row.atoms) for row in rows])])
-    place = [{a: slots[k] + i for i, a in enumerate(row.atoms)} for k, row in enumerate(rows)]
-    entry: list[list[int]] = []
-    product: list[list[int]] = []
-    numbers: dict[tuple[int, int], int] = {}
-    for i in range(count):
-        for j in [i, *order.later[i]]:
-            numbers[i, j] = len(entry)
-            entry.append([i, j, len(product), 0])
-            product += [[place[i][a], place[j][a]] for a in rows[i].atoms if a in place[j]]
-    updates: list[list[list[int]]] = [[] for _ in entry]
-    earlier: list[list[int]] = [[] for _ in rows]
-    for m in range(count):
-        for first, i in enumerate(order.later[m]):
-            earlier[i].append(numbers[m, i])
-            for j in order.later[m][first:]:
-                updates[numbers[i, j]].append([numbers[m, i], numbers[m, j], m])
-    begins = np.concatenate([[0], np.cumsum([len(each) for each in updates])])
-    places = np.concatenate([[0], np.cumsum([len(each) for each in earlier])])
+    widths = np.array([len(row.atoms) for row in rows])
+    slots = np.stack([np.concatenate([row.atoms for row in rows]), np.repeat(np.arange(count), widths)], axis=1)
+    touch = np.argsort(slots[:, 0], kind="stable")
+    # Entries row by row, the diagonal first; `key` grows.
+    lengths = np.array([1 + len(later) for later in order.later])
+    diagonal = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    entry = np.stack(
+        [np.repeat(np.arange(count), lengths), np.concatenate([[k, *later] for k, later in enumerate(order.later)])],
+        axis=1,
+    )
+    key = entry @ [count, 1]
+    product = np.concatenate([_pairs(some) for some in np.split(touch, np.flatnonzero(np.diff(slots[touch, 0])) + 1)])
+    product = product[np.argsort(slots[product, 1] @ [count, 1], kind="stable")]
+    of = np.concatenate([_pairs(later) for later in order.later]) @ [count, 1]
+    update = np.concatenate(
+        [np.insert(_pairs(np.arange(n - 1) + b + 1), 2, m, axis=1) for m, (n, b) in enumerate(zip(lengths, diagonal))]
+    )[np.argsort(of, kind="stable")]
+    aside = np.flatnonzero(entry[:, 0] < entry[:, 1])
+    earlier = aside[np.argsort(entry[aside, 1], kind="stable")]
     # In clusters where rows may depend on others any pivot may vanish: not all of them are marked in large ones.
     doubtful = bool(held.doubtful[pattern.clusters].any())
-    table = []
-    parameter = cells = 0
-    for k, row in enumerate(rows):
-        flags = row.rolls + 2 * doubtful + 4 * row.summed
-        table.append([row.function, slots[k], parameter, row.how, numbers[k, k], places[k], flags, -1, cells])
-        parameter += len(held.parameters[pattern.clusters[0, order.rows[k]]])
-        cells += 3 * len(row.atoms) if row.how == IN_CELLS else 0
-    touch = [[place[k][a] for k in range(count) if a in place[k]] for a in range(n_atoms)]
+    sizes = np.array([len(held.parameters[pattern.clusters[0, k]]) for k in order.rows])
+    cells = np.array([3 * len(row.atoms) * (row.how == IN_CELLS) for row in rows])
+    columns = [
+        np.array([row.function for row in rows]),
+        np.cumsum(widths) - widths,
+        np.cumsum(sizes) - sizes,
+        np.array([row.how for row in rows]),
+        diagonal,
+        np.searchsorted(entry[earlier, 1], np.arange(count)),
+        np.array([row.rolls + 2 * doubtful + 4 * row.summed for row in rows]),
+        np.full(count, -1),
+        np.cumsum(cells) - cells,
+    ]
     found = (
-        table,
-        [[a, k] for k, row in enumerate(rows) for a in row.atoms],
-        [[level] for level in order.levels[:-1]],
-        [[*e[:3], begins[number]] for number, e in enumerate(entry)],
+        np.stack(columns, axis=1),
+        slots,
+        order.levels[:-1],
+        np.column_stack(
+            [entry, np.searchsorted(slots[product, 1] @ [count, 1], key), np.searchsorted(np.sort(of), key)]
+        ),
         product,
-        [each for some in updates for each in some],
-        [[e] for some in earlier for e in some],
-        [[begin] for begin in np.concatenate([[0], np.cumsum([len(t) for t in touch])])[:-1]],
-        [[slot] for some in touch for slot in some],
+        update,
+        earlier,
+        np.searchsorted(slots[touch, 0], np.arange(pattern.atoms.shape[1])),
+        touch,
     )
-    widths = _ROW, 2, 1, 4, 2, 3, 1, 1, 1
-    arrays = [np.array(each, dtype=np.int64).reshape(-1, w) for each, w in zip(found, widths, strict=True)]
-    return _Tables(*arrays), order.rows
+    return _Tables(
+        *(table.astype(np.int64).reshape(len(table), math.prod(table.shape[1:])) for table in found)
+    ), order.rows
+
+
+def _pairs(some: IntArray) -> IntArray:
+    """All pairs of numbers in a list, each with itself and those after it, shape (n, 2)."""
+    return np.stack([some[side] for side in np.triu_indices(len(some))], axis=1)
 
 
 class LargeClusters:

@@ -184,8 +184,8 @@ class LangevinRespa(Langevin):
         """Groups from the slowest to the fastest, see `kcons.thermostats.multistep.respa`."""
         return levels_of({str(group): count for group, count in zip(self.groups, self.counts, strict=True)})
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
-        return nested(self.levels, 2, (1.0,), middle=self.slow_kicks == "middle")
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
+        return nested(self.levels, (1.0,), middle=self.slow_kicks == "middle")
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""

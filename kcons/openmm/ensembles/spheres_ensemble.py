@@ -10,7 +10,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step, refuse_leapfrog
+from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Operation
@@ -38,7 +38,7 @@ class IsokineticSpheres(Ensemble):
         of x, y and z of the center of mass; 'cluster': one for each cluster.
     auxiliary : int
         Auxiliary variables on each sphere.
-    order, substeps, slow_kicks
+    substeps, slow_kicks
         As for `kcons.thermostats.IsokineticSpheres`.
 
     Raises
@@ -70,7 +70,6 @@ class IsokineticSpheres(Ensemble):
         *,
         spheres: Literal["split", "axes", "cluster"] = "split",
         auxiliary: int = 1,
-        order: int = 2,
         substeps: int = 3,
         slow_kicks: Literal["ends", "middle"] = "ends",
     ) -> None:
@@ -81,7 +80,7 @@ class IsokineticSpheres(Ensemble):
                 "spheres='global' needs sums over all particles; choose 'split', 'axes' or 'cluster'"
             )
         levels = None if steps is None else {str(group): count for group, count in steps.items()}
-        made: dict[str, Any] = {"spheres": spheres, "auxiliary": auxiliary, "order": order, "substeps": substeps}
+        made: dict[str, Any] = {"spheres": spheres, "auxiliary": auxiliary, "substeps": substeps}
         bath = OnArrays(1.0, gamma, 0, steps=levels, slow_kicks=slow_kicks, **made)
         given = None if steps is None else tuple(steps.items())
         self._keep(temperature=kelvin, friction=gamma, steps=given, slow_kicks=slow_kicks, **made)
@@ -90,14 +89,12 @@ class IsokineticSpheres(Ensemble):
     def __repr__(self) -> str:
         return f"IsokineticSpheres({self.temperature:g} K, {self.friction:g}/ps, spheres={self.spheres!r})"
 
-    def check(self, scheme: Splitting | None) -> None:
+    def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for all schemes but 'rattle': the bath has its own."""
-        if scheme is None:
-            refuse_leapfrog(self)
-        elif scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
-            raise UnsupportedError(f"{self!r} has a scheme of its own, see order=; leave out {scheme!r}")
+        if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,):
+            raise UnsupportedError(f"{self!r} has a scheme of its own; leave out {scheme!r}")
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         found: tuple[Operation, ...] = vars(self)["_operations"]
         return found
 

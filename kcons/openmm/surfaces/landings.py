@@ -575,7 +575,7 @@ class ExpressionSurface:
             for _ in self.atoms:
                 system.addParticle(1.0)
             try:
-                self._context = forces_alone(system, [[force] for force in self.forces(np.arange(len(self.atoms)))])
+                self._context = forces_alone(system, self.forces(np.arange(len(self.atoms))))
             except openmm.OpenMMException as error:
                 raise InputError(f"OpenMM cannot read {self.expression!r}: {error}", item="expression") from None
         self._context.setPositions(np.ascontiguousarray(r))

@@ -53,7 +53,6 @@ def test_compiled_landing_is_the_same(kind, scheme):
     "options",
     [
         {},
-        {"scheme": "leapfrog"},
         {"ensemble": Langevin(300, 0.0)},
         {"ensemble": Isokinetic(300, momentum="free")},
         {"ensemble": NoseHooverMiddle(300, 5.0)},

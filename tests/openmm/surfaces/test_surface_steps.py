@@ -230,10 +230,3 @@ def test_surfaces_free_particles_and_bonds_do_not_disturb_each_other():
             alone = run([k], scheme)
             assert np.abs(together[[k, 4]] - alone[[k, 4]]).max() <= 1e-13
             assert np.abs(together[5:7] - alone[5:7]).max() <= 1e-9
-
-
-def test_leapfrog():
-    integrator, context = on_surface("sphere", "leapfrog", 0.01)
-    integrator.step(100)
-    off, _ = worst(integrator, context)
-    assert off <= 1e-14

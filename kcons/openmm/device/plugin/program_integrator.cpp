@@ -77,6 +77,7 @@ void ProgramIntegrator::step(int steps) {
         if (k.read("failure")[0] == 0) throw;
         k.lookBack();                              // it came of a failure, which is told
     }
+    moved = false;                             // by barostats, which keep to the constraints
     vector<double> told = k.read("looked");    // the only wait of a call
     look = {told[0], told[5], told[6], (int) told[2], (int) told[3], (int) told[4]};
     if (look.failed) {
@@ -92,6 +93,7 @@ void ProgramIntegrator::step(int steps) {
 void ProgramIntegrator::stateChanged(State::DataType changed) {
     if (context == nullptr) return;
     if (changed != State::Velocities) handle.getAs<StepKernel>().valid = false;
+    if (changed == State::Positions) moved = true;
 }
 double ProgramIntegrator::computeKineticEnergy() {
     if (middleKinetic < 0) return handle.getAs<StepKernel>().kineticEnergy();
@@ -180,6 +182,7 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
     const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
     c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
     for (int k = 0; k < 3; k++) if (numbers.box[k] != before[k]) valid = false;
+    bool ended = true;                         // whether velocities are those of the end of a step
     for (int k = 0; k < steps; k++) {
         if (c.updateContextState()) {          // barostats have moved positions
             valid = false;
@@ -193,10 +196,13 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
             for (auto& action : plan.parts[1])
                 if (action.verb == Verb::Evaluate && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
         }
-        run(c, k == 0 || integrator.whole ? 0 : 1);
+        run(c, ended ? 0 : 1);
         c.setTime(numbers.time+numbers.dt);
         c.setStepCount(c.getStepCount()+1);
-        if (k == steps-1 || integrator.whole) run(c, 2);
+        bool recorded = integrator.every > 0 && (c.getStepCount()-integrator.since) % integrator.every == 0;
+        ended = k == steps-1 || integrator.whole || recorded;
+        if (ended) run(c, 2);
+        if (recorded) launch("record");
     }
     lookBack();
 }
@@ -250,6 +256,11 @@ void kcons_describe(void* integrator, const char* description, int noisy) {
     own(integrator).noisy = noisy;
 }
 void kcons_set_whole(void* integrator, int whole) { own(integrator).whole = whole; }
+void kcons_record_every(void* integrator, int steps, int since) {
+    own(integrator).every = steps;
+    own(integrator).since = since;
+}
+int kcons_was_moved(void* integrator) { return own(integrator).moved; }
 int kcons_is_bound(void* integrator) { return own(integrator).bound(); }
 int kcons_read(void* integrator, const char* name, double* out, int room) try {
     auto values = own(integrator).read(name);

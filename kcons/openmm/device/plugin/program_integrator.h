@@ -63,6 +63,8 @@ public:
     std::string description;       // what Python makes the plan of
     bool whole = true;             // whether others look at velocities between steps, which must then end
     bool noisy = false;            // whether the kinetic energy is that of the middle of the last step
+    int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
+    bool moved = false;            // whether others have set positions since the last step
     void step(int steps) override;
     std::vector<double> read(const std::string& name) const;
     void write(const std::string& name, const std::vector<double>& values);
