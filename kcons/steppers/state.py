@@ -450,10 +450,6 @@ class System:
         x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
         return x, v, None if f is None or not state.has_forces_of(self) else as_array(f, self._shape, "forces")
 
-    def resisted(self, f: FloatArray, v: FloatArray) -> FloatArray:
-        """Applied forces and friction together, where friction is not solved exactly."""
-        return f - self.friction * self.moving_masses.reshape(self._shape) * v if self.friction else f
-
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""
         if state.has_forces_of(self):

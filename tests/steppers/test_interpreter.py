@@ -244,7 +244,7 @@ def test_methods_of_verbs_and_errors_get_the_number_of_the_step() -> None:
                 raise ImageError("half the cell apart")
 
     system, state = molecules(*GROUPS)
-    program = Program([Kick(0.25), Evaluate()], python=("evaluate",))
+    program = Program([Kick(0.25), Evaluate()])
     program.rows.insert(0, program.rows[0]._replace(name="damp", verb=0, length=0.7, kick=0.0))
     for table, value in ((program.ends, 0.0), (program.shown, False), (program.flies, False)):
         table.insert(0, value)
