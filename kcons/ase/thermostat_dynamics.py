@@ -38,7 +38,7 @@ from kcons.thermostats import (
     thermal_velocities,
     tune,
 )
-from kcons.thermostats.freedom import Momentum, open_directions
+from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.isokinetic.isokinetic import Convention
 from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
 
@@ -116,8 +116,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
     def _made(self, motion: Motion) -> System:
         if self.barostat is None:
             return super()._made(motion)
-        if np.any(self._friction):
-            raise UnsupportedError("friction takes out heat beside the thermostat; leave it out")
         system = AtomsSystem(self, motion)
         self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
         return system
@@ -183,12 +181,8 @@ class IsokineticDynamics(ThermostattedDynamics):
 
     Raises
     ------
-    InputError
-        Temperature not positive, all momenta zero.
     OverdeterminedError
         g is 1.
-    UnsupportedError
-        A constraint couples `indices` to other atoms.
     """
 
     def __init__(
@@ -272,13 +266,6 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         Links of the chain.
     momentum : {'auto', 'conserved', 'free'}
         As for `IsokineticDynamics`.
-
-    Raises
-    ------
-    InputError
-        Temperature or time constant not positive.
-    UnsupportedError
-        Targets that move.
     """
 
     def __init__(
@@ -320,13 +307,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     tolerance : float
         Largest difference of a time step taken back.
-
-    Raises
-    ------
-    InputError
-        Temperature not positive, fewer than one step, `keep` out of range, a negative time step.
-    UnsupportedError
-        A stepper that is not reversible and symplectic; targets that move, rows that hold velocities, friction.
     """
 
     def __init__(
@@ -375,13 +355,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         return found
 
     def get_conserved_energy(self) -> NoReturn:
-        """Nothing is conserved.
-
-        Raises
-        ------
-        UnsupportedError
-            Always.
-        """
+        """`UnsupportedError`: nothing is conserved."""
         raise UnsupportedError(
             "Monte Carlo conserves no energy; look at counts.mean_square, that of its change over kT"
         )
@@ -420,11 +394,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; calculators of other atoms; bad numbers of steps, friction or
-        temperature; options of the other bath. The atoms are then as they were. While it runs: the atoms got another
-        calculator.
-    UnsupportedError
-        Spheres with constraints that move or that hold velocities.
+        One calculator given twice; calculators of other atoms; options of the other bath. While it runs: the atoms got
+        another calculator.
     """
 
     @checked
@@ -523,13 +494,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
 
     def get_conserved_energy(self) -> float:
-        """Total energy less the heat in eV, for Langevin dynamics.
-
-        Raises
-        ------
-        UnsupportedError
-            On spheres, where forces of the bath do work.
-        """
+        """Total energy less the heat in eV; `UnsupportedError` on spheres, whose bath does work."""
         if isinstance(self.stepper, IsokineticSpheres):
             raise UnsupportedError("nothing like an energy is conserved on spheres; look at averages instead")
         return super().get_conserved_energy()
@@ -564,7 +529,6 @@ def draw_velocities(
     temperature_K: float,
     rng: Rng = None,
     *,
-    exact: bool = False,
     zero_momentum: bool = False,
     constraints: Constraint | Iterable[Constraint] = (),
 ) -> None:
@@ -579,8 +543,6 @@ def draw_velocities(
         On their constraints.
     temperature_K : float
     rng : int, numpy.random.Generator or None
-    exact : bool
-        Scale to 2K = g kT exactly.
     zero_momentum : bool
         Take total momentum out, in the directions in which no constraint knows a place in space.
     constraints : sequence of Constraint, optional
@@ -589,7 +551,7 @@ def draw_velocities(
     Raises
     ------
     InputError
-        Temperature not positive; atoms off their constraints.
+        Atoms off their constraints.
     UnsupportedError
         `zero_momentum` where atoms are held in space.
     """
@@ -599,15 +561,8 @@ def draw_velocities(
     try:
         atoms.set_momenta(np.zeros_like(momenta), apply_constraint=False)
         held = ConstrainedDynamics(atoms, 0.0, constraints=constraints)
-        system = held._systems()
-        wanted = None
-        if exact:
-            count = held.degrees_of_freedom
-            if zero_momentum:
-                count -= len(open_directions(system.motion, atoms.positions))
-            wanted = 0.5 * count * thermal or None
         v = thermal_velocities(
-            system, atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum, kinetic_energy=wanted
+            held._systems(), atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum
         )
         momenta = v * held._masses
     finally:

@@ -143,8 +143,6 @@ def freedom(
 
     Raises
     ------
-    InputError
-        Bad atom numbers, or an unknown `momentum`.
     UnsupportedError
         A row couples the chosen atoms to others; 'conserved' with rows that hold atoms in space.
     OverdeterminedError

@@ -45,9 +45,9 @@ ALL = [
     *(Composition((0.25, 0.5, 0.25), 2), RungeKuttaNystrom((1.0,), (0.5, 0.5)), Splitting((1.0,), (0.5, 0.5))),
     *(Langevin(1.0, 0.5, 1), Langevin(1.0, 0.5, 1, substeps=1), ReversibilityCheck(Suzuki4())),
     *(Isokinetic(1.0), Isokinetic(1.0, order=4), Isokinetic(1.0, order=6)),
-    *(LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 3}), LangevinRespa(1.0, 0.5, 1, order=4)),
+    *(LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 3}), LangevinRespa(1.0, 0.5, 1)),
     LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 2}, slow_kicks="middle"),
-    *(IsokineticSpheres(1.0, 0.5, 1, steps={"a": 1, "b": 2, "c": 4}, order=4), IsokineticSpheres(1.0, 0.5, 1)),
+    *(IsokineticSpheres(1.0, 0.5, 1, steps={"a": 1, "b": 2, "c": 4}), IsokineticSpheres(1.0, 0.5, 1)),
     ConstantPressure(Langevin(1.0, 0.5, 1), MonteCarloBarostat(1.0)),
     *(NoseHooverChain(1.0, 9.0), NoseHooverChain(1.0, 9.0, stepper=Geodesic(2))),
 ]

@@ -30,7 +30,8 @@ from kcons.openmm import (
     hold,
 )
 from kcons.steppers.files import text
-from kcons.thermostats import autocorrelation_time
+from kcons.thermostats import mean
+from kcons.thermostats.correlated_series import spread
 
 BAROSTATS = {
     "isotropic": openmm.MonteCarloBarostat(1.0, 300.0, 2),
@@ -201,9 +202,9 @@ def volumes(system, integrator, x, barostat, count=1200, part=None):
 def judge(found, n, pressure):
     exact = stats.gamma(n + 1, scale=KT / pressure)
     assert p_value(found, exact) > 0.01
-    error = exact.std() * np.sqrt(autocorrelation_time(found) / len(found))
-    assert error < 0.05 * exact.mean()
-    assert abs(found.mean() - exact.mean()) < 3.5 * error
+    estimate = mean(found)
+    assert estimate.error < 0.05 * exact.mean()
+    assert abs(estimate.off(exact.mean())) < 3.5
 
 
 PRESSURE = (N + 1) * KT / SIDE**3
@@ -258,7 +259,7 @@ def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
     assert (abs(box[np.tril_indices(3, -1)]) > 1e-3).all() == (barostat == "flexible")
     integrator.check()
     told = {"ensemble": ensemble, "barostat": barostat, "steps": count, "molecules": n, "off": off}
-    return told | {"independent": count / autocorrelation_time(found), "less": less, "p": right, "more": more}
+    return told | {"independent": spread(found).independent, "less": less, "p": right, "more": more}
 
 
 @pytest.fixture(scope="module")

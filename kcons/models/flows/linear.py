@@ -10,8 +10,8 @@ there after their mean is a nilpotent matrix up to rounding, whose null spaces, 
 (Kublanovskaya's staircase) and chains of generalized eigenvectors.
 
 **Stability.** The notes' criterion Re lambda <= 0 (eq. 14) is completed: where Re lambda = 0, the Jordan blocks must be
-1 x 1, or the solution grows like a power of t. A real part within its error is zero only if the trace of one variable,
-or of two that act on each other, is zero exactly; else stability cannot be told.
+1 x 1, or the solution grows like a power of t. Whether a real part within its error is zero is decided in rational
+numbers, by SymPy: the entries are taken as they stand. Where they have errors of their own, stability cannot be told.
 
 References
 ----------
@@ -32,7 +32,7 @@ from scipy.optimize import root
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.arguments import FloatArray, Rng, as_float_array, generator_of, whole_number
-from kcons.errors import InputError
+from kcons.errors import InputError, with_extra
 from kcons.models.flows.flow import Flow
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
@@ -43,6 +43,8 @@ NULL = 100.0
 STANDS_OUT = 10.0
 #: Eigenvalues that have no common structure are tried again as if known this many times better.
 CLOSER = 8.0
+#: Variables of the largest matrix whose eigenvalues on the imaginary axis are counted exactly.
+LARGEST = 24
 #: Equilibria closer than this, in parts of the size of the box, are one.
 SAME = 1e-6
 
@@ -348,11 +350,13 @@ class Classification(NamedTuple):
     hyperbolic: bool
     #: How far each eigenvalue may be off.
     errors: FloatArray
+    #: What to install for an answer where there is none.
+    remark: str = ""
 
     def __str__(self) -> str:
         name = self.detail if self.detail == "saddle-focus" else f"{self.detail} {self.kind.value}".strip()
         if self.stability is Stability.UNKNOWN:
-            return f"{name} whose stability cannot be told"
+            return f"{name} whose stability cannot be told{self.remark and ': '}{self.remark}"
         return f"{self.stability.value} {name}"
 
 
@@ -367,7 +371,7 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
     matrix : array_like, shape (n, n)
     error : array_like, shape (n, n) or a number
         How far the entries may be off, beyond their rounding: of a Jacobian by differences, for example. Without any,
-        real parts of exactly zero are found where one variable, or two that act on each other, show them.
+        real parts of exactly zero are found, for up to 24 variables; for more than two this needs SymPy.
     """
     A, found = _square(matrix), spectrum(matrix, error)
     groups = _clusters(found.values, found.errors)
@@ -389,25 +393,42 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
         if len(blocks) == 1:
             detail = "star" if blocks[0].sizes[0] == 1 else "improper"
     stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN
-    if stability is Stability.UNKNOWN and not np.any(error) and _on_axis(A) == np.sum(signs == 0):
-        defective = any(max(b.sizes) > 1 for b in jordan_form(A).blocks if abs(b.eigenvalue.real) <= max(found.errors))
-        stability = Stability.UNSTABLE if defective else Stability.STABLE
+    axis, remark = None, ""
+    if stability is Stability.UNKNOWN and not np.any(error):
+        try:
+            axis = (2, True) if len(A) == 2 and not zero and np.trace(A) == 0.0 else on_axis(A)
+        except ModuleNotFoundError as missing:
+            remark = str(with_extra(missing, "to decide in rational numbers"))
+    if axis is not None and axis[0] == np.sum(signs == 0):
+        stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
     order = np.lexsort((-found.values.imag, -found.values.real))
-    return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order])
+    return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order], remark)
 
 
-def _on_axis(A: FloatArray) -> int:
-    """How many eigenvalues lie on the imaginary axis for certain.
+def on_axis(matrix: FloatArray) -> tuple[int, bool] | None:
+    """How many eigenvalues lie on the imaginary axis exactly, and whether all their Jordan blocks have size 1.
 
-    Those of one variable, or of two that act on each other, of which the trace is zero exactly.
+    Entries count as they stand, as doubles are rational numbers. Eigenvalues on the axis are common roots of the
+    characteristic polynomials of A and -A. None where common roots lie off the axis, or with too many variables.
     """
-    _, label = connected_components(A != 0, directed=True, connection="strong")
-    found = 0
-    for k in np.unique(label):
-        own = A[np.ix_(label == k, label == k)]
-        if np.trace(own) == 0.0 and (len(own) == 1 or (len(own) == 2 and np.linalg.det(own) > 0)):
-            found += len(own)
-    return found
+    from sympy import QQ, Poly, Symbol
+    from sympy.polys.matrices import DomainMatrix
+
+    if len(matrix) > LARGEST:
+        return None
+    x, shape = Symbol("x"), matrix.shape
+    A = DomainMatrix([[QQ(*float(v).as_integer_ratio()) for v in row] for row in matrix], shape, QQ)
+    p = Poly(A.charpoly(), x, domain=QQ)
+    common = p.gcd(p.compose(Poly(-x, x, domain=QQ)))
+    once = common.sqf_part()
+    squares = Poly(once.all_coeffs()[::2], x, domain=QQ)
+    if squares.degree() > 0 and squares.count_roots(None, 0) < squares.degree():
+        return None
+    # The least polynomial of A has simple roots on the axis if this one vanishes at A.
+    least, value = p.quo(common) * once, DomainMatrix.zeros(shape, QQ)
+    for c in least.all_coeffs() if once.degree() < common.degree() else ():
+        value = value * A + QQ(c.p, c.q) * DomainMatrix.eye(shape, QQ)
+    return common.degree(), value.is_zero_matrix
 
 
 # -- equilibria ---------------------------------------------------------------------------------------

@@ -207,7 +207,7 @@ class CarriedConstraints(Part):
         reach = np.abs(x[held.touched]).max(initial=0.0)
         if self._slopes is None:
             self._slopes = found.norms
-        if self._engine.passage.precision.name != "double" and self._engine.cell is not None:
+        if self._engine.passage.precision.name != "double" and context.getSystem().usesPeriodicBoundaryConditions():
             # OpenMM rounds molecules to single numbers where it moves them back into the box.
             allowed += 2.0**-22 * reach * self._slopes
         miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)

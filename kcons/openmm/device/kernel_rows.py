@@ -11,7 +11,7 @@ import openmm
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.callbacks import Passage, cell_of
@@ -144,11 +144,6 @@ class KernelRows(CarriedConstraints):
     @property
     def driven(self) -> bool:
         return any(item.moving or not item.holonomic for item in self.given)
-
-    @property
-    def steered(self) -> bool:
-        """Whether targets may have changed between two calls."""
-        return any(isinstance(item.target, MovingTarget) for item in self.given)
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         self.bind(context)

@@ -229,17 +229,12 @@ class ProjectedIntegrator(Integrator):
             There is none.
         """
         context = None if self._guard is None else self._guard.alive
-        if context is None and (context := find_context(self._holder)) is None:
+        if context is None and (context := find_context(self)) is None:
             raise UnsupportedError(
                 "this integrator belongs to no Context: create one with it first. Where it has one that is not found, "
                 "as a member of a CompoundIntegrator, call integrator.attach(context)"
             )
         return context
-
-    @property
-    def _holder(self) -> openmm.Integrator:
-        """The integrator that the Context has."""
-        return self
 
     def attach(self, context: openmm.Context) -> None:
         """Look at this Context, and at its System anew; done by itself but for members of a CompoundIntegrator.
@@ -253,7 +248,7 @@ class ProjectedIntegrator(Integrator):
         owner = context.getIntegrator()
         compound = isinstance(owner, openmm.CompoundIntegrator)
         members = [owner.getIntegrator(k) for k in range(owner.getNumIntegrators())] if compound else []
-        if owner is not self._holder and all(int(member.this) != int(self.this) for member in members):
+        if owner is not self and all(int(member.this) != int(self.this) for member in members):
             raise InputError(
                 f"the Context was made with another integrator than {self!r}; give the Context of this one",
                 item="context",
@@ -709,7 +704,7 @@ class ProjectedIntegrator(Integrator):
         UnsupportedError
             The Context exists; it has read the groups and would ignore the change.
         """
-        if self._guard is not None or find_context(self._holder) is not None:
+        if self._guard is not None or find_context(self) is not None:
             raise UnsupportedError("the Context has read the force groups already; set them before it is created")
         if isinstance(groups, int | np.integer):
             wanted = {g for g in range(32) if (int(groups) >> g) & 1}

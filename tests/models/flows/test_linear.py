@@ -1,5 +1,7 @@
 """Linear flows: exp(At), eigenvalues with their errors, Jordan structure, and stability that is told, or cannot be."""
 
+import sys
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -20,7 +22,7 @@ from kcons.models.flows import (
     jordan_block_propagator,
     jordan_form,
 )
-from kcons.models.flows.linear import spectrum
+from kcons.models.flows.linear import LARGEST, on_axis, spectrum
 
 R = np.array([[0.0, 1.0], [-1.0, 0.0]])
 RESONANT = np.block([[R, np.eye(2)], [np.zeros((2, 2)), R]])
@@ -301,7 +303,8 @@ def test_what_is_said_is_so():
         if seed % 5 == 0 and right == 0 < on:
             # Bounded, or growing like a power of t: small integers make that plain after some time.
             grown = np.abs(scipy.linalg.expm(A * 1e4)).max() > 1e3
-            assert found.stability in (Stability.UNSTABLE if grown else Stability.STABLE, Stability.UNKNOWN), A
+            assert found.stability is (Stability.UNSTABLE if grown else Stability.STABLE), A
+            assert on_axis(A) is None or on_axis(A)[0] == on
         if found.hyperbolic:
             assert on == 0, A
             assert (np.sum(found.eigenvalues.real < 0), np.sum(found.eigenvalues.real > 0)) == (left, right), A
@@ -369,3 +372,46 @@ def test_bad_errors_are_refused(error):
     with pytest.raises(InputError) as caught:
         classify(np.eye(2), error)
     assert caught.value.item == "error"
+
+
+@pytest.mark.parametrize(
+    ("blocks", "wanted"),
+    [
+        ([[[-1.0]]], (0, True)),
+        ([R], (2, True)),
+        ([R, R, 3 * R], (6, True)),
+        ([RESONANT, [[-2.0]]], (4, False)),
+        ([np.zeros((2, 2)), -np.eye(2)], (2, True)),
+        ([[[0.0, 1.0], [0.0, 0.0]], R], (4, False)),
+        ([RESONANT, R, np.zeros((2, 2))], (8, False)),
+        ([R - np.eye(2), [[0.0]]], (1, True)),
+        # Pairs of opposite signs, real or complex, are common roots too, but not on the axis.
+        ([[[2.0]], [[-2.0]], R], None),
+        ([R + np.eye(2), R - np.eye(2), 2 * R], None),
+    ],
+)
+def test_eigenvalues_on_the_axis_are_counted_in_integers(blocks, wanted):
+    assert on_axis(scipy.linalg.block_diag(*blocks)) == wanted
+    assert on_axis(in_skew_basis(np.random.default_rng(0), blocks)) == wanted
+
+
+def test_the_last_digit_decides():
+    assert on_axis(R + np.diag([1e-300, -1e-300])) == (2, True)
+    assert on_axis(R + np.diag([1e-300, 0.0])) == (0, True)
+    third = np.array([[0.0, 1 / 3], [-1 / 3, 0.0]])
+    assert on_axis(np.kron(third, np.array([[1.0, 0.1], [0.1, 2.0]]))) == (4, True)
+    # Numbers from one end of their range to the other.
+    assert on_axis(scipy.linalg.block_diag(1e-300 * R, 1e300 * R)) == (4, True)
+    # x'' = -K x with a symmetric K: all eigenvalues are imaginary, whatever the digits of K.
+    K = np.random.default_rng(0).normal(size=(5, 5))
+    K = K @ K.T
+    assert on_axis(np.block([[np.zeros((5, 5)), np.eye(5)], [-0.5 * (K + K.T), np.zeros((5, 5))]])) == (10, True)
+    assert on_axis(np.zeros((LARGEST + 1, LARGEST + 1))) is None
+
+
+def test_without_sympy_the_answer_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sympy", None)
+    assert str(classify(R)) == "stable center"
+    said = str(classify(scipy.linalg.block_diag(R, 3 * R)))
+    assert said.startswith("center whose stability cannot be told: to decide in rational numbers needs sympy")
+    assert "kcons[formulas]" in said

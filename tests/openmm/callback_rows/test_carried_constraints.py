@@ -57,7 +57,7 @@ def test_the_motion_is_that_of_openmm():
     verlet.setConstraintTolerance(1e-12)
     x, v = state_of(context)
     own = started(own_bonds(verlet), x, v)
-    own.setVelocities(v - 0.0005 * forces_at(own, -1) / masses_of(own.getSystem())[:, None])
+    own.setVelocities(v - 0.0005 * forces_at(own) / masses_of(own.getSystem())[:, None])
     verlet.step(100)
     integrator.step(100)
     assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9

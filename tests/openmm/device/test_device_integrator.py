@@ -37,7 +37,7 @@ STEPS = {
     "blanes-moan6": ("blanes-moan6", None),
     "Isokinetic": ("rattle", Isokinetic()),
     "isokinetic4": ("isokinetic4", Isokinetic(300.0)),
-    "NoseHoover": ("rattle", NoseHoover(300.0, 10.0, length=4, repeats=2)),
+    "NoseHoover": ("rattle", NoseHoover(300.0, 10.0, length=4)),
     "NoseHooverMiddle": ("rattle", NoseHooverMiddle(300.0, 10.0)),
     "friction": ("rattle", Langevin(0.0, 5.0)),
     "several steps": ("rattle", LangevinRespa(0.0, 2.0, {0: 1, 1: 4})),

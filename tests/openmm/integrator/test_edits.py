@@ -188,17 +188,6 @@ def test_a_start_that_is_a_little_off_is_put_right(kind, caplog):
     assert not caplog.records
 
 
-@pytest.mark.parametrize("carried", [False, True])
-def test_a_start_that_is_far_off_is_refused(carried):
-    system, x = water_box(8, spacing=0.4)
-    parts = [hold(system, [], x, take="all", keep_water=False)] if carried else []
-    integrator = ProjectedIntegrator(1e-3, parts=parts)
-    context = started(system, integrator, 1.12 * x)
-    with pytest.raises(InputError, match=r"positions|at the start"):
-        integrator.step(1)
-    np.testing.assert_array_equal(state_of(context)[0], 1.12 * x)
-
-
 # -- parts that were forgotten ------------------------------------------------------------------------------
 
 

@@ -440,7 +440,7 @@ def beside_water(kind):
         return system, x, v, hold(system, [Angle([[0, 1, 2]]), Distance([[81, 82]])], x)
     force = openmm.CustomBondForce("r")
     force.addBond(81, 82, [])
-    return system, x, v, CollectiveRows(system, [Row(force)], positions=x, meets_system=kind == "meeting" or None)
+    return system, x, v, CollectiveRows(system, [Row(force)], positions=x, meets_system=kind == "meeting")
 
 
 BESIDE_WATER = {

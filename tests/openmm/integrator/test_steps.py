@@ -66,18 +66,6 @@ def test_part_is_held(scheme, evaluates, platform):
     assert context.getStepCount() == 100
 
 
-@pytest.mark.parametrize("evaluates", [False, True])
-def test_a_part_that_holds_nothing_changes_nothing(evaluates):
-    """With forces kept within a call or not."""
-    system, x, v = loose_alanine()
-    contexts = []
-    for parts in ((), (HeldCoordinates([], 2, 0.0, 22, evaluates=evaluates),)):
-        integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=parts)
-        contexts.append(started(system, integrator, x, v))
-        integrator.step(10)
-    np.testing.assert_allclose(state_of(contexts[0]), state_of(contexts[1]), atol=1e-10)
-
-
 class Reluctant(HeldCoordinates):
     """Fails to project velocities where the global variable `reluctant` is 1."""
 
