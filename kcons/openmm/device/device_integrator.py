@@ -44,15 +44,15 @@ from kcons.thermostats.nose_hoover import chain_fractions
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
 _EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
 _DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
-#: What a solve that failed leaves of a call.
-_FAILED = 1
+#: Places in what the kernel `look` tells: sum of v^2; whether a row failed, in which step, its number, its residual.
+_MOTION, _FAILED, _STEP, _ROW, _RESIDUAL = 0, 2, 3, 4, 5
 
 
 class _Given(ctypes.Structure):
     """What the plugin tells of a Context, as plugin/program_integrator.h has it."""
 
     _fields_ = (
-        *((name, ctypes.c_char_p) for name in ("description", "platform", "precision")),
+        *((name, ctypes.c_char_p) for name in ("description", "platform")),
         *((name, ctypes.c_int) for name in ("groups", "particles", "constraints")),
         ("masses", ctypes.POINTER(ctypes.c_double)),
         ("pairs", ctypes.POINTER(ctypes.c_int)),
@@ -116,11 +116,14 @@ class DeviceProgram(Program):
     ----------
     kept : list of str
         Variables that belong to a state, in the order of the array `memory`.
+    made_under : tuple
+        `conditions` when `remembered` was asked last.
     """
 
     on_device = True
     integrator: DeviceIntegrator
     kept: list[str]
+    made_under: tuple[Any, ...] = ()
 
     def hand_over(self) -> None:
         """Describe the step to the plugin."""
@@ -150,6 +153,7 @@ class DeviceProgram(Program):
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
         memory = {"memory": self.integrator.read("memory")}  # which makes the kernels if there are none yet
+        self.made_under = self.integrator.conditions(self.integrator.context)
         saved = [array.name for array in self.integrator.rows.arrays if array.saved]
         return memory | {name: self.integrator.read(name) for name in saved}
 
@@ -293,21 +297,27 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:
         """The error for a row in a step that the Context is then just before.
 
-        It is at the last check; the steps from there are made again, the same where nothing random acts beside the
-        noise of the kernels. Where they are not, it stays there.
+        It is at the last check. The steps from there are made again if they will be the same: if settings are, and
+        nothing acts on the System that is random. Else it stays there.
         """
-        step, context = int(told[2]), guard.context
-        error: KconsError = self.rows.failure(int(told[3]), told[4], step)
+        step, context = int(told[_STEP]), guard.context
+        error: KconsError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
         again = step - 1 - context.getStepCount()
-        if again > 0 and guard.undisturbed and not guard.moving:
+        if again > 0 and guard.undisturbed and not guard.moving and self.program.made_under == self.conditions(context):
             try:
                 self._advance(context, again)
                 guard.since_check += again
                 guard.leave()
             except openmm.OpenMMException:
                 guard.put_back()
+        if not np.isfinite(told[_RESIDUAL]):
+            return guard.explosion(f"{self.rows.set.row_name(error.row)} is not finite.", step - 1)
         error.args = (f"{error}. The Context is at step {context.getStepCount()}", *error.args[1:])
         return error
+
+    def conditions(self, context: openmm.Context) -> tuple[Any, ...]:
+        """What a run that is made again has to have in common with the first."""
+        return self._dt, self.getConstraintTolerance(), self._described, dict(context.getParameters())
 
     # -- records ---------------------------------------------------------------------------------
 
@@ -344,8 +354,8 @@ class DeviceIntegrator(ProjectedIntegrator):
                 yield x, v, f, time + (k + 1) * every * self._dt
 
     def _look(self) -> list[float]:
-        told = (ctypes.c_double * 5)()
-        build.library().kcons_look(self._address, told)
+        told = (ctypes.c_double * 7)()
+        build.library().kcons_told(self._address, told)
         return list(told)
 
     def _execute(self, guard: Guard, steps: int) -> None:
@@ -357,7 +367,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         """A variable of the step, see `listing`."""
         program = self.program
         if name == "motion":
-            return self._look()[0]
+            return self._look()[_MOTION]
         if name == "failed":  # a call that fails raises
             return 0.0
         if name in program.kept and self.bound:
