@@ -174,14 +174,11 @@ def pieces(chosen: argparse.Namespace) -> dict[str, Any]:
 
 
 def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Processor time a step of argon atoms on surfaces, one thread; error of a spherical pendulum at t = 4."""
     columns = {"cutoff_nm": "{:g}", "verlet_us": "{:.0f}", "ours_us": "{:.0f}", "ratio": "{:.2f}", "off_nm": "{:.0e}"}
     return {
-        "Argon atoms on surfaces: processor time a step, one thread": harness.shown(
-            table, "speed", kind="{}", device="{}", scheme="{}", **columns, across="{:.0e}"
-        ),
-        "Spherical pendulum: error at t = 4": harness.shown(
-            table, "precision", scheme="{}", evaluations="{:.0f}", error="{:.0e}"
-        ),
+        "speed": harness.shown(table, "speed", kind="{}", device="{}", scheme="{}", **columns, across="{:.0e}"),
+        "precision": harness.shown(table, "precision", scheme="{}", evaluations="{:.0f}", error="{:.0e}"),
     }
 
 
