@@ -448,8 +448,8 @@ def through_openmm() -> Iterator[tuple[str, list[State]]]:
         part = hold(system, [Angle([[3, 4, 5]]), Dihedral([[4, 5, 8, 9]])], x)
         return ProjectedIntegrator(0.001, scheme, parts=[part], ensemble=ensemble)
 
-    def around(scheme, **more):
-        return SurfaceIntegrator(0.001, scheme, surfaces=Sphere([6, 7], np.zeros(3), 0.5), n_particles=10, **more)
+    def around(system, scheme, **more):
+        return SurfaceIntegrator(0.001, scheme, surfaces=Sphere([6, 7], np.zeros(3), 0.5), system=system, **more)
 
     schemes = ("rattle", "geodesic", "yoshida4", "suzuki4", "kahan-li6")
     schemes += ("blanes-moan4", "blanes-moan6", "blanes-moan6a", "isokinetic4", "isokinetic6")
@@ -459,11 +459,11 @@ def through_openmm() -> Iterator[tuple[str, list[State]]]:
         made[f"Isokinetic {s}"] = lambda system, s=s: ProjectedIntegrator(0.001, s, ensemble=OfOpenMM(300.0))
     for s in ("rattle", "suzuki4", "blanes-moan6a"):
         made[f"carried {s}"] = lambda system, s=s: carried(system, s)
-        made[f"spheres {s}"] = lambda system, s=s: around(s)
-    made["spheres geodesic"] = lambda system: around("geodesic")
+        made[f"spheres {s}"] = lambda system, s=s: around(system, s)
+    made["spheres geodesic"] = lambda system: around(system, "geodesic")
     made["carried Langevin"] = lambda system: carried(system, "rattle", Noise(300.0, 2.0))
     made["carried Isokinetic"] = lambda system: carried(system, "rattle", OfOpenMM(300.0))
-    made["spheres Isokinetic"] = lambda system: around("isokinetic4", ensemble=OfOpenMM(300.0))
+    made["spheres Isokinetic"] = lambda system: around(system, "isokinetic4", ensemble=OfOpenMM(300.0))
     for name, make in made.items():
         system = springy()
         integrator = make(system)

@@ -325,7 +325,7 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("kcons.openmm.Langevin(300, -1.0)", InputError, "friction"),
     ("kcons.openmm.Isokinetic(0)", InputError, "temperature"),
     ("kcons.openmm.NoseHoover(300, 0)", InputError, "frequency"),
-    ("SurfaceIntegrator(0.001, [])", InputError, "surfaces"),
+    ("SurfaceIntegrator(0.001, surfaces=[], system=openmm_system())", InputError, "surfaces"),
     ("hold(3, Distance([0, 1]), X)", InputError, "system"),
     ("hold(openmm_system(), Distance([0, 9]), X)", InputError, "atoms"),
     ("hold(openmm_system(), Distance([0, 1]), X[:2])", InputError, "positions"),
