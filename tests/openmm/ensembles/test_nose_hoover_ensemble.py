@@ -188,6 +188,7 @@ def test_a_chain_in_the_middle_takes_rattle_and_stays_itself():
 # -- what is held ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("without_device")
 def test_a_step_that_fails_leaves_the_chain_where_it_was():
     system, x, v = loose_alanine()
     part = hold(system, [], positions=x, take="all")

@@ -25,7 +25,6 @@ from kcons.constraints import Distance, Sphere
 from kcons.errors import CertificateError, InputError, KconsError
 from kcons.openmm import (
     CollectiveRows,
-    ExpressionSurface,
     Langevin,
     ProjectedIntegrator,
     Row,
@@ -197,14 +196,12 @@ def _held(how):
         hold(system, [Distance([[0, 7]])], X)
     elif how == "collective":
         CollectiveRows(system, [bond()], positions=X)
-    elif how == "compiled surface":
-        surface_parts(Sphere([0], CENTER, RADIUS), system=system, compiled=True)
     else:
-        surface_parts(ExpressionSurface([0], f"x^2+y^2+z^2-{X[0] @ X[0]}"), system=system)
+        surface_parts(Sphere([0], CENTER, RADIUS), system=system)
     return system
 
 
-@pytest.mark.parametrize("how", ["hold", "collective", "compiled surface", "formula"])
+@pytest.mark.parametrize("how", ["hold", "collective", "surface"])
 def test_forgotten_parts_are_refused(how):
     context = started(_held(how), integrator := ProjectedIntegrator(1e-3), X)
     with pytest.raises(InputError, match=r"parts=\[rows\]"):
