@@ -16,7 +16,7 @@ import openmm
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
@@ -299,7 +299,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         nothing acts on the System that is random. Else it stays there.
         """
         step, context = int(told[_STEP]), guard.context
-        error: KconsError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
+        error: ConvergenceError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
         again = step - 1 - context.getStepCount()
         if again > 0 and guard.undisturbed and not guard.moving and self.program.made_under == self.conditions(context):
             try:
@@ -332,7 +332,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         Yields
         ------
         x, v, f : ndarray, shape (n, 3)
-            Positions, velocities and applied forces of the particles of `record`, in ascending order.
+            Positions, velocities and applied forces of the particles of `record`, in ascending order; molecules are
+            in one piece, in any cell.
         time : float
         """
         room, n = room_for(len(self._recorded)), len(self._recorded)

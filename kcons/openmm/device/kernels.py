@@ -339,7 +339,8 @@ _CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(
  if (GROUP_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}
 """
 #: Half a push of all links, the first of which then scales velocities, and half a push; see `kcons.openmm.NoseHoover`.
-_CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place], inertia = P_kT/(P_frequency*P_frequency);
+_CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place];
+ mixed inertia = P_kT/(P_frequency*P_frequency);
  const mixed parts[PARTS] = {SHARES};
  for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
  for (int part = 0; part < PARTS; part++) {
