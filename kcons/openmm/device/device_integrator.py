@@ -21,7 +21,7 @@ from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan, room_for
+from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
@@ -357,9 +357,6 @@ class DeviceIntegrator(ProjectedIntegrator):
         build.library().kcons_told(self._address, told)
         return list(told)
 
-    def _execute(self, guard: Guard, steps: int) -> None:
-        raise NotImplementedError
-
     # -- variables, as the CustomIntegrator has them ------------------------------------------------
 
     def getGlobalVariableByName(self, name: str) -> float:
@@ -437,12 +434,10 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
             members = np.ascontiguousarray(atoms, dtype=np.int32)
             library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
         return
-    rows: Any = NoRows()
-    if n or part is not None:
-        positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
-        box = np.array(given.box[:9]).reshape(3, 3)
-        made_of = masses, (pairs, lengths), positions, box if box.any() else None, given.time
-        rows = KernelRows(()).rows_at(*made_of) if part is None else part.rows_at(*made_of)
+    positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
+    box = np.array(given.box[:9]).reshape(3, 3)
+    held = KernelRows(()) if part is None else part
+    rows = held.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
     platform = given.platform.decode()
