@@ -272,13 +272,7 @@ class _Simulation:
         self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
         if not self._on_device:
             rows = [
-                Row(
-                    _force_of(name, item, wraps),
-                    float(a),
-                    (float(b) - float(a)) / duration,
-                    period=item.period,
-                    name=name,
-                )
+                Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, item.period, name=name)
                 for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
             ]
             parts = [CollectiveRows(system, rows, positions=sampler.positions)]
