@@ -19,6 +19,28 @@ MUTANTS = {
             "test_molecule_spheres.py::test_trajectories_are_those_on_arrays",
         ),
     ],
+    "openmm/device/c_writer.py": [
+        (
+            're.sub(r"pow\\((.*), (.*)\\)", r"(\\«1→2»)^(\\2)", text)',
+            "test_surface_rows.py::test_formulas_are_read_by_openmm",
+        ),
+    ],
+    "openmm/device/large_clusters.py": [
+        (
+            "key=lambda k: («k in last, →»k)",
+            "test_rows.py::test_levels_have_rows_that_share_no_entry",
+        ),
+        (
+            "level[min(mine)] = «max(level[min(mine)], level[place] + 1)→level[place] + 1»",
+            "test_rows.py::test_levels_have_rows_that_share_no_entry",
+        ),
+    ],
+    "openmm/device/small_clusters.py": [
+        (
+            '"there« && last→»"',
+            "test_surface_steps.py::test_the_device_holds_the_same_surfaces",
+        ),
+    ],
     "openmm/device/device_integrator.py": [
         (
             "if told[_FAILED]«→ and False»:",
