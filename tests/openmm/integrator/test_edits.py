@@ -214,7 +214,6 @@ def test_forgotten_parts_are_refused(how):
 
 
 @parts
-@pytest.mark.usefixtures("without_device")
 def test_solvers_that_lie_are_found(make):
     """The program holds another target than the rows say: at the next check, back to the last that was right."""
     made = make()
