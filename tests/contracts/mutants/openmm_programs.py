@@ -202,10 +202,14 @@ MUTANTS = {
             "test_row_program.py::test_many_steps_look_less_often",
         ),
     ],
-    "openmm/surfaces/landings.py": [
+    "openmm/surfaces/surface_rows.py": [
         (
-            "super()«._declare_solution(p)→»",
-            "test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
+            'f"select(failed, v, {u}«+→-»i_push/{h})"',
+            "test_surface_steps.py::test_the_steps_are_those_of_the_core",
+        ),
+        (
+            "«*step(dot(i_slope, i_gradient))→»",
+            "test_surface_rows.py::test_a_landing_where_the_surface_looks_the_other_way_is_none",
         ),
     ],
     "openmm/callback_rows/carried_constraints.py": [
