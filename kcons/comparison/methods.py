@@ -200,13 +200,6 @@ def lines_on_arrays(imports: str, last: str) -> str:
     return _ON_ARRAYS.replace("$imports", imports).replace(", run", ", run" if "run(" in last else "") + last
 
 
-_BY_EXTRAPOLATION = lines_on_arrays(
-    "from kcons.steppers import Extrapolation",
-    """\
-for end in Extrapolation($step).states(system, start, until=test_system.horizon):
-    pass  # each state is the end of a step
-""",
-)
 _BY_DYNAMICS = """\
 from ase import units
 
@@ -274,12 +267,6 @@ for _name, _title, _stepper in (
     )
 
 
-def _extrapolated(system: TestSystem, tolerance: float) -> Run:
-    start = State(system.positions, system.velocities)
-    return OfStates(steppers.Extrapolation(tolerance).states(_system(system), start, system.horizon), start)
-
-
-add_method("extrapolation", _extrapolated, title="kcons Extrapolation", adaptive=True, code=_BY_EXTRAPOLATION)
 add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", holds=False)
 
 

@@ -319,7 +319,7 @@ def test_openmm_that_is_not_installed(monkeypatch):
 @pytest.mark.parametrize(
     ("system", "method"),
     [
-        *(("rotor", name) for name in ("rattle", "blanes-moan6", "extrapolation", "dop853", "ase-kcons", "ase-bonds")),
+        *(("rotor", name) for name in ("rattle", "blanes-moan6", "dop853", "ase-kcons", "ase-bonds")),
         *(
             ("rotor", name)
             for name in ("openmm-verlet", "openmm-kcons-suzuki4", "openmm-kcons-rattle", "openmm-held-rattle")

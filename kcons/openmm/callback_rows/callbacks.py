@@ -347,8 +347,8 @@ class Engine:
         unknown = len(self._fractions) != 1 or (np.isnan(self._push_before).any() and not whole)
         if integrator is None or integrator.thermostatted or unknown:
             raise InputError(
-                "multipliers of a step need two steps of a scheme with one drift, at constant energy; "
-                "multipliers(context) gives those of any state",
+                "multipliers of a step need two steps of a scheme with one drift, at constant energy and with "
+                "device=False; multipliers(context) gives those of any state",
                 item="scheme",
             )
         dt = self._made_with

@@ -151,7 +151,7 @@ MUTANTS = {
     ],
     "openmm/ensembles/langevin_ensemble.py": [
         (
-            "«groups_of(force)→{force.getForceGroup()}» - set(self.groups)",
+            "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
             "test_respa_ensemble.py::test_forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "test_langevin_ensemble.py"),

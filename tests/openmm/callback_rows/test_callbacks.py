@@ -154,6 +154,7 @@ def test_callbacks_keep_no_memory():
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
+@pytest.mark.usefixtures("without_device")
 def test_a_step_too_large_is_taken_back(platform):
     part = hold(system := free([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
     integrator = ProjectedIntegrator(0.1 * unit.picosecond, parts=[part])

@@ -179,6 +179,7 @@ def test_molecules_move_whole_under_pressure(rows, options, groups):
     assert context.getState().getPeriodicBoxVectors()[0][0]._value != edge
 
 
+@pytest.mark.usefixtures("without_device")
 def test_two_parts_that_share_particles_are_refused():
     system, x = openmm.System(), np.array([[0, 0, 0], [0.15, 0, 0], [0.2, 0.14, 0], [0.35, 0.14, 0.05]])
     for _ in x:
