@@ -229,7 +229,6 @@ def held(kind, **arguments):
 
 
 @pytest.mark.parametrize("kind", LEAN)
-@pytest.mark.usefixtures("without_device")
 def test_calls_of_any_length_make_the_same_motion(kind):
     """Within a call steps leave out what only a reader of velocities needs."""
     ends, parts = [], []
@@ -282,7 +281,6 @@ def test_steps_in_tens_are_those_of_one_call(kind):
     ],
     ids=["rattle", "blanes-moan4", "Langevin", "Isokinetic", "collective", "carried"],
 )
-@pytest.mark.usefixtures("without_device")
 def test_evaluations_of_forces_in_tens(make, more):
     """OpenMM evaluates the forces once a step (five times in that of order 4), in however many calls."""
     system, x, v = alanine()
@@ -333,7 +331,6 @@ def test_failure_where_nobody_looked():
 
 
 @pytest.mark.parametrize("agent", ["barostat", "thermostat", "momentum"])
-@pytest.mark.usefixtures("without_device")
 def test_agents_of_the_system(agent):
     """A carried row stays exact where a barostat moves x between steps; a thermostat meets complete velocities."""
     system = openmm.System()
@@ -388,7 +385,6 @@ def test_a_number_of_steps_that_is_none_is_refused(kind):
 
 
 @pytest.mark.parametrize("before", [100, 0])
-@pytest.mark.usefixtures("without_device")
 def test_checks_that_come_more_often_make_no_step_more(before):
     """Steps since the last check may be more than the new interval."""
     system, x, v = dumbbell()
