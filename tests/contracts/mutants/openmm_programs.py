@@ -20,7 +20,7 @@ MUTANTS = {
         ),
         (
             "«self._left == (context.getStepCount(), box_of(context))→True»",
-            "test_steps.py::test_changes_from_outside_reach_the_next_step",
+            "test_steps.py::test_change_of_the_box",
         ),
     ],
     "openmm/integrator/steps.py": [
