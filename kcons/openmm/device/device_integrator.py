@@ -483,7 +483,7 @@ def choose(
     classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
 ) -> tuple[type[ProjectedIntegrator], str]:
-    """The class of an integrator that may run on the device, of two, see `ProjectedIntegrator`, and why it is the first.
+    """The class of an integrator that may run on the device, of two, and why it is the first.
 
     Raises
     ------

@@ -61,7 +61,7 @@ class KernelRows(CarriedConstraints):
         self._parts = parts
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
         self.given: list[Constraint] = list(accepted(constraints_of(parts)))
-        self.groups = frozenset().union(*(part.groups for part in carried))
+        self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         #: The engine of what `hold` made, until the Context is known.
         self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
