@@ -202,7 +202,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _write(self, program: Program) -> Step:
         """A step without parts: kernels hold their rows."""
         step = Step(program, self.scheme, (), self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
