@@ -15,7 +15,7 @@ import openmm
 from numpy.typing import ArrayLike, NDArray
 from openmm import unit
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
@@ -26,16 +26,9 @@ from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
 
-Choice = Literal["all", "touched"] | Iterable[int]
 
-
-def move_constraints(
-    system: openmm.System,
-    which: Choice = "all",
-    *,
-    keep_water: bool = True,
-) -> list[Constraint]:
-    """Take constraints out of a System and return them as constraints of kcons.
+def move_constraints(system: openmm.System, *, keep_water: bool = True) -> list[Constraint]:
+    """Take the constraints out of a System and return them as constraints of kcons.
 
     Bonds of no strength are added between their atoms, so that the molecules of a Context, which barostats and the
     wrapping of positions go by, stay what they were.
@@ -44,11 +37,8 @@ def move_constraints(
     ----------
     system : openmm.System
         Changed in place, before a Context is made of it.
-    which : 'all' or iterable of int
-        Clusters of constraints that share atoms are taken whole: all, or those that touch one of the given atoms.
     keep_water : bool
-        Whether rigid water stays with OpenMM, whose SETTLE is fastest there; molecules among given atoms are taken
-        all the same.
+        Whether rigid water stays with OpenMM, whose SETTLE is fastest there.
 
     Returns
     -------
@@ -58,10 +48,10 @@ def move_constraints(
     Raises
     ------
     InputError
-        Unknown choice or atoms; nothing was changed.
+        No System.
     """
     table = _table(system)
-    chosen = _chosen(table, which, keep_water)
+    chosen = table.all_but_water if keep_water else table.all
     rows = _as_rows(table, chosen)
     _release(system, table, chosen)
     return rows
@@ -72,7 +62,7 @@ def hold(
     constraints: Constraint | Iterable[Constraint],
     positions: unit.Quantity | ArrayLike,
     *,
-    take: Choice = "touched",
+    take: Literal["touched", "all"] = "touched",
     keep_water: bool = True,
     periodic: bool | None = None,
     join: bool = False,
@@ -92,8 +82,9 @@ def hold(
         are to move over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints; targets left at None are taken from them.
-    take : 'touched', 'all' or iterable of int
-        Which clusters of the System's constraints move over besides those that a row touches.
+    take : {'touched', 'all'}
+        Which of the System's constraints move over: those that share atoms with the rows, directly or through others,
+        or all.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
     periodic, time
@@ -115,9 +106,12 @@ def hold(
     given = constraints_in(constraints, "constraints")
     table = _table(system)
     n = system.getNumParticles()
-    chosen = _chosen(table, () if take == "touched" else take, keep_water)
+    if take not in ("touched", "all"):
+        raise InputError(f"take is {take!r}; give 'touched' or 'all'", item="take")
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
-    chosen |= _sharing(table, touched[touched < n])
+    chosen = _sharing(table, touched[touched < n])
+    if take == "all":
+        chosen |= table.all_but_water if keep_water else table.all
     taken = _as_rows(table, chosen)
     part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, time=time)
     links = [_neighbors(item.atoms) for item in given] if join else []
@@ -152,11 +146,15 @@ class _Table:
         return self.clusters[self.pairs[:, 0]]
 
     @property
-    def water(self) -> NDArray[np.bool_]:
-        """Constraints of molecules that are a triangle of constraints and nothing else."""
+    def all(self) -> NDArray[np.bool_]:
+        return np.ones(len(self.pairs), dtype=bool)
+
+    @property
+    def all_but_water(self) -> NDArray[np.bool_]:
+        """All but those of molecules that are a triangle of constraints and nothing else."""
         rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
         atoms = np.bincount(self.clusters)[self.cluster]
-        return (rows == 3) & (atoms == 3)
+        return (rows != 3) | (atoms != 3)
 
 
 def _table(system: openmm.System) -> _Table:
@@ -176,20 +174,6 @@ def _table(system: openmm.System) -> _Table:
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     clusters = connected_components(links, directed=False)[1].astype(np.int64)
     return _Table(pairs, lengths, clusters)
-
-
-def _chosen(table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
-    """Which constraints to take, in whole clusters."""
-    if isinstance(which, str):
-        if which != "all":
-            raise InputError(f"no choice {which!r}; give 'all' or the numbers of atoms", item="which")
-        return ~table.water if keep_water else np.ones(len(table.pairs), dtype=bool)
-    atoms = np.asarray(list(which))
-    if atoms.size == 0:
-        return np.zeros(len(table.pairs), dtype=bool)
-    if not np.issubdtype(atoms.dtype, np.integer) or atoms.min() < 0 or atoms.max() >= len(table.clusters):
-        raise InputError(f"atoms must be integers from 0 to {len(table.clusters) - 1}", item="which")
-    return _sharing(table, atoms)
 
 
 def _sharing(table: _Table, atoms: IntArray) -> NDArray[np.bool_]:
@@ -215,17 +199,13 @@ def _tie(system: openmm.System, pairs: IntArray) -> None:
     """Make the pairs count as bonded."""
     if not len(pairs):
         return
-    n = system.getNumParticles()
-    i, j = pairs.T.astype(np.int32)  # older SciPy makes no tree of wider indices
-    links = coo_array((np.ones(len(pairs)), (i, j)), shape=(n, n))
-    tree = minimum_spanning_tree(links.tocsr()).tocoo()
     force = next((f for f in system.getForces() if f.getName() == TIES), None)
     if force is None:
         force = openmm.HarmonicBondForce()
         force.setName(TIES)
         system.addForce(force)
         force = system.getForce(system.getNumForces() - 1)
-    for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+    for i, j in pairs.tolist():
         force.addBond(i, j, 0.0, 0.0)
 
 

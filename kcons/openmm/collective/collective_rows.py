@@ -20,7 +20,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.internal import MOST_TURNED
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
-    CertificateError,
     ConstraintError,
     ConvergenceError,
     InputError,
@@ -94,15 +93,13 @@ class CollectiveRows(GroupRows):
     tolerance : float, optional
         Of sigma, relative to the larger of 1 and the target: the root of the sum of squares over the rows. Left open,
         1e-13, or 5e-7 where the platform computes forces in single precision (CUDA, HIP and OpenCL, mixed too).
-    meets_system : bool, optional
-        Whether the rows touch atoms constrained by the System. Found from the Forces; say True where they touch them
-        in ways that the Forces do not tell.
+    meets_system : bool
+        Say True where the rows touch atoms that the System constrains in ways that the Forces do not tell.
 
     Raises
     ------
     InputError
-        A number that is not finite, a particle that is not there, a target to find without positions,
-        meets_system=False where a row does.
+        A number that is not finite, a particle that is not there, a target to find without positions.
     UnsupportedError
         More rows than free force groups; rows on virtual sites. The System is unchanged then.
 
@@ -119,7 +116,7 @@ class CollectiveRows(GroupRows):
         *,
         positions: object | None = None,
         tolerance: float | None = None,
-        meets_system: bool | None = None,
+        meets_system: bool = False,
     ) -> None:
         given = as_rows(rows)
         if not given:
@@ -162,7 +159,7 @@ class CollectiveRows(GroupRows):
             self._rates.append(number(row.rate, f"rate of row {k}", of, unit.picosecond))
         return targets
 
-    def _find_what_meets(self, system: openmm.System, asked: bool | None) -> None:
+    def _find_what_meets(self, system: openmm.System, asked: bool) -> None:
         """Which rows touch the same bodies that the constraints of the System make, and whether they touch any."""
         for k, touched in enumerate(self.atoms):
             sites = [atom for atom in touched if system.isVirtualSite(atom)]
@@ -174,14 +171,7 @@ class CollectiveRows(GroupRows):
         self.sited = bool(virtual_sites(system))
         pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
         tied = {atom for pair in pairs for atom in pair}
-        meeting = [k for k, touched in enumerate(self.atoms) if tied.intersection(touched)]
-        if meeting and asked is False:
-            raise InputError(
-                f"row {meeting[0]} ({self.names[meeting[0]]}) touches atoms that the System constrains; leave out "
-                "meets_system=False",
-                item="meets_system",
-            )
-        self.meets_system = bool(meeting or asked)
+        self.meets_system = asked or any(tied.intersection(touched) for touched in self.atoms)
         body = _components(system.getNumParticles(), pairs if self.meets_system else [])
         bodies = [{int(body[atom]) for atom in touched} for touched in self.atoms]
         self._meet = [[bool(a & b) for b in bodies] for a in bodies]
@@ -281,18 +271,11 @@ class CollectiveRows(GroupRows):
         met = np.isin(body[held.pairs[:, 0]], body[[atom for atoms in self.atoms for atom in atoms]])
         return [Distance(held.pairs[met], held.lengths[met])] if met.any() else []
 
-    def apply_positions(self, context: openmm.Context, bonds: ArrayLike | None = None) -> None:
+    def apply_positions(self, context: openmm.Context) -> None:
         """Bring the positions of the context onto the rows and the System's constraints; velocities stay as they are.
 
         Where all rows are distances, angles or dihedrals of particles or distances of centers of mass, other bonds
-        and angles stay as they are, as with `hold` (`Motion.restore_positions`).
-
-        Parameters
-        ----------
-        context : openmm.Context
-        bonds : array_like of int, shape (n, 2), optional
-            The bonds of the molecules; those of the System's forces and constraints unless given. An empty list:
-            the nearest point, whatever becomes of bonds and angles.
+        and angles stay as they are, as with `hold` (`Motion.restore_positions`); with others it is the nearest point.
 
         Raises
         ------
@@ -305,10 +288,8 @@ class CollectiveRows(GroupRows):
             if context.getSystem().getNumConstraints():
                 context.applyConstraints(context.getIntegrator().getConstraintTolerance())
             solver = self.solver_at(context, plain=True)
-            if bonds is None:
-                any_function = any(isinstance(row, Custom) for row in solver.motion.sources[0].constraints)
-                bonds = [] if any_function else bonds_of(context.getSystem(), start)
-            self.restore_by(solver, context, bonds)
+            any_function = any(isinstance(row, Custom) for row in solver.motion.sources[0].constraints)
+            self.restore_by(solver, context, [] if any_function else bonds_of(context.getSystem(), start))
         except KconsError as error:
             context.setPositions(start)
             row = getattr(error, "row", -1)
@@ -331,25 +312,12 @@ class CollectiveRows(GroupRows):
             context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
         super().apply_velocities(context)
 
-    def restore(self, context: openmm.Context, *, bonds: ArrayLike | None = None) -> None:
-        """`apply_positions`, then `apply_velocities`.
-
-        Raises
-        ------
-        ConvergenceError, InfeasibleError, SingularGeometryError
-            As these.
-        CertificateError
-            The rows say that they are not fulfilled afterwards.
-        """
-        self.apply_positions(context, bonds)
+    def restore(self, context: openmm.Context) -> None:
+        """`apply_positions`, then `apply_velocities`; raises what these do."""
+        self.apply_positions(context)
         self.apply_velocities(context)
-        found = self.worst_violation(context)
-        if found is not None:
-            raise CertificateError(
-                f"after restoring, the {found}", row=found.row, residual=abs(found.off), atoms=found.atoms
-            )
 
-    def check(self, context: openmm.Context, velocities: bool = True) -> None:
+    def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows.
 
         Raises
@@ -375,7 +343,7 @@ class CollectiveRows(GroupRows):
         bound = f"collective row {self._named(int(in_space[0]))}" if len(in_space) else None
         held = [(np.array([atoms]), lambda _, k=k: self._named(k)) for k, atoms in enumerate(self.atoms)]
         refuse_agents(system, bound, held, context.getMolecules)
-        found = self.worst_violation(context, velocities)
+        found = self.worst_violation(context)
         if found is not None:
             remedy = "call restore(context)"
             moves = self._rates[found.row] != 0.0

@@ -1,11 +1,12 @@
 """Families of constraints as C: the function `row` of a declaration is run on symbols, which write down what it does.
 
 A row is straight arithmetic with elementary functions, and loops over numbers that are known. The same text is compiled
-as OpenCL C, CUDA, HIP and C++; its numbers are `mixed`.
+as OpenCL C, CUDA, HIP and C++; its numbers are `mixed`. Expressions of OpenMM are made of it as well.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -119,3 +120,32 @@ def c_rate(name: str, second: Callable[..., Any], width: int, parameters: int, s
     head = f"DEVICE mixed {name}({space}const mixed* r, GLOBAL const mixed* p, mixed t)"
     result = rate.text if isinstance(rate, _Symbol) else literal(rate)
     return "".join([head, " {\n", *lines, f" return {result};\n}}\n"])
+
+
+def openmm_expression(row: Callable[..., Any]) -> str:
+    """Definition of ``row_value``, the value of a row over one atom, for a force of OpenMM with parameters row_p0, ...
+
+    Raises
+    ------
+    UnsupportedError
+        The function is no expression.
+    """
+    lines: list[str] = []
+    out: dict[int, Any] = {}
+    _run(row, _Places("r", lines), _Places("p", lines), _Symbol("t", lines), out)
+    found, needed = [f"row_value={out[0].text}"], {out[0].text}
+    for line in reversed(lines):
+        name, text = line.removeprefix(" mixed ").removesuffix(";\n").split(" = ")
+        if name in needed:
+            needed |= set(re.findall(r"\bk\d+", text))
+            found.append(f"{name}=" + re.sub(r"pow\((.*), (.*)\)", r"(\1)^(\2)", text))
+    text = "; ".join(found)
+    for old, new in ((r"\bk(?=\d)", "row_k"), (r"\(mixed\) ", ""), (r"\bfabs\b", "abs"), (r"p\[(\d+)\]", r"row_p\1")):
+        text = re.sub(old, new, text)
+    text = re.sub(r"r\[(\d)\]", lambda place: "xyz"[int(place[1])], text)
+    if wrong := re.search(r"\bt\b|rint|copysign", text):
+        raise UnsupportedError(
+            f"{getattr(row, '__qualname__', row)} has {wrong[0]!r} in it, which expressions of OpenMM do not have; "
+            "leave it to the host (kcons.openmm.hold)"
+        )
+    return text

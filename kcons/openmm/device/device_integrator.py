@@ -6,6 +6,7 @@ import ctypes
 import json
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 from uuid import uuid4
 from xml.etree import ElementTree
@@ -16,12 +17,12 @@ import openmm
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan, room_for
+from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
@@ -34,6 +35,7 @@ from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.states import box_of, positions_of
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, listed
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
@@ -42,15 +44,15 @@ from kcons.thermostats.nose_hoover import chain_fractions
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
 _EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
 _DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
-#: What a solve that failed leaves of a call.
-_FAILED = 1
+#: Places in what the kernel `look` tells: sum of v^2; whether a row failed, in which step, its number, its residual.
+_MOTION, _FAILED, _STEP, _ROW, _RESIDUAL = 0, 2, 3, 4, 5
 
 
 class _Given(ctypes.Structure):
     """What the plugin tells of a Context, as plugin/program_integrator.h has it."""
 
     _fields_ = (
-        *((name, ctypes.c_char_p) for name in ("description", "platform", "precision")),
+        *((name, ctypes.c_char_p) for name in ("description", "platform")),
         *((name, ctypes.c_int) for name in ("groups", "particles", "constraints")),
         ("masses", ctypes.POINTER(ctypes.c_double)),
         ("pairs", ctypes.POINTER(ctypes.c_int)),
@@ -114,11 +116,14 @@ class DeviceProgram(Program):
     ----------
     kept : list of str
         Variables that belong to a state, in the order of the array `memory`.
+    made_under : tuple
+        `conditions` when `remembered` was asked last.
     """
 
     on_device = True
     integrator: DeviceIntegrator
     kept: list[str]
+    made_under: tuple[Any, ...] = ()
 
     def hand_over(self) -> None:
         """Describe the step to the plugin."""
@@ -148,6 +153,7 @@ class DeviceProgram(Program):
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
         memory = {"memory": self.integrator.read("memory")}  # which makes the kernels if there are none yet
+        self.made_under = self.integrator.conditions(self.integrator.context)
         saved = [array.name for array in self.integrator.rows.arrays if array.saved]
         return memory | {name: self.integrator.read(name) for name in saved}
 
@@ -196,7 +202,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _write(self, program: Program) -> Step:
         """A step without parts: kernels hold their rows."""
         step = Step(program, self.scheme, (), self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
@@ -291,21 +297,27 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:
         """The error for a row in a step that the Context is then just before.
 
-        It is at the last check; the steps from there are made again, the same where nothing random acts beside the
-        noise of the kernels. Where they are not, it stays there.
+        It is at the last check. The steps from there are made again if they will be the same: if settings are, and
+        nothing acts on the System that is random. Else it stays there.
         """
-        step, context = int(told[2]), guard.context
-        error: KconsError = self.rows.failure(int(told[3]), told[4], step)
+        step, context = int(told[_STEP]), guard.context
+        error: ConvergenceError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
         again = step - 1 - context.getStepCount()
-        if again > 0 and guard.undisturbed and not guard.moving:
+        if again > 0 and guard.undisturbed and not guard.moving and self.program.made_under == self.conditions(context):
             try:
                 self._advance(context, again)
                 guard.since_check += again
                 guard.leave()
             except openmm.OpenMMException:
                 guard.put_back()
+        if not np.isfinite(told[_RESIDUAL]):
+            return guard.explosion(f"{self.rows.set.row_name(error.row)} is not finite.", step - 1)
         error.args = (f"{error}. The Context is at step {context.getStepCount()}", *error.args[1:])
         return error
+
+    def conditions(self, context: openmm.Context) -> tuple[Any, ...]:
+        """What a run that is made again has to have in common with the first."""
+        return self._dt, self.getConstraintTolerance(), self._described, dict(context.getParameters())
 
     # -- records ---------------------------------------------------------------------------------
 
@@ -322,7 +334,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         Yields
         ------
         x, v, f : ndarray, shape (n, 3)
-            Positions, velocities and applied forces of the particles of `record`, in ascending order.
+            Positions, velocities and applied forces of the particles of `record`, in ascending order; molecules are
+            in one piece, in any cell.
         time : float
         """
         room, n = room_for(len(self._recorded)), len(self._recorded)
@@ -342,12 +355,9 @@ class DeviceIntegrator(ProjectedIntegrator):
                 yield x, v, f, time + (k + 1) * every * self._dt
 
     def _look(self) -> list[float]:
-        told = (ctypes.c_double * 5)()
-        build.library().kcons_look(self._address, told)
+        told = (ctypes.c_double * 7)()
+        build.library().kcons_told(self._address, told)
         return list(told)
-
-    def _execute(self, guard: Guard, steps: int) -> None:
-        raise NotImplementedError
 
     # -- variables, as the CustomIntegrator has them ------------------------------------------------
 
@@ -355,7 +365,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         """A variable of the step, see `listing`."""
         program = self.program
         if name == "motion":
-            return self._look()[0]
+            return self._look()[_MOTION]
         if name == "failed":  # a call that fails raises
             return 0.0
         if name in program.kept and self.bound:
@@ -426,12 +436,10 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
             members = np.ascontiguousarray(atoms, dtype=np.int32)
             library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
         return
-    rows: Any = NoRows()
-    if n or part is not None:
-        positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
-        box = np.array(given.box[:9]).reshape(3, 3)
-        made_of = masses, (pairs, lengths), positions, box if box.any() else None, given.time
-        rows = KernelRows(()).rows_at(*made_of) if part is None else part.rows_at(*made_of)
+    positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
+    box = np.array(given.box[:9]).reshape(3, 3)
+    held = KernelRows(()) if part is None else part
+    rows = held.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
     platform = given.platform.decode()
@@ -454,6 +462,13 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
 
 
+class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):
+    """`SurfaceIntegrator` whose steps are kernels of a plugin."""
+
+    def _surface_parts(self, surfaces: Any, system: openmm.System | None, positions: Any) -> Sequence[Any]:
+        return listed(surfaces, positions, 2**31 if positions is None else len(positions))
+
+
 def choose(
     device: bool | None,
     timestep: Any,
@@ -461,9 +476,10 @@ def choose(
     *,
     parts: Sequence[Any] = (),
     ensemble: Ensemble | None = None,
+    classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
 ) -> tuple[type[ProjectedIntegrator], str]:
-    """The class of an integrator that may run on the device, see `ProjectedIntegrator`, and why it is not this one.
+    """The class of an integrator that may run on the device, of two, and why it is the first.
 
     Raises
     ------
@@ -476,12 +492,13 @@ def choose(
     if not why:
         try:
             build.library()
-            return DeviceIntegrator, ""
+            return classes[1], ""
         except UnsupportedError as error:
             why = str(error)
     if device:
         raise UnsupportedError(f"no steps on the device: {why}; leave out device=True for a CustomIntegrator")
-    return ProjectedIntegrator, why
+    return classes[0], why
 
 
 ProjectedIntegrator._on_device = staticmethod(choose)
+SurfaceIntegrator._on_device = staticmethod(partial(choose, classes=(SurfaceIntegrator, DeviceSurfaceIntegrator)))

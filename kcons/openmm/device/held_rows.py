@@ -19,7 +19,7 @@ from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-from kcons.openmm.device.c_writer import c_function, c_rate
+from kcons.openmm.device.c_writer import c_function, c_rate, openmm_expression
 
 #: Rows, atoms of a cluster and atoms of a row up to which a work-item has the cluster in registers.
 ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
@@ -90,18 +90,22 @@ class Function(NamedTuple):
     numbers: tuple[int, int] = (0, 0)
     is_distance: bool = False
 
+    def _formula(self, r: Any, p: Any, t: Any, out: Any) -> None:
+        places, parameters = self.numbers
+        given = [*(r[k] for k in range(places)), t, *(p[k] for k in range(parameters))]
+        out.update(enumerate(self.row(*given)))
+
     def text(self, name: str, space: str = "") -> str:
         """Its C function; with the time in it, also ``NAME_rate``."""
         places, parameters = self.numbers
-
-        def formula(r: Any, p: Any, t: Any, out: Any) -> None:
-            given = [*(r[k] for k in range(places)), t, *(p[k] for k in range(parameters))]
-            out.update(enumerate(self.row(*given)))
-
-        text = c_function(name, formula if places else self.row, space, self.known)
+        text = c_function(name, self._formula if places else self.row, space, self.known)
         if self.second is not None:
             text += c_rate(f"{name}_rate", self.second, places // 3, parameters, space)
         return text
+
+    def expression(self) -> str:
+        """Its value for a force of OpenMM, see `openmm_expression`."""
+        return openmm_expression(self._formula if self.numbers[0] else self.row)
 
 
 @cache

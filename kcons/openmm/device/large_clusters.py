@@ -1,13 +1,14 @@
 """Large clusters: tables for a work-group, with an order of elimination by levels (see `clusters.c`).
 
-Rows are ordered by nested dissection: rows that cross a cut of the molecule come after those on its sides, which share no
-entry. In each level are rows whose earlier ones are all eliminated.
+Rows are ordered by nested dissection: rows that cross a cut of the molecule come after those on its sides, which share
+no entry. In each level are rows whose earlier ones are all eliminated.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -115,7 +116,7 @@ def _tree(atoms: Sequence[Sequence[int]], users: dict[int, list[int]], root: int
                 seen.add(k)
                 at = atoms[k].index(a)
                 for way in (atoms[k][at:], atoms[k][at::-1]):
-                    for before, b in zip(way, way[1:], strict=False):
+                    for before, b in pairwise(way):
                         if b not in above:
                             above[b] = before
                             line.append(b)
@@ -155,9 +156,8 @@ def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, IntArray]:
     product = np.concatenate([_pairs(some) for some in np.split(touch, np.flatnonzero(np.diff(slots[touch, 0])) + 1)])
     product = product[np.argsort(slots[product, 1] @ [count, 1], kind="stable")]
     of = np.concatenate([_pairs(later) for later in order.later]) @ [count, 1]
-    update = np.concatenate(
-        [np.insert(_pairs(np.arange(n - 1) + b + 1), 2, m, axis=1) for m, (n, b) in enumerate(zip(lengths, diagonal))]
-    )[np.argsort(of, kind="stable")]
+    both = np.concatenate([_pairs(np.arange(b + 1, b + n)) for b, n in zip(diagonal, lengths, strict=True)])
+    update = np.column_stack([both, entry[both[:, 0], 0]])[np.argsort(of, kind="stable")]
     aside = np.flatnonzero(entry[:, 0] < entry[:, 1])
     earlier = aside[np.argsort(entry[aside, 1], kind="stable")]
     # In clusters where rows may depend on others any pivot may vanish: not all of them are marked in large ones.

@@ -252,10 +252,10 @@ class Guard:
             self._put_right(x)
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
-                if not self.started:
-                    part.check(context)
-                elif not part.steered:  # a context parameter moves rows, and the next drift follows
+                if self.started:
                     self._refuse(part.worst_violation(context))
+                else:
+                    part.check(context)
             if not self.started:
                 warn_of_barostat(context, getattr(integrator.ensemble, "temperature", None), stacklevel=5)
                 integrator.ensemble.begin(integrator, context)
@@ -278,14 +278,13 @@ class Guard:
                 item="positions",
                 atoms=self.rows.pairs[row],
             )
-        asked = [part for part in integrator.parts if not (self.started and part.steered)]
-        misses = _misses(asked, context)
+        misses = _misses(integrator.parts, context)
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
         if not near and not np.any(miss > self.limit(x)):
             return
         if not near:
             self.hold_positions(integrator.getConstraintTolerance())
-            near = not misses and bool(_misses(asked, context))  # pulled off by the constraints of the System
+            near = not misses and bool(_misses(integrator.parts, context))  # the System pulled them off
         if near:
             integrator.applyConstraints(context)
         now = positions_of(context)

@@ -161,11 +161,6 @@ class Part(ABC):
         """Whether rows demand velocities that are not 0."""
         return False
 
-    @property
-    def steered(self) -> bool:
-        """Whether context parameters move targets; positions need not be on the rows after one has changed."""
-        return False
-
     # -- the program ----------------------------------------------------------------------------
 
     @abstractmethod

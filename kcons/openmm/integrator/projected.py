@@ -15,7 +15,7 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
-from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
+from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
@@ -133,7 +133,7 @@ class ProjectedIntegrator(Integrator):
     def __new__(cls, *args: Any, device: bool | None = None, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
         kind, why = cls, ""
-        if cls is ProjectedIntegrator and device is not False:
+        if "_on_device" in vars(cls) and device is not False:
             kind, why = cls._on_device(device, *args, **kwargs)
         made = object.__new__(kind)
         made._refused = why
@@ -187,13 +187,10 @@ class ProjectedIntegrator(Integrator):
         for k, part in enumerate(self.parts, start=1):
             part.begin_program(k)
         step = Step(program, self.scheme, self.parts, self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
-
-    #: A kind of step of its own, see `write_step`.
-    _own_step: Callable[[Step], bool] | None = None
 
     def __repr__(self) -> str:
         held = "".join(f", {part!r}" for part in self.parts)
@@ -229,17 +226,12 @@ class ProjectedIntegrator(Integrator):
             There is none.
         """
         context = None if self._guard is None else self._guard.alive
-        if context is None and (context := find_context(self._holder)) is None:
+        if context is None and (context := find_context(self)) is None:
             raise UnsupportedError(
                 "this integrator belongs to no Context: create one with it first. Where it has one that is not found, "
                 "as a member of a CompoundIntegrator, call integrator.attach(context)"
             )
         return context
-
-    @property
-    def _holder(self) -> openmm.Integrator:
-        """The integrator that the Context has."""
-        return self
 
     def attach(self, context: openmm.Context) -> None:
         """Look at this Context, and at its System anew; done by itself but for members of a CompoundIntegrator.
@@ -253,7 +245,7 @@ class ProjectedIntegrator(Integrator):
         owner = context.getIntegrator()
         compound = isinstance(owner, openmm.CompoundIntegrator)
         members = [owner.getIntegrator(k) for k in range(owner.getNumIntegrators())] if compound else []
-        if owner is not self._holder and all(int(member.this) != int(self.this) for member in members):
+        if owner is not self and all(int(member.this) != int(self.this) for member in members):
             raise InputError(
                 f"the Context was made with another integrator than {self!r}; give the Context of this one",
                 item="context",
@@ -377,7 +369,9 @@ class ProjectedIntegrator(Integrator):
                 return
             guard.since_check += done
             failure = self._failure(code, first + done + 1)
-            if "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
+            if isinstance(failure, NonFiniteError) and not np.isfinite(motion_of(context)).all():
+                guard.put_back()  # a force is seen in the step after the one whose velocities it has spoilt
+            elif "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
                 self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             guard.leave()
@@ -709,7 +703,7 @@ class ProjectedIntegrator(Integrator):
         UnsupportedError
             The Context exists; it has read the groups and would ignore the change.
         """
-        if self._guard is not None or find_context(self._holder) is not None:
+        if self._guard is not None or find_context(self) is not None:
             raise UnsupportedError("the Context has read the force groups already; set them before it is created")
         if isinstance(groups, int | np.integer):
             wanted = {g for g in range(32) if (int(groups) >> g) & 1}
@@ -747,7 +741,7 @@ class ProjectedIntegrator(Integrator):
             The file has another program.
         """
         device = 'type="KconsProgram"' in xml
-        if device and cls is ProjectedIntegrator:
+        if device and "_on_device" in vars(cls):
             cls = cls._on_device(True, 0.0, scheme, **arguments)[0]  # loads what the file is read by
         plain = openmm.XmlSerializer.deserialize(xml)
         given = {"tolerance": plain.getConstraintTolerance(), "device": False, **arguments}

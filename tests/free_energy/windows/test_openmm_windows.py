@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 
 import numpy as np
 import openmm
@@ -12,7 +13,8 @@ from openmm_systems import DATA
 
 from kcons.constraints import Angle, Dihedral, Distance, DistanceDifference, Formula
 from kcons.errors import InputError, SingularGeometryError, UnsupportedError
-from kcons.free_energy import OpenMMWindows, Series, Settings, Window
+from kcons.free_energy import OpenMMWindows, Series, Settings, Window, mean_force
+from kcons.openmm.device import build
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
 PHI, PSI = Dihedral([[4, 6, 8, 14]]), Dihedral([[6, 8, 14, 16]])
@@ -40,6 +42,26 @@ def test_two_torsions_far_from_the_structure(tmp_path):
     assert np.abs(series.multiplier).max() > 1
     assert np.isfinite(series.turned).all() and series.turned.std() < series.multiplier.std() / 2
     assert series.seconds > 0
+
+
+@pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
+def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
+    """A hundred steps, the states recorded on the device: multipliers, weights and what belongs to them."""
+    steps = {"relax": 0, "pull": 16, "equilibration": 20, "production": 64, "every": 2}
+    settings = Settings(timestep=1.0, friction=1e-30, **steps)  # noise of 1e-14: each has its own
+    found = []
+    for why in ("", "there is no compiler"):
+        monkeypatch.setattr(build, "reluctance", lambda why=why: why)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # few samples
+            window = Window(0, "up", (3.0, 3.1), (3.05, 3.1), 7)
+            sampler({"phi": PHI, "psi": PSI}).sample(window, settings, tmp_path / "window.npz")
+        found.append(Series.load(tmp_path / "window.npz"))
+    for name in ("value", "multiplier", "kinetic", "log_det_z", "gradient", "turned", "mean_kinetic", "time"):
+        one, other = (getattr(series, name) for series in found)
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max(), err_msg=name)
+    forces = [mean_force(series, 2.494).force for series in found]
+    np.testing.assert_allclose(forces[0], forces[1], rtol=1e-9)
 
 
 def test_a_torsion_over_atoms_that_are_not_bonded():

@@ -367,7 +367,6 @@ def _owned():
         (lambda s: [bond(0, 1)], {"positions": None}, "positions"),
         (lambda s: [bond(0, 1)], {"positions": X[:3]}, "shape"),
         (lambda s: [bond(0, 1)], {"positions": np.full((5, 3), math.nan)}, "row 0 is nan"),
-        (lambda s: [bond(1, 3)], {"meets_system": False}, "meets_system"),
         (lambda s: [Row(bond(0, 3), 0.3)], {"tolerance": "x"}, "tolerance"),
         (lambda s: [Row(bond(0, 3), 0.3)], {"tolerance": 0.0}, "tolerance"),
     ],

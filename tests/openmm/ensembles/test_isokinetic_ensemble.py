@@ -113,6 +113,7 @@ def waters():
     return system, x, v - masses_of(system) @ v / masses_of(system).sum()
 
 
+@pytest.mark.usefixtures("without_device")
 def test_rigid_bodies_take_two_sums_and_make_the_same_motion():
     """Drifts keep the 2K of rigid bodies: what a sum would find is known before."""
     integrator = in_calls_of_any_length(lambda: Isokinetic(300.0), waters)
@@ -122,6 +123,7 @@ def test_rigid_bodies_take_two_sums_and_make_the_same_motion():
     )
 
 
+@pytest.mark.usefixtures("without_device")
 def test_half_a_kick_is_not_owed_after_a_failure():
     """A NaN within a call: the state of the last check, and the next step begins there with half a kick."""
     system, x, v = alanine()
@@ -230,6 +232,7 @@ def test_of_velocities_set_between_calls_only_the_direction_counts(platform):
 
 
 @pytest.mark.parametrize("remover", [False, True])
+@pytest.mark.usefixtures("without_device")
 def test_a_run_does_not_go_on_from_rest(remover):
     """There is no direction to scale: the Context goes back to where it was checked last."""
     system, x, v = dumbbell()
@@ -262,6 +265,7 @@ def unlike(dt):
     return np.abs(ends[1] - ends[0]).max(), off
 
 
+@pytest.mark.usefixtures("without_device")
 def test_two_sums_do_where_velocities_are_not_read():
     """What drifts change of K, of third order here, does not add up, and moves nothing in second order."""
     coarse, off = unlike(2e-3)

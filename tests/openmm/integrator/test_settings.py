@@ -17,7 +17,6 @@ from tied_cluster import (
     KINDS,
     MASSES,
     X,
-    begun,
     bond,
     carried_at,
     cluster,
@@ -38,9 +37,7 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.quantities import GAS_CONSTANT
-from kcons.steppers import Geodesic
 from kcons.steppers.splitting import Splitting
 
 #: The trap of `cluster` is round.
@@ -52,15 +49,16 @@ PAIRS = {
     for held, make in (("sphere", on_a_sphere), ("collective", row_at), ("carried", carried_at))
     for name, chosen in {
         "Isokinetic": {"ensemble": Isokinetic(300)},
-        "isokinetic4": {"ensemble": Isokinetic(300), "scheme": "isokinetic4"},
         "NoseHooverMiddle": {"ensemble": NoseHooverMiddle(300, 5.0)},
-        "blanes-moan4": {"scheme": "blanes-moan4"},
+        "suzuki4": {"scheme": "suzuki4"},
     }.items()
+    if (held, name) != ("collective", "suzuki4")  # whose program takes OpenMM ten seconds
 }
 
 
-@pytest.mark.parametrize("kind", KINDS | PAIRS)
-@pytest.mark.parametrize("way", ["State", "checkpoint"])
+@pytest.mark.parametrize(
+    ("kind", "way"), [*((kind, "State") for kind in KINDS), *((kind, "checkpoint") for kind in KINDS | PAIRS)]
+)
 def test_a_run_goes_on_bit_for_bit(kind, way):
     """In another Context with an integrator of the same settings, and again in its own; noise aside."""
     if "Langevin" in kind and way != "checkpoint":
@@ -192,7 +190,6 @@ def test_set_target_outlives_a_state():
     assert copy.copy(made.integrator).program.settings == made.integrator.program.settings
 
 
-@pytest.mark.usefixtures("without_device")
 def test_a_setting_has_a_method_of_its_own():
     """Written by its number, as programs do that copy all variables, it has its value again in the next step."""
     made = thermostatted(Langevin(300, 1.0))()
@@ -206,27 +203,7 @@ def test_a_setting_has_a_method_of_its_own():
     assert integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.usefixtures("without_device")
-def test_variables_of_a_copy_leave_a_run_as_it_is(kind):
-    ran, fresh = KINDS[kind](), KINDS[kind]()
-    for one in (ran, fresh) if "Langevin" in kind else ():
-        one.integrator.setFriction(0)
-    ran.run(5)
-    given = copy.deepcopy(ran.integrator)
-    for k in range(given.getNumGlobalVariables()):
-        ran.integrator.setGlobalVariable(k, given.getGlobalVariable(k))
-    fresh.run(5)
-    ran.run(5)
-    fresh.run(5)
-    np.testing.assert_allclose(state_of(ran.context), state_of(fresh.context), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("make", "more"),
-    # A particle on a sphere is damped least.
-    [(row_at, 5000), (carried_at, 5000), (on_a_sphere, 16000), (lambda **given: thermostatted(**given)(), 5000)],
-)
+@pytest.mark.parametrize(("make", "more"), [(row_at, 5000), (lambda **given: thermostatted(**given)(), 5000)])
 def test_zero_kelvin_brings_to_rest(make, more):
     """Friction without noise: all energy goes, the certificate holds with velocities of rounding alone."""
     made = make(ensemble=Langevin(0, 6.0))  # as the field damps fastest
@@ -378,9 +355,8 @@ def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(how):
     np.testing.assert_allclose(state_of(contexts[1]), state_of(made.context), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("scheme", [*SCHEMES, Geodesic(3), Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
 @pytest.mark.parametrize("parts", [False, True])
-@pytest.mark.usefixtures("without_device")
 def test_xml_has_the_bare_program(scheme, parts):
     """What reads it makes the same steps; `from_xml` takes what no file contains."""
     system, x, v = loose_alanine()
@@ -414,7 +390,7 @@ def test_xml_has_the_bare_program(scheme, parts):
     np.testing.assert_allclose(state_of(contexts[0]), state_of(contexts[2]), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [name for name in KINDS if "carried" not in name])
+@pytest.mark.parametrize("kind", ["constant energy", "Isokinetic", "Langevin", "sphere", "collective"])
 def test_the_bare_program_makes_the_same_steps(kind):
     """Of an integrator that has run, with all that it was made with, and without Python."""
     made, again = KINDS[kind](), KINDS[kind]()
@@ -431,7 +407,6 @@ def test_the_bare_program_makes_the_same_steps(kind):
     np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=1e-9)
 
 
-@pytest.mark.usefixtures("without_device")
 def test_files_of_something_else_are_refused():
     for other in (openmm.VerletIntegrator(1e-3), openmm.CustomIntegrator(1e-3)):
         with pytest.raises(InputError, match="another program"):
@@ -443,14 +418,3 @@ def test_files_of_something_else_are_refused():
     others = CollectiveRows(cluster(), [Row(bond(), 0.35)])
     again = ProjectedIntegrator.from_xml(text, parts=[others], ensemble=None)
     assert again.getGlobalVariableByName("target1_0") == 0.35
-
-
-def test_a_checkpoint_of_the_same_program_begins_with_its_settings():
-    made, other = (
-        begun(cluster(bonded=True), ProjectedIntegrator(0.002)),
-        begun(cluster(bonded=True), ProjectedIntegrator(1e-3)),
-    )
-    made.run(5)
-    other.context.loadCheckpoint(made.context.createCheckpoint())
-    other.run(5)
-    assert other.context.getTime()._value == pytest.approx(0.015)
