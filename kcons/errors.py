@@ -259,6 +259,8 @@ EXTRAS = {
     "tblite": "xtb",
     "sympy": "formulas",
     "pymbar": "free-energy",
+    "torch": "torch",
+    "torch_sim": "torchsim",
 }
 
 
