@@ -1,12 +1,11 @@
 """TorchSim: constraints on batches of systems, for machine-learned potentials.
 
-`hold` puts what is to be held on a `SimState`; `nve`, `langevin` and `nose_hoover` are pairs of functions for
-`torch_sim.integrate`, in place of its own, which tell constraints the positions but not the momenta. TorchSim's optimizers,
-splitting, joining, autobatching, reporters and trajectories work as they are. Units are TorchSim's.
+`hold` puts what is to be held on a `SimState`. `nve`, `langevin` and `nose_hoover` are integrators for
+`torch_sim.integrate`, in place of its own, which tell constraints the positions but not the momenta. Optimizers,
+slices, joins, autobatching, reporters and trajectories of TorchSim work as they are. Units are TorchSim's.
 
-- `topology`: constraints by name for each system of a state
-- `constraints_object`: the object on the state that TorchSim calls
-- `holding`: putting it there, and a report
+- `constraints_object`: the object on a state that TorchSim calls
+- `holding`: what is held by name, and a report
 - `dynamics`: constant energy, Langevin dynamics, Nosé-Hoover chains
 """
 

@@ -12,174 +12,142 @@ from torch_sim.constraints import Constraint, SystemConstraint
 from torch_sim.integrators import MDState
 
 from kcons.batched import Batch
+from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.torchsim.topology import array_of, starts_of
 
 __all__ = ["Constraints"]
 
 #: How far masses and cells may be from those that rows were made for, relative: what single precision leaves.
 SAME = 1e-5
 _OWN = (
-    "give torch_sim.integrate one of kcons: integrator=kcons.torchsim.nve, langevin or nose_hoover (TorchSim's own move "
-    "positions onto constraints without telling momenta, which cools the system; at constant pressure there is none)"
+    "this integrator does not keep momenta on constraints: TorchSim's own correct positions and do not tell momenta, "
+    "which cools the system. Give torch_sim.integrate one of kcons, integrator=kcons.torchsim.nve, langevin or "
+    "nose_hoover; at constant pressure there is none"
 )
-_CELL = "cells are not relaxed with held rows in TorchSim; relax positions alone, or the cell in ASE with kcons.ase.constrain"
+_CELL = "cells are not relaxed with held rows; relax positions alone, or the cell in ASE with kcons.ase.constrain"
 
 
 class Constraints(SystemConstraint):
-    """Everything that is held on a state: for each system an engine.
+    """Everything that is held on a state, made by `kcons.torchsim.hold`: an engine for each system that has rows.
 
-    One object for all systems of a state, made by `kcons.torchsim.hold`. TorchSim takes it along where states are sliced,
-    split, joined and moved to a device. Its optimizers step along forces, so that for them positions and forces are
-    projected with equal weights of all atoms; momenta with the masses.
+    TorchSim takes it along where states are sliced, split, joined and moved. Its optimizers step along forces, so that
+    for them positions and forces are projected with equal weights of all atoms. Its integrators are refused.
 
     Parameters
     ----------
     motions : sequence of Motion
-        Engines of the systems; equal ones may be one object.
+        Engines; equal systems may share one.
     system_idx : torch.Tensor of int, shape (len(motions),)
-        The systems that are held.
+        The systems that they belong to.
     """
 
     def __init__(self, motions: Sequence[Motion], system_idx: torch.Tensor) -> None:
         super().__init__(system_idx)
         self.motions = tuple(motions)
-        self._made: tuple[Any, ...] | None = None
+        self._made: tuple[torch.Tensor, Batch, torch.Tensor | None] | None = None
 
     # -- the engine -----------------------------------------------------------------------------
 
     def batch(self, state: SimState) -> tuple[Batch, torch.Tensor | None]:
-        """The engine for the state's device and precision, and its atoms; None if these are all.
+        """The engine for all systems of a state, and its atoms, None if these are all.
 
         Raises
         ------
         InputError
             The state has other atoms, masses or cells than the rows were made for.
         """
-        # TorchSim gives the attribute system_idx another value where it reorders systems.
-        key = (state.device, state.dtype, self.system_idx)
-        made = self._made
-        if made is None or made[0][:2] != key[:2] or made[0][2] is not key[2]:
+        # TorchSim sets another system_idx where it reorders systems.
+        if self._made is None or self._made[0] is not self.system_idx or self._made[1].dtype != state.dtype:
             self.check_fits(state)
-            order = torch.argsort(self.system_idx)
-            motions = [self.motions[k] for k in order.tolist()]
+            motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
             batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=1)
-            whole = len(motions) == state.n_systems
-            atoms = None if whole else torch.isin(state.system_idx, self.system_idx).nonzero().ravel()
-            made = self._made = (key, batch, atoms)
-        return made[1], made[2]
+            part = torch.isin(state.system_idx, self.system_idx)
+            self._made = self.system_idx, batch, None if bool(part.all()) else part.nonzero().ravel()
+        return self._made[1:]
 
     def check_fits(self, state: SimState) -> None:
         """Refuse a state with other atoms, masses or cells than the rows were made for."""
-        starts, masses = starts_of(state), array_of(state.masses)
-        cells, periodic = array_of(state.row_vector_cell), bool(state.pbc.any())
+        starts, masses, cells = starts_of(state), array_of(state.masses), array_of(state.row_vector_cell)
         for motion, k in zip(self.motions, self.system_idx.tolist(), strict=True):
+            part, lattice = masses[starts[k] : starts[k + 1]], motion.lattice
             wrong = ""
-            part = masses[starts[k] : starts[k + 1]]
-            lattice = motion.lattice
-            if len(part) != motion.n_atoms:
-                wrong = f"{len(part)} atoms, and its rows were made for {motion.n_atoms}"
-            elif not np.allclose(part, motion.masses, rtol=SAME, atol=0.0):
-                atom = int(np.argmax(np.abs(part - motion.masses)))
-                wrong = f"another mass of atom {atom} ({part[atom]:.6g}) than its rows were made for"
-            elif periodic != (lattice is not None):
-                wrong = "other periodic directions than its rows were made for"
-            elif lattice is not None and not np.allclose(
-                cells[k], lattice[0], rtol=SAME, atol=SAME * np.ptp(lattice[0])
-            ):
-                wrong = "another cell than its rows were made for"
+            if part.shape != motion.masses.shape or not np.allclose(part, motion.masses, rtol=SAME, atol=0.0):
+                wrong = "atoms or masses"
+            elif lattice is not None and np.abs(cells[k] - lattice[0]).max() > SAME * np.abs(lattice[0]).max():
+                wrong = "a cell"
             if wrong:
                 raise InputError(
-                    f"system {k} has {wrong}; set state.constraints = [] and call kcons.torchsim.hold again",
+                    f"system {k} has {wrong} its rows were not made for; set state.constraints = [] and hold again",
                     item="state",
                 )
 
     def move(self, state: SimState, new: torch.Tensor, masses: torch.Tensor | None = None) -> tuple[Any, Any]:
-        """Positions `new` of all atoms on the constraints, along the gradients at ``state.positions``, and the correction.
-
-        With the state's masses, or others. The correction comes from the multipliers and not from rounded positions.
+        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction.
 
         Raises
         ------
         ConvergenceError
-            A system and a row that find no solution, named.
+            There is no solution near enough; system and row are named.
         """
         batch, atoms = self.batch(state)
-        old = state.positions
         if atoms is None:
-            solved = batch.solve_positions(new, old, masses=masses)
+            solved = batch.solve_positions(new, state.positions, masses=masses)
             return solved.positions, solved.push
         masses = None if masses is None else masses[atoms]
-        solved = batch.solve_positions(new[atoms], old[atoms], masses=masses)
+        solved = batch.solve_positions(new[atoms], state.positions[atoms], masses=masses)
         push = torch.zeros_like(new).index_copy(0, atoms, solved.push)
         return new.index_copy(0, atoms, solved.positions), push
 
-    def tangent(
-        self, state: SimState, vectors: torch.Tensor, at: torch.Tensor | None = None, masses: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """The part of velocities (of forces, with equal masses) that stays on the constraints, `at` the state's positions."""
+    def tangent(self, state: SimState, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> torch.Tensor:
+        """The part of velocities (of forces, with equal masses) that stays on the constraints."""
         batch, atoms = self.batch(state)
-        x = state.positions if at is None else at
         if atoms is None:
-            return batch.project_velocities(x, vectors, masses=masses)
+            return batch.project_velocities(state.positions, vectors, masses=masses)
         masses = None if masses is None else masses[atoms]
-        part = batch.project_velocities(x[atoms], vectors[atoms], masses=masses)
+        part = batch.project_velocities(state.positions[atoms], vectors[atoms], masses=masses)
         return vectors.index_copy(0, atoms, part)
 
     # -- what TorchSim calls --------------------------------------------------------------------
 
     def get_removed_dof(self, state: SimState) -> torch.Tensor:
-        """The rank of the rows of each system, which may be less than their number, shape (n_systems,)."""
+        """The rank of the rows of each system, which may be less than their number."""
         ranks = torch.tensor([motion.rank for motion in self.motions], device=state.device)
         return torch.zeros(state.n_systems, dtype=torch.long, device=state.device).index_add(0, self.system_idx, ranks)
 
     def adjust_positions(self, state: SimState, new_positions: torch.Tensor) -> None:
-        """Bring positions that an optimizer asks for onto the constraints, in place.
-
-        Raises
-        ------
-        UnsupportedError
-            Called by an integrator of TorchSim.
-        """
+        """Bring positions that an optimizer asks for onto the constraints, in place."""
         if isinstance(state, MDState):
-            raise UnsupportedError(f"this integrator does not keep momenta on constraints: {_OWN}")
+            self.adjust_momenta(state, state.momenta)
         new_positions.copy_(self.move(state, new_positions, torch.ones_like(state.masses))[0])
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
-        """Remove the part of momenta that leaves the constraints, in place."""
-        masses = state.masses[:, None]
-        momenta.copy_(masses * self.tangent(state, momenta / masses))
+        """Refuse integrators of TorchSim, before they move positions."""
+        raise UnsupportedError(_OWN)
 
     def adjust_forces(self, state: SimState, forces: torch.Tensor) -> None:
         """Remove the part of forces that leaves the constraints, in place: what is left vanishes at a minimum."""
-        forces.copy_(self.tangent(state, forces, masses=torch.ones_like(state.masses)))
+        forces.copy_(self.tangent(state, forces, torch.ones_like(state.masses)))
 
     def adjust_stress(self, state: SimState, stress: torch.Tensor) -> None:
-        """Refuse: the stress of held rows is not known to cell filters."""
-        raise UnsupportedError(_CELL)
-
-    def adjust_cell(self, state: SimState, cell: torch.Tensor) -> None:
-        """Refuse: rows belong to the cell that they were made in."""
+        """Refuse cell filters, which do not know the stress of held rows."""
         raise UnsupportedError(_CELL)
 
     # -- slices, joins, copies ------------------------------------------------------------------
 
     def select_constraint(self, atom_mask: torch.Tensor, system_mask: torch.Tensor) -> Constraints | None:
-        """What is held of the systems that stay, renumbered in ascending order; TorchSim then reorders."""
-        kept = system_mask[self.system_idx]
-        if not bool(kept.any()):
-            return None
+        """What is held of the systems that stay, numbered in ascending order; TorchSim then reorders."""
+        kept = system_mask[self.system_idx].nonzero().ravel()
         number = torch.cumsum(system_mask, 0) - 1
-        motions = [motion for motion, stays in zip(self.motions, kept.tolist(), strict=True) if stays]
-        return Constraints(motions, number[self.system_idx[kept]])
+        return self._part(kept, number[self.system_idx[kept]])
 
     def select_sub_constraint(self, atom_idx: torch.Tensor, sys_idx: int) -> Constraints | None:
-        """What is held of one system, alone."""
-        place = (self.system_idx == sys_idx).nonzero().ravel()
-        if not len(place):
-            return None
-        return Constraints([self.motions[int(place[0])]], torch.zeros_like(place))
+        """What is held of one system."""
+        kept = (self.system_idx == sys_idx).nonzero().ravel()
+        return self._part(kept, torch.zeros_like(kept))
+
+    def _part(self, kept: torch.Tensor, numbers: torch.Tensor) -> Constraints | None:
+        return Constraints([self.motions[k] for k in kept.tolist()], numbers) if len(kept) else None
 
     def reindex(self, atom_offset: int, system_offset: int) -> Constraints:
         """The same where systems are numbered from `system_offset`."""
@@ -211,20 +179,27 @@ def constraints_of(state: SimState) -> Constraints:
     Raises
     ------
     InputError
-        There is none, or more than one.
+        There is none.
     UnsupportedError
-        Another constraint is beside it, which would undo its work.
+        Another constraint is beside it.
     """
-    found = [item for item in state.constraints if isinstance(item, Constraints)]
-    if len(found) != 1:
-        what = "nothing is" if not found else f"{len(found)} objects of kcons are"
-        raise InputError(
-            f"{what} on this state; call kcons.torchsim.hold(state, ...) once, with all that is held", item="state"
-        )
+    own = next((item for item in state.constraints if isinstance(item, Constraints)), None)
+    if own is None:
+        raise InputError("nothing is held on this state; call kcons.torchsim.hold(state, ...) before", item="state")
     for item in state.constraints:
-        if item is not found[0]:
+        if item is not own:
             raise UnsupportedError(
-                f"{type(item).__name__} of TorchSim is beside the constraints of kcons, and each would undo the work of "
-                "the other; leave it out (hold takes FixAtoms over where it is on the state before)"
+                f"{type(item).__name__} is beside the constraints of kcons, and each would undo the work of the other; "
+                "leave it out"
             )
-    return found[0]
+    return own
+
+
+def starts_of(state: SimState) -> IntArray:
+    """The first atom of each system, and the number of all atoms, shape (n_systems + 1,)."""
+    return np.concatenate([[0], np.cumsum(state.n_atoms_per_system.cpu().numpy())]).astype(np.int64)
+
+
+def array_of(values: torch.Tensor) -> Any:
+    """A contiguous copy in double precision."""
+    return values.detach().to("cpu", torch.float64, copy=True).contiguous().numpy()

@@ -1,6 +1,6 @@
 """Dynamics on constraints for `torch_sim.integrate`: constant energy, Langevin dynamics, Nosé-Hoover chains.
 
-Each is a pair (init, step) with the arguments and units of TorchSim's own. A step that fails leaves the state as it was.
+Each is a pair (init, step) with the arguments and units of TorchSim's own. A failed step leaves the state as it was.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class NoseHooverState(MDState):
 
 
 def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MDState:
-    """A state with forces, on the constraints, its momenta projected, or drawn anew if there are none."""
+    """A state with forces, on the constraints, its momenta projected, or drawn if it has none."""
     held = constraints_of(state)
     held.check_fits(state)
     start = copy.copy(state)
@@ -93,25 +93,22 @@ def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MD
     masses = state.masses[:, None]
     given = getattr(state, "momenta", None)
     if given is None:
-        noise = torch.randn(start.positions.shape, device=state.device, dtype=state.dtype, generator=start.rng)
-        velocities = torch.sqrt(_per_atom(state, kT) / masses) * noise
-    else:
-        velocities = given / masses
-    velocities = held.tangent(start, velocities)
-    if given is None and at_rest:
-        # The rows of these systems know no place in space, so that this leaves velocities on the constraints.
-        per_system = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
-        per_system.index_add_(0, state.system_idx, masses * torch.cat([velocities, torch.ones_like(masses)], dim=1))
-        drift = per_system[:, :3] / per_system[:, 3:] * _free(state)[:, None]
-        velocities = velocities - drift[state.system_idx]
+        given = torch.randn(start.positions.shape, device=state.device, dtype=state.dtype, generator=start.rng)
+        given = torch.sqrt(_each(state, kT, atoms=True) * masses) * given
+        if at_rest:
+            # Rows of systems that are free to move know no place in space: this leaves velocities on them.
+            sums = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
+            sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
+            given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
+    momenta = masses * held.tangent(start, given / masses)
     output = model(start)
-    made = MDState.from_state(start, momenta=masses * velocities, energy=output["energy"], forces=output["forces"])
+    made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
     made.store_model_extras(output)
     return made
 
 
 def _free(state: SimState) -> torch.Tensor:
-    """1 for systems whose center of mass no row and no fixed atom keeps from moving, else 0; shape (n_systems,)."""
+    """1 for systems whose rows know no place in space, else 0; shape (n_systems,)."""
     free = torch.ones(state.n_systems, dtype=torch.long, device=state.device)
     held = constraints_of(state)
     for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
@@ -119,10 +116,10 @@ def _free(state: SimState) -> torch.Tensor:
     return free
 
 
-def _per_atom(state: SimState, value: Any) -> torch.Tensor:
-    """A number, or one for each system, as a column for all atoms."""
-    numbers = torch.as_tensor(value, device=state.device, dtype=state.dtype)
-    return numbers[state.system_idx, None] if numbers.ndim else numbers
+def _each(state: SimState, value: Any, atoms: bool = False) -> torch.Tensor:
+    """A number or one for each system, shape (n_systems,), or as a column for all atoms."""
+    numbers = torch.as_tensor(value, device=state.device, dtype=state.dtype).expand(state.n_systems)
+    return numbers[state.system_idx, None] if atoms else numbers.clone()
 
 
 # -- parts of a step ------------------------------------------------------------------------------
@@ -144,8 +141,8 @@ def _whole(step: Callable[..., State]) -> Callable[..., State]:
             if isinstance(error, ConvergenceError) and len(bad):
                 atom, system = int(bad[0]), int(state.system_idx[bad[0]])
                 raise NonFiniteError(
-                    f"force of atom {atom} (in system {system}) is not finite: look at what the model returned, or take a "
-                    "smaller timestep; the state is as before the step",
+                    f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; "
+                    "the state is as before the step",
                     item="force",
                     atom=atom,
                 ) from error
@@ -175,18 +172,15 @@ def _evaluate(state: MDState, model: ModelInterface) -> None:
     state.store_model_extras(output)
 
 
-def _rattle(state: MDState, model: ModelInterface, held: Constraints, dt: torch.Tensor) -> None:
+def _rattle(state: MDState, model: ModelInterface, dt: Any) -> None:
     """Velocity Verlet on constraints."""
+    held, dt = constraints_of(state), _each(state, dt, atoms=True)
     # What a kick leaves across the constraints the drift removes along the same gradients.
     state.momenta = state.momenta + 0.5 * dt * state.forces
     _drift(state, held, dt)
     _evaluate(state, model)
     state.momenta = state.momenta + 0.5 * dt * state.forces
     _project(state, held)
-
-
-def _time(state: SimState, dt: Any) -> torch.Tensor:
-    return torch.as_tensor(dt, device=state.device, dtype=state.dtype)
 
 
 # -- constant energy ------------------------------------------------------------------------------
@@ -200,7 +194,7 @@ def _nve_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> M
 @_whole
 def _nve_step(state: MDState, model: ModelInterface, *, dt: Any, **_: Any) -> MDState:
     """A step of RATTLE."""
-    _rattle(state, model, constraints_of(state), _time(state, dt))
+    _rattle(state, model, dt)
     return state
 
 
@@ -215,13 +209,13 @@ def _langevin_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any)
 @_whole
 def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, gamma: Any = None) -> MDState:
     """Kick, half a drift, friction and noise, half a drift: g-BAOAB between its kicks."""
-    held, dt = constraints_of(state), _time(state, dt)
-    friction = FRICTION / dt if gamma is None else _per_atom(state, gamma)
+    held, dt = constraints_of(state), _each(state, dt, atoms=True)
+    friction = FRICTION / dt if gamma is None else _each(state, gamma, atoms=True)
     keep = torch.exp(-friction * dt)
     state.momenta = state.momenta + dt * state.forces
     _drift(state, held, dt / 2)
     noise = torch.randn(state.momenta.shape, device=state.device, dtype=state.dtype, generator=state.rng)
-    spread = torch.sqrt(_per_atom(state, kT) * (1 - keep**2) * state.masses[:, None])
+    spread = torch.sqrt(_each(state, kT, atoms=True) * (1 - keep**2) * state.masses[:, None])
     state.momenta = keep * state.momenta + spread * noise
     _project(state, held)
     _drift(state, held, dt / 2)
@@ -238,32 +232,33 @@ def _nose_hoover_init(
 ) -> NoseHooverState:
     """Momenta at `kT`, as for constant energy, and chains at rest."""
     made = _start(state, model, kT, at_rest=True)
-    period = PERIODS * _time(state, dt) if tau is None else _time(state, tau)
     rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
-    numbers = {"tau": period, "target_kT": _time(state, kT)}
-    settings = {name: value.expand(state.n_systems).clone() for name, value in numbers.items()}
-    extras = {"energy": made.energy, "forces": made.forces, "momenta": made.momenta}
-    return NoseHooverState.from_state(made, chain_positions=rest, chain_momenta=rest.clone(), **settings, **extras)
+    return NoseHooverState.from_state(
+        made,
+        chain_positions=rest,
+        chain_momenta=rest.clone(),
+        tau=_each(state, PERIODS * dt if tau is None else tau),
+        target_kT=_each(state, kT),
+    )
 
 
 @_whole
 def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any, kT: Any, **_: Any) -> NoseHooverState:
     """Half a step of the chains, a step of RATTLE, half a step of the chains."""
-    held, dt = constraints_of(state), _time(state, dt)
-    state.target_kT = _time(state, kT).expand(state.n_systems).clone()
+    state.target_kT = _each(state, kT)
     half_step = construct_nose_hoover_chain(dt, state.chain_positions.shape[1], 3, 3, state.tau).half_step
     for first in (True, False):
         momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)
         state.momenta, state.chain_positions, state.chain_momenta = momenta, chain.positions, chain.momenta
         if first:
-            _rattle(state, model, held, dt)
+            _rattle(state, model, dt)
     return state
 
 
 #: Constant energy by RATTLE (velocity Verlet on constraints).
 nve = Integrator(_nve_init, _nve_step)
-#: Langevin dynamics by geodesic BAOAB; ``gamma`` as in TorchSim. The momenta are those before the kick, whose temperature
-#: is accurate.
+#: Langevin dynamics by geodesic BAOAB, with ``gamma`` as in TorchSim. Momenta are those before the kick, which have the
+#: right temperature.
 langevin = Integrator(_langevin_init, _langevin_step)
 #: Nosé-Hoover chains around RATTLE; ``tau`` and ``chain_length`` in ``init_kwargs``, as in TorchSim.
 nose_hoover = Integrator(_nose_hoover_init, _nose_hoover_step)
