@@ -128,3 +128,13 @@ def state_of(x, numbers, masses, dtype=torch.float64, cell=None):
 def total_energy(state):
     kinetic = ts.calc_kinetic_energy(masses=state.masses, momenta=state.momenta, system_idx=state.system_idx)
     return state.energy + kinetic
+
+
+def off(state):
+    """The worst |sigma| of each system, by the engine on arrays."""
+    (held,) = state.constraints
+    worst = np.full(state.n_systems, np.nan)
+    for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
+        x = state.positions[state.system_idx == k].double().numpy()
+        worst[k] = np.abs(motion.constraint_set.value(x)).max()
+    return worst

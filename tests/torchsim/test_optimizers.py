@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from test_states import off
-from torch_models import Butanes, Drops, butane, drop
+from torch_models import Butanes, Drops, butane, drop, off
 
 from kcons.constraints import Dihedral
 from kcons.errors import UnsupportedError
 from kcons.torchsim import hold, langevin
 
-CARBONS = [0, 1, 3, 2]
+CARBONS = [0, 1, 2, 3]
 MOST = 0.02
 
 

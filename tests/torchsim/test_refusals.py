@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from torch_models import Drops, K, butane, drop, state_of
+from torch_models import Butanes, Drops, K, butane, drop, state_of
 
 from kcons.constraints import Distance, LinearVelocity
 from kcons.errors import InputError, SingularGeometryError, UnsupportedError
@@ -144,11 +144,10 @@ def test_degenerate_rows_are_converted_or_refused():
 
 
 def test_bonds_that_are_given_are_taken():
-    state = butane()
+    state, bonds = butane(), Butanes().first.T.tolist()
     with pytest.raises(InputError, match="has no bonds of"):
-        hold(state, "allbonds", bonds=[[0, 1], [1, 3]], guess_bonds=False)
-    chain = torch.arange(13).repeat_interleave(2)[1:].tolist() + [13]
-    hold(state, "allbonds", bonds=np.reshape(chain, (-1, 2)), guess_bonds=False)
+        hold(state, "allbonds", bonds=bonds[1:4], guess_bonds=False)
+    hold(state, "allbonds", bonds=bonds, guess_bonds=False)
     assert state.constraints[0].motions[0].rank == 13
 
 
