@@ -63,10 +63,11 @@ class Pattern(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """Where atoms come from, for rows of velocities: places there, and how far the atoms have come, (3 n_atoms, n)."""
+    """For rows of velocities: places where atoms come from, how far they have come, (3 n_atoms, n), and the mean time."""
 
     start: Tensor
     way: Tensor
+    time: Tensor
 
 
 class Clusters(ABC):
@@ -160,7 +161,7 @@ class Clusters(ABC):
         weights, known = self.weights(w), self.rows_of(lam)
         there = self.evaluate(start, None, p, t_start)[1]
         u = _times(weights, self.spread(there, known))
-        value, slope = self.evaluate(base, u, p, t, None if way is None else Flight(start, way))
+        value, slope = self.evaluate(base, u, p, t, None if way is None else Flight(start, way, 0.5 * (t + t_start)))
         off = self.solved(self.off(value, self.rows_of(targets)))
         s = self.couple(slope, there, weights)
         step = self.solve(s, [-each for each in off])
@@ -182,7 +183,9 @@ class Clusters(ABC):
         """How far multipliers move the atoms, and by how much all rows are off there."""
         there = self.evaluate(start, None, p, t_start)[1]
         u = _times(self.weights(w), self.spread(there, self.rows_of(lam)))
-        value, _ = self.evaluate(base, u, p, t, None if way is None else Flight(start, way), slope=False)
+        value, _ = self.evaluate(
+            base, u, p, t, None if way is None else Flight(start, way, 0.5 * (t + t_start)), slope=False
+        )
         off = self.off(value, self.rows_of(targets))
         return self.packed(u, base), self.packed([each.abs() for each in off], base)
 
@@ -212,7 +215,7 @@ class Clusters(ABC):
             By positions, by positions of the start, by targets and by inverse masses, (n_atoms, n).
         """
         weights, known, h = self.weights(w), self.rows_of(lam), self.atoms_of(pushed)
-        flight = None if way is None else Flight(start, way)
+        flight = None if way is None else Flight(start, way, 0.5 * (t + t_start))
         there = self.evaluate(start, None, p, t_start)[1]
         slope = self.evaluate(base, None, p, t, flight)[1]
         s = self.couple(slope, there, weights)
@@ -228,7 +231,7 @@ class Clusters(ABC):
             total = _dot(self.solved(self.contract(slopes, wz)), known)
             if way is not None:
                 # The way and the middle of the flight change with where it starts.
-                moved = Flight(start + self._places(moved_by), way - moved_by)
+                moved = Flight(start + self._places(moved_by), way - moved_by, 0.5 * (t + t_start))
                 total = total - _dot(self.solved(self.evaluate(base, None, p, t, moved)[0]), a)
             return total
 

@@ -232,7 +232,7 @@ class Group:
 
     def put(self, into: Tensor, vector: Tensor) -> None:
         """Write a vector of atoms, (3 n_atoms, n), into a tensor of all atoms; those that are fixed keep theirs."""
-        into.view(-1)[self.moved] = vector if self.coordinates is None else vector[self.coordinates.to(vector.device)]
+        into.view(-1)[self.moved] = vector if self.coordinates is None else vector[self.coordinates]
 
 
 def _flat(atoms: Tensor) -> Tensor:

@@ -50,12 +50,13 @@ class Lanes(Clusters):
                 for atom in row.atoms:
                     for i in range(3 * atom, 3 * atom + 3):
                         r.append(0.0 if way is None else way[i] if u is None else way[i] + u[i])
+            time = t if flight is None or row.function.holonomic else flight.time
             mine, used = numbers[used : used + row.parameters], used + row.parameters
             if slope:
-                value, steep = row.function(r, mine, t)
+                value, steep = row.function(r, mine, time)
                 slopes.append(steep)
             else:
-                value = row.function.value(r, mine, t)
+                value = row.function.value(r, mine, time)
             values.append(value)
         return values, slopes
 

@@ -178,14 +178,15 @@ class Levels(Clusters):
                     come = flight.way.reshape(-1, 3, n)
                     way = (come if u is None else come + u[0])[group.atoms]
                 r = torch.cat([r, way], 1)
+            time = t if flight is None or row.function.holonomic else flight.time
             numbers = p[group.parameters].unbind(1)
             coordinates = r.reshape(len(r), -1, n).unbind(1)
             if slope:
-                value, steep = row.function(coordinates, numbers, t)
+                value, steep = row.function(coordinates, numbers, time)
                 full = [base.new_zeros(()) + each for each in steep]
                 slopes.append(torch.stack([e.expand(len(r), n) for e in full], 1).reshape(-1, 3, n))
             else:
-                value = row.function.value(coordinates, numbers, t)
+                value = row.function.value(coordinates, numbers, time)
             values.append((base.new_zeros(()) + value).expand(len(r), n))
         return [torch.cat(values)[self.order]], torch.cat(slopes)[self.slots] if slope else None
 

@@ -81,6 +81,8 @@ class RowFunction(NamedTuple):
         if self.tape is not None and len(self.tape.results) > 1:
             found = run(self.tape, r, p, t)
             return found[0], found[1:]
+        like = next(each for each in r if isinstance(each, Tensor))
+        r = [each if isinstance(each, Tensor) else torch.full_like(like, each) for each in r]
         value, pull = torch.func.vjp(lambda *places: self._value(places, p, t), *r)
         slope = list(pull(torch.ones_like(value)))
         n = 3 * self.width

@@ -63,7 +63,10 @@ class _Symbol(NDArrayOperatorsMixin):
         if name == "power" and given[1] == 0.5:
             name, given = "sqrt", given[:1]
         elif name == "power" and given[1] in (2, 3, 4):
-            name, given = "multiply", given[:1] * int(inputs[1])
+            product, base = inputs[0], inputs[0]
+            for _ in range(int(inputs[1]) - 1):
+                product = product * base
+            return product
         self.steps.append((name, tuple(given)))
         return _Symbol(("k", len(self.steps) - 1), self.steps)
 
