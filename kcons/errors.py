@@ -171,6 +171,8 @@ class ConvergenceError(KconsError, RuntimeError):
         Its atoms.
     cluster : int
         Number of the cluster, -1 if unknown.
+    copy : int
+        Number of the system in a batch, -1 elsewhere.
     step : int or None
         Step number, where a stepper knows it.
     singular : bool
@@ -180,6 +182,7 @@ class ConvergenceError(KconsError, RuntimeError):
     """
 
     positions: Any = None
+    copy: int = -1
 
     def __init__(
         self,

@@ -1,8 +1,4 @@
-"""Large clusters: tables for a work-group, with an order of elimination by levels (see `clusters.c`).
-
-In each level rows of about the lowest degree are eliminated that share no entry, so that all of them can go at once;
-rows that depend on others come last.
-"""
+"""Large clusters: tables for a work-group, with an order of elimination by levels (see `clusters.c`)."""
 
 from __future__ import annotations
 
@@ -12,58 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
+from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import IN_CELLS, HeldRows, Pattern
 from kcons.openmm.device.kernels import Array
+from kcons.plan.clusters_alike import elimination, neighbors
 
-#: Rows of one level have at most this many times the lowest degree, or this many neighbors more.
-_ABOUT, _MORE = 1.5, 2
 #: Numbers of a row in `rows_row`.
 _ROW = 9
-
-
-class Order(NamedTuple):
-    """Rows in the order of elimination, where levels begin in it, and the later rows that each is coupled to."""
-
-    rows: list[int]
-    levels: list[int]
-    later: list[list[int]]
-
-
-def elimination(neighbors: list[set[int]], last: set[int]) -> Order:
-    """Order of elimination of rows by levels.
-
-    Parameters
-    ----------
-    neighbors : list of set of int
-        Rows that share a moving atom with each.
-    last : set of int
-        Rows that come after all others.
-    """
-    left, coupled = set(range(len(neighbors))), [set(each) for each in neighbors]
-    order: list[int] = []
-    levels = [0]
-    found: dict[int, set[int]] = {}
-    while left:
-        candidates = sorted(left - last or left, key=lambda row: (len(coupled[row]), row))
-        limit = max(_ABOUT * len(coupled[candidates[0]]), len(coupled[candidates[0]]) + _MORE)
-        blocked: set[int] = set()
-        chosen = []
-        for row in candidates:
-            if len(coupled[row]) > limit:
-                break
-            if row not in blocked:
-                chosen.append(row)
-                blocked |= coupled[row]
-        for row in chosen:
-            found[row] = around = coupled[row]
-            for other in around:
-                coupled[other] |= around
-                coupled[other] -= {other, row}
-        left -= set(chosen)
-        order += chosen
-        levels.append(len(order))
-    place = {row: k for k, row in enumerate(order)}
-    return Order(order, levels, [sorted(place[other] for other in found[row]) for row in order])
 
 
 class _Tables(NamedTuple):
@@ -83,11 +34,7 @@ class _Tables(NamedTuple):
 def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, list[int]]:
     """Tables of a pattern, and its rows in the order of elimination."""
     count, n_atoms = len(pattern.rows), pattern.atoms.shape[1]
-    users: list[set[int]] = [set() for _ in range(n_atoms)]
-    for k, row in enumerate(pattern.rows):
-        for atom in row.atoms:
-            users[atom].add(k)
-    coupled = [set().union(*(users[a] for a in row.atoms)) - {k} for k, row in enumerate(pattern.rows)]
+    coupled = neighbors([row.atoms for row in pattern.rows])
     order = elimination(coupled, {k for k, row in enumerate(pattern.rows) if row.depends})
     rows = [pattern.rows[k] for k in order.rows]
     slots = np.concatenate([[0], np.cumsum([len(row.atoms) for row in rows])])
@@ -216,7 +163,7 @@ class LargeClusters:
     @staticmethod
     def _source(patterns: list[Pattern], held: HeldRows, first_row: int, first_cell: int) -> str:
         used = sorted({row.function for pattern in patterns for row in pattern.rows})
-        functions = "".join(held.functions[f].text(f"rows_g{f}", "GLOBAL ") for f in used)
+        functions = "".join(c_functions(f"rows_g{f}", held.functions[f], "GLOBAL ") for f in used)
         cases = "".join(f" case {f}: rows_g{f}(r, p, t, out); break;\n" for f in used)
         timed = [f for f in used if held.functions[f].second is not None]
         rates = "".join(f" if (f == {f}) return rows_g{f}_rate(r, p, t);\n" for f in timed)

@@ -1,0 +1,127 @@
+"""Small clusters: a tensor for each number, and elimination written out, so that one kernel does all of a step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcons.batched.clusters import Clusters, Flight, Vector
+
+Matrix = list[list[Any]]
+
+
+class Lanes(Clusters):
+    """See `Clusters`; gradients are lists of numbers by row, matrices lists of rows, None where two share no atom."""
+
+    def rows_of(self, packed: Tensor) -> Vector:
+        return list(packed.unbind(0))
+
+    def atoms_of(self, packed: Tensor) -> Vector:
+        return list(packed.unbind(0))
+
+    def weights(self, w: Tensor) -> Vector:
+        return [each for each in w.unbind(0) for _ in range(3)]
+
+    def packed(self, vector: Vector, like: Tensor) -> Tensor:
+        lane = like[0]
+        return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
+
+    def evaluate(
+        self, base: Tensor, u: Vector | None, p: Tensor, t: Any, flight: Flight | None = None, slope: bool = True
+    ) -> tuple[Vector, Any]:
+        places, numbers = base.unbind(0), p.unbind(0)
+        start = None if flight is None else flight.start.unbind(0)
+        way = None if flight is None else flight.way.unbind(0)
+        values, slopes = [], []
+        k = used = 0
+        for row in self.pattern.rows:
+            r = [0.0] * 3 if row.relative else []
+            for atom in row.places:
+                for c in range(3):
+                    r.append(places[k])
+                    if u is not None:
+                        r[-1] = r[-1] + (u[3 * atom + c] - (u[3 * row.atoms[0] + c] if row.relative else 0.0))
+                    if start is not None and not row.function.holonomic:
+                        r[-1] = 0.5 * (r[-1] + start[k])
+                    k += 1
+            if not row.function.holonomic:
+                for atom in row.atoms:
+                    for i in range(3 * atom, 3 * atom + 3):
+                        r.append(0.0 if way is None else way[i] if u is None else way[i] + u[i])
+            time = t if flight is None or row.function.holonomic else flight.time
+            mine, used = numbers[used : used + row.parameters], used + row.parameters
+            if slope:
+                value, steep = row.function(r, mine, time)
+                slopes.append(steep)
+            else:
+                value = row.function.value(r, mine, time)
+            values.append(value)
+        return values, slopes
+
+    def couple(self, left: Any, right: Any, weights: Vector) -> Matrix:
+        rows = self.pattern.rows[: self.pattern.rank]
+        slot = [{a: 3 * i for i, a in enumerate(row.atoms) if a not in self.pattern.fixed} for row in rows]
+        heavy = [
+            {a: [weights[3 * a] * right[k][i + c] for c in range(3)] for a, i in slot[k].items()}
+            for k in range(len(rows))
+        ]
+
+        def entry(k: int, other: int) -> Any:
+            found = None
+            for atom, i in slot[k].items():
+                for c, each in enumerate(heavy[other].get(atom, ())):
+                    term = left[k][i + c] * each
+                    found = term if found is None else found + term
+            return found
+
+        return [[entry(k, other) for other in range(len(rows))] for k in range(len(rows))]
+
+    def solve(self, s: Matrix, b: Vector, transposed: bool = False) -> Vector:
+        n, b = len(b), list(b)
+        s = [[s[j][i] if transposed else s[i][j] for j in range(n)] for i in range(n)]
+        for k in range(n):
+            s[k][k] = 1.0 / s[k][k]
+            for i in range(k + 1, n):
+                if s[i][k] is None:
+                    continue
+                factor = s[i][k] * s[k][k]
+                for j in range(k + 1, n):
+                    if s[k][j] is not None:
+                        s[i][j] = -factor * s[k][j] if s[i][j] is None else s[i][j] - factor * s[k][j]
+                b[i] = b[i] - factor * b[k]
+        for k in reversed(range(n)):
+            for j in range(k + 1, n):
+                if s[k][j] is not None:
+                    b[k] = b[k] - s[k][j] * b[j]
+            b[k] = b[k] * s[k][k]
+        return b
+
+    def diagonal(self, s: Matrix) -> Vector:
+        return [s[k][k] for k in range(len(s))]
+
+    def spread(self, slope: Any, lam: Vector) -> Vector:
+        found: Vector = [0.0] * (3 * self.pattern.n_atoms)
+        for row, steep, each in zip(self.pattern.rows, slope, lam, strict=False):
+            for i, atom in enumerate(row.atoms):
+                for c in range(3):
+                    found[3 * atom + c] = found[3 * atom + c] + steep[3 * i + c] * each
+        return found
+
+    def contract(self, slope: Any, v: Vector) -> Vector:
+        return [
+            sum(steep[3 * i + c] * v[3 * atom + c] for i, atom in enumerate(row.atoms) for c in range(3))
+            for row, steep in zip(self.pattern.rows, slope, strict=True)
+        ]
+
+    def lengths(self, slope: Any) -> Vector:
+        return [sum(each * each for each in steep) ** 0.5 for steep in slope]
+
+    def solved(self, rows: Vector) -> Vector:
+        return rows[: self.pattern.rank]
+
+    def off(self, value: Vector, targets: Vector) -> Vector:
+        found = [a - b for a, b in zip(value, targets, strict=True)]
+        periods = [row.period for row in self.pattern.rows]
+        return [a - p * torch.round(a / p) if p else a for a, p in zip(found, periods, strict=True)]
