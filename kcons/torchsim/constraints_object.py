@@ -31,8 +31,8 @@ _CELL = "cells are not relaxed with held rows; relax positions alone, or the cel
 class Constraints(SystemConstraint):
     """Everything that is held on a state, made by `kcons.torchsim.hold`: an engine for each system that has rows.
 
-    TorchSim takes it along where states are sliced, split, joined and moved. Its optimizers step along forces, so that
-    for them positions and forces are projected with equal weights of all atoms. Its integrators are refused.
+    TorchSim takes it along where states are sliced, split, joined and moved. Its optimizers end on the constraints; its
+    integrators are refused.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Constraints(SystemConstraint):
                     item="state",
                 )
 
-    def move(self, state: SimState, new: torch.Tensor, masses: torch.Tensor | None = None) -> tuple[Any, Any]:
+    def move(self, state: SimState, new: torch.Tensor) -> tuple[Any, Any]:
         """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction.
 
         Raises
@@ -92,21 +92,18 @@ class Constraints(SystemConstraint):
         """
         batch, atoms = self.batch(state)
         if atoms is None:
-            solved = batch.solve_positions(new, state.positions, masses=masses)
-            return solved.positions, solved.push
-        masses = None if masses is None else masses[atoms]
-        solved = batch.solve_positions(new[atoms], state.positions[atoms], masses=masses)
+            return batch.solve_positions(new, state.positions)[:2]
+        solved = batch.solve_positions(new[atoms], state.positions[atoms])
         push = torch.zeros_like(new).index_copy(0, atoms, solved.push)
         return new.index_copy(0, atoms, solved.positions), push
 
-    def tangent(self, state: SimState, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> torch.Tensor:
-        """The part of velocities (of forces, with equal masses) that stays on the constraints."""
+    def tangent(self, state: SimState, velocities: torch.Tensor) -> torch.Tensor:
+        """The part of velocities that stays on the constraints."""
         batch, atoms = self.batch(state)
         if atoms is None:
-            return batch.project_velocities(state.positions, vectors, masses=masses)
-        masses = None if masses is None else masses[atoms]
-        part = batch.project_velocities(state.positions[atoms], vectors[atoms], masses=masses)
-        return vectors.index_copy(0, atoms, part)
+            return batch.project_velocities(state.positions, velocities)
+        part = batch.project_velocities(state.positions[atoms], velocities[atoms])
+        return velocities.index_copy(0, atoms, part)
 
     # -- what TorchSim calls --------------------------------------------------------------------
 
@@ -119,7 +116,7 @@ class Constraints(SystemConstraint):
         """Bring positions that an optimizer asks for onto the constraints, in place."""
         if isinstance(state, MDState):
             self.adjust_momenta(state, state.momenta)
-        new_positions.copy_(self.move(state, new_positions, torch.ones_like(state.masses))[0])
+        new_positions.copy_(self.move(state, new_positions)[0])
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
         """Refuse integrators of TorchSim, before they move positions."""
@@ -127,7 +124,8 @@ class Constraints(SystemConstraint):
 
     def adjust_forces(self, state: SimState, forces: torch.Tensor) -> None:
         """Remove the part of forces that leaves the constraints, in place: what is left vanishes at a minimum."""
-        forces.copy_(self.tangent(state, forces, torch.ones_like(state.masses)))
+        masses = state.masses[:, None]
+        forces.copy_(masses * self.tangent(state, forces / masses))
 
     def adjust_stress(self, state: SimState, stress: torch.Tensor) -> None:
         """Refuse cell filters, which do not know the stress of held rows."""

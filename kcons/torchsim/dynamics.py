@@ -161,6 +161,12 @@ def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
     state.momenta = state.momenta + masses * push / dt
 
 
+def _kick(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
+    """Let forces act for `dt`; those between atoms whose distance is held may be any."""
+    state.momenta = state.momenta + dt * state.forces
+    _project(state, held)
+
+
 def _project(state: MDState, held: Constraints) -> None:
     masses = state.masses[:, None]
     state.momenta = masses * held.tangent(state, state.momenta / masses)
@@ -175,12 +181,10 @@ def _evaluate(state: MDState, model: ModelInterface) -> None:
 def _rattle(state: MDState, model: ModelInterface, dt: Any) -> None:
     """Velocity Verlet on constraints."""
     held, dt = constraints_of(state), _each(state, dt, atoms=True)
-    # What a kick leaves across the constraints the drift removes along the same gradients.
-    state.momenta = state.momenta + 0.5 * dt * state.forces
+    _kick(state, held, dt / 2)
     _drift(state, held, dt)
     _evaluate(state, model)
-    state.momenta = state.momenta + 0.5 * dt * state.forces
-    _project(state, held)
+    _kick(state, held, dt / 2)
 
 
 # -- constant energy ------------------------------------------------------------------------------
@@ -212,7 +216,7 @@ def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, g
     held, dt = constraints_of(state), _each(state, dt, atoms=True)
     friction = FRICTION / dt if gamma is None else _each(state, gamma, atoms=True)
     keep = torch.exp(-friction * dt)
-    state.momenta = state.momenta + dt * state.forces
+    _kick(state, held, dt)
     _drift(state, held, dt / 2)
     noise = torch.randn(state.momenta.shape, device=state.device, dtype=state.dtype, generator=state.rng)
     spread = torch.sqrt(_each(state, kT, atoms=True) * (1 - keep**2) * state.masses[:, None])

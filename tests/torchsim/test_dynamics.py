@@ -10,13 +10,13 @@ import pytest
 import torch
 import torch_sim as ts
 from scipy.integrate import quad
-from torch_models import FS, Drops, K, butane, drop, state_of, total_energy
+from torch_models import FS, Drops, K, butane, drop, off, state_of, total_energy
 from torch_models import Butanes as Springs
 
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.steppers import Rattle, State, System, run
-from kcons.torchsim import hold, langevin, nose_hoover, nve, report
+from kcons.torchsim import hold, langevin, nose_hoover, nve
 
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "torchsim.json"
 
@@ -54,7 +54,7 @@ def test_constant_energy_is_the_trajectory_of_the_engine():
         motion = alone.constraints[0].motions[0]
 
         def force(x, t, alone=alone):
-            alone.positions = torch.as_tensor(x)
+            alone.positions = torch.tensor(x)
             return model(alone)["forces"].numpy()
 
         began = State(start[k].positions.numpy(), start[k].velocities.numpy())
@@ -74,7 +74,7 @@ def test_energy_of_sixteen_drops_does_not_drift():
     course = torch.stack(energies).mean(1).numpy() / (27 * 300 * K)
     drift = np.polynomial.Polynomial.fit(np.arange(151), course, 1).convert().coef[1] * 150
     assert abs(drift) < 1e-3
-    assert float(report(end).residual.max()) < 1e-13
+    assert off(end).max() < 1e-13
     assert float(end.calc_temperature().mean()) > 250
 
 
@@ -98,7 +98,7 @@ def error_of(means):
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", [langevin, nose_hoover], ids=["langevin", "nose_hoover"])
 def test_short_runs_have_the_temperature_of_the_bath(pair):
-    """64 copies of butane for 0.6 ps, bonds to hydrogen held."""
+    """64 copies of butane for 0.4 ps, bonds to hydrogen held."""
     state = ts.concatenate_states([butane()] * 64)
     hold(state, "hbonds")
     state.rng = 1
@@ -106,8 +106,7 @@ def test_short_runs_have_the_temperature_of_the_bath(pair):
     start = pair.init(state, model, dt=1 * FS, **settings, **({"tau": 20 * FS} if pair is nose_hoover else {}))
     if pair is langevin:
         settings["gamma"] = 0.02 / FS
-    means = temperatures(pair, start, model, 600, 1 * FS, 200, **settings)
-    # Of the mean over 400 correlated steps of 64 copies with 32 degrees of freedom.
+    means = temperatures(pair, start, model, 400, 1 * FS, 150, **settings)
     assert abs(means.mean() - 300) < 4 * error_of(means)
     assert error_of(means) < 6
 
@@ -171,8 +170,7 @@ class Free(Drops):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", [langevin, nose_hoover], ids=["langevin", "nose_hoover"])
-def test_angles_of_free_chains_have_the_distribution_of_the_surface(pair):
+def test_angles_of_free_chains_have_the_distribution_of_the_surface():
     """Three atoms, two lengths held: the density of the cosine goes with the root of det A M^-1 A^T."""
     masses = [1.0, 2.0, 1.0]
     copies = [state_of(chain(k), [6, 6, 6], masses) for k in range(400)]
@@ -182,22 +180,16 @@ def test_angles_of_free_chains_have_the_distribution_of_the_surface(pair):
     root = lambda c: np.sqrt(1.5**2 - (0.5 * c) ** 2)  # noqa: E731
     norm = quad(root, -1, 1)[0]
     wanted = quad(lambda c: c * c * root(c), -1, 1)[0] / norm
-    fourth = quad(lambda c: c**4 * root(c), -1, 1)[0] / norm
-    settings = {"gamma": 0.2 / FS} if pair is langevin else {}
-    kT = 300 * K
-    start = pair.init(state, Free(), kT=kT, dt=1 * FS)
+    start = langevin.init(state, Free(), kT=300 * K)
     found = []
 
     def look(k, now):
-        if k >= 200 and k % 100 == 0:
+        if k >= 100 and k % 50 == 0:
             u = now.positions.reshape(-1, 3, 3)
             a, b = u[:, 0] - u[:, 1], u[:, 2] - u[:, 1]
             found.append(((a * b).sum(1) ** 2).numpy())
 
-    go_on(pair, start, Free(), 1200, 2 * FS, look=look, kT=kT, **settings)
-    if pair is nose_hoover:  # without a potential each copy turns for ever as it began
-        assert abs(np.mean(found) - wanted) < 4 * np.sqrt((fourth - wanted**2) / 400)
-        return
+    go_on(langevin, start, Free(), 700, 2 * FS, look=look, kT=300 * K, gamma=0.2 / FS)
     spread = np.std(np.mean(found, 0), ddof=1) / 20
     assert abs(np.mean(found) - wanted) < 4 * spread < 0.02
     assert abs(wanted - 1 / 3) > 0.005

@@ -30,8 +30,10 @@ def left_over(state, model):
 
 def bent_butanes(copies):
     states = []
+    random = torch.Generator().manual_seed(1)
     for k in range(copies):
         state = butane()
+        state.positions += 0.06 * torch.randn(state.positions.shape, dtype=state.dtype, generator=random)
         hold(state, ["hbonds", Dihedral([CARBONS], [0.4 + 0.5 * k])], project=True)
         states.append(state)
     return ts.concatenate_states(states)
