@@ -16,9 +16,9 @@ the equations at the solution.
 from kcons.errors import with_extra
 
 try:
-    from kcons.batched.batch import Batch, BatchReport, Solved
+    from kcons.batched.batch import Batch, Solved
     from kcons.batched.steps import drift, gbaoab, kick, rattle
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.batched") from error
 
-__all__ = ["Batch", "BatchReport", "Solved", "drift", "gbaoab", "kick", "rattle"]
+__all__ = ["Batch", "Solved", "drift", "gbaoab", "kick", "rattle"]

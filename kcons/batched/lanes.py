@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcons.batched.clusters import Clusters, Flight, Vector
+from kcons.batched.clusters import Clusters, Problem, Vector
 
 Matrix = list[list[Any]]
 
@@ -18,8 +18,7 @@ class Lanes(Clusters):
     def rows_of(self, packed: Tensor) -> Vector:
         return list(packed.unbind(0))
 
-    def atoms_of(self, packed: Tensor) -> Vector:
-        return list(packed.unbind(0))
+    atoms_of = rows_of
 
     def weights(self, w: Tensor) -> Vector:
         return [each for each in w.unbind(0) for _ in range(3)]
@@ -28,53 +27,45 @@ class Lanes(Clusters):
         lane = like[0]
         return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
 
-    def evaluate(
-        self, base: Tensor, u: Vector | None, p: Tensor, t: Any, flight: Flight | None = None, slope: bool = True
-    ) -> tuple[Vector, Any]:
-        places, numbers = base.unbind(0), p.unbind(0)
-        start = None if flight is None else flight.start.unbind(0)
-        way = None if flight is None else flight.way.unbind(0)
+    def evaluate(self, of: Problem, u: Vector | None, slope: bool = True) -> tuple[Vector, Any]:
+        places, start, numbers = of.base.unbind(0), of.start.unbind(0), of.p.unbind(0)
         values, slopes = [], []
         k = used = 0
         for row in self.pattern.rows:
-            r = [0.0] * 3 if row.relative else []
+            flies = of.way is not None and not row.function.holonomic
+            r: list[Any] = [0.0] * 3 if row.relative else []
             for atom in row.places:
                 for c in range(3):
-                    r.append(places[k])
+                    place = places[k]
                     if u is not None:
-                        r[-1] = r[-1] + (u[3 * atom + c] - (u[3 * row.atoms[0] + c] if row.relative else 0.0))
-                    if start is not None and not row.function.holonomic:
-                        r[-1] = 0.5 * (r[-1] + start[k])
+                        place = place + (u[3 * atom + c] - (u[3 * row.atoms[0] + c] if row.relative else 0.0))
+                    r.append(0.5 * (place + start[k]) if flies else place)
                     k += 1
             if not row.function.holonomic:
-                for atom in row.atoms:
-                    for i in range(3 * atom, 3 * atom + 3):
-                        r.append(0.0 if way is None else way[i] if u is None else way[i] + u[i])
-            time = t if flight is None or row.function.holonomic else flight.time
+                for i in (3 * atom + c for atom in row.atoms for c in range(3)):
+                    r.append(0.0 if of.way is None else of.way[i] if u is None else of.way[i] + u[i])
+            t = 0.5 * (of.t + of.t_start) if flies else of.t
             mine, used = numbers[used : used + row.parameters], used + row.parameters
-            if slope:
-                value, steep = row.function(r, mine, time)
-                slopes.append(steep)
-            else:
-                value = row.function.value(r, mine, time)
+            value, steep = row.function(r, mine, t) if slope else (row.function.value(r, mine, t), None)
             values.append(value)
+            slopes.append(steep)
         return values, slopes
 
     def couple(self, left: Any, right: Any, weights: Vector) -> Matrix:
         rows = self.pattern.rows[: self.pattern.rank]
         slot = [{a: 3 * i for i, a in enumerate(row.atoms) if a not in self.pattern.fixed} for row in rows]
         heavy = [
-            {a: [weights[3 * a] * right[k][i + c] for c in range(3)] for a, i in slot[k].items()}
-            for k in range(len(rows))
+            {a: [weights[3 * a] * right[k][i + c] for c in range(3)] for a, i in mine.items()}
+            for k, mine in enumerate(slot)
         ]
 
         def entry(k: int, other: int) -> Any:
-            found = None
-            for atom, i in slot[k].items():
-                for c, each in enumerate(heavy[other].get(atom, ())):
-                    term = left[k][i + c] * each
-                    found = term if found is None else found + term
-            return found
+            terms = [
+                left[k][i + c] * each
+                for atom, i in slot[k].items()
+                for c, each in enumerate(heavy[other].get(atom, ()))
+            ]
+            return sum(terms[1:], terms[0]) if terms else None
 
         return [[entry(k, other) for other in range(len(rows))] for k in range(len(rows))]
 
@@ -104,9 +95,8 @@ class Lanes(Clusters):
     def spread(self, slope: Any, lam: Vector) -> Vector:
         found: Vector = [0.0] * (3 * self.pattern.n_atoms)
         for row, steep, each in zip(self.pattern.rows, slope, lam, strict=False):
-            for i, atom in enumerate(row.atoms):
-                for c in range(3):
-                    found[3 * atom + c] = found[3 * atom + c] + steep[3 * i + c] * each
+            for i, k in enumerate(3 * atom + c for atom in row.atoms for c in range(3)):
+                found[k] = found[k] + steep[i] * each
         return found
 
     def contract(self, slope: Any, v: Vector) -> Vector:
@@ -114,9 +104,6 @@ class Lanes(Clusters):
             sum(steep[3 * i + c] * v[3 * atom + c] for i, atom in enumerate(row.atoms) for c in range(3))
             for row, steep in zip(self.pattern.rows, slope, strict=True)
         ]
-
-    def lengths(self, slope: Any) -> Vector:
-        return [sum(each * each for each in steep) ** 0.5 for steep in slope]
 
     def solved(self, rows: Vector) -> Vector:
         return rows[: self.pattern.rank]

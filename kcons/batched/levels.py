@@ -2,67 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcons.batched.clusters import Clusters, Flight, Pattern, Vector
+from kcons.batched.clusters import Clusters, Pattern, Problem, Vector
 from kcons.plan.clusters_alike import elimination, neighbors
 
 
 class _Level(NamedTuple):
-    """Rows that are eliminated at once: pivots, factors of later rows with the row and the entry, and products."""
+    """Rows that are eliminated at once.
+
+    `factor` has of each factor its entry, the row eliminated and the later row; `product` of each product the factor,
+    the entry beside the pivot, and the entry it is taken from.
+    """
 
     rows: Tensor
-    pivot: Tensor
-    #: Of each factor: its entry, that of the pivot, the row eliminated and the later row.
     factor: Tensor
-    #: Of each product: the factor, the entry beside the pivot, and the entry it is taken from.
     product: Tensor
-    #: Of each entry right of a pivot: the entry, the row eliminated and the later row.
-    right: Tensor
 
 
 class _Program(NamedTuple):
-    """What elimination does: levels; entries by row and column, and the entry across the diagonal."""
+    """What elimination does: levels; entries by row and column, the entry across the diagonal, and those on it."""
 
     levels: list[_Level]
     row: Tensor
     column: Tensor
     across: Tensor
     diagonal: Tensor
-    numbers: dict[tuple[int, int], int]
 
 
-def _program(pattern: Pattern) -> _Program:
-    """Entries of the matrix of the rows that are solved for, those that fill in among them."""
+def _table(entries: Iterable[Iterable[int]], width: int, device: torch.device) -> Tensor:
+    return torch.tensor([list(each) for each in entries], dtype=torch.long, device=device).reshape(-1, width).T
+
+
+def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tuple[int, int], int]]:
+    """Elimination of the rows that are solved for, and their entries by number, those that fill in among them."""
     moving = [tuple(a for a in row.atoms if a not in pattern.fixed) for row in pattern.rows[: pattern.rank]]
     order = elimination(neighbors(moving), set())
-    place = order.rows
-    numbers: dict[tuple[int, int], int] = {}
-    for k, later in enumerate(order.later):
-        for i, j in [(k, k), *((k, i) for i in later), *((i, k) for i in later)]:
-            numbers[place[i], place[j]] = len(numbers)
+    place, later = order.rows, [[order.rows[i] for i in some] for some in order.later]
+    pairs = [pair for here, some in zip(place, later, strict=True) for i in some for pair in ((here, i), (i, here))]
+    numbers = {pair: k for k, pair in enumerate([*((k, k) for k in place), *pairs])}
     levels = []
     for begin, end in zip(order.levels[:-1], order.levels[1:], strict=True):
-        factor, product, right = [], [], []
-        for k in range(begin, end):
-            here = place[k]
-            for i in order.later[k]:
-                there = place[i]
-                right.append((numbers[here, there], here, there))
-                for j in order.later[k]:
-                    product.append((len(factor), numbers[here, place[j]], numbers[there, place[j]]))
-                factor.append((numbers[there, here], numbers[here, here], here, there))
-        rows = place[begin:end]
-        tables = (
-            torch.tensor(t, dtype=torch.long).reshape(-1, n).T for t, n in ((factor, 4), (product, 3), (right, 3))
-        )
-        levels.append(_Level(torch.tensor(rows), torch.tensor([numbers[k, k] for k in rows]), *tables))
-    row, column = torch.tensor(list(numbers), dtype=torch.long).T
-    across = torch.tensor([numbers[j, i] for i, j in numbers])
-    return _Program(levels, row, column, across, torch.tensor([numbers[k, k] for k in range(pattern.rank)]), numbers)
+        factor, product = [], []
+        for here, some in zip(place[begin:end], later[begin:end], strict=True):
+            for there in some:
+                product += [(len(factor), numbers[here, j], numbers[there, j]) for j in some]
+                factor.append((numbers[there, here], here, there))
+        rows = torch.tensor(place[begin:end], device=device)
+        levels.append(_Level(rows, _table(factor, 3, device), _table(product, 3, device)))
+    row, column, across = _table(((i, j, numbers[j, i]) for i, j in numbers), 3, device)
+    return _Program(
+        levels, row, column, across, _table([[numbers[k, k] for k in range(len(place))]], 1, device)[0]
+    ), numbers
 
 
 class _Solution(torch.autograd.Function):
@@ -72,15 +67,15 @@ class _Solution(torch.autograd.Function):
     def forward(s: Tensor, b: Tensor, program: _Program) -> Tensor:
         s, b = s.clone(), b.clone()
         for level in program.levels:
-            entry, pivot, here, there = level.factor
-            factor = s[entry] / s[pivot]
+            entry, here, there = level.factor
             which, beside, taken = level.product
+            factor = s[entry] / s[program.diagonal[here]]
             s.index_add_(0, taken, factor[which] * s[beside], alpha=-1)
             b.index_add_(0, there, factor * b[here], alpha=-1)
         for level in reversed(program.levels):
-            entry, here, there = level.right
-            b.index_add_(0, here, s[entry] * b[there], alpha=-1)
-            b[level.rows] = b[level.rows] / s[level.pivot]
+            entry, here, there = level.factor
+            b.index_add_(0, here, s[program.across[entry]] * b[there], alpha=-1)
+            b[level.rows] = b[level.rows] / s[program.diagonal[level.rows]]
         return b
 
     @staticmethod
@@ -95,10 +90,10 @@ class _Solution(torch.autograd.Function):
         return -a[ctx.program.row] * y[ctx.program.column], a, None
 
 
-class _Group(NamedTuple):
-    """Rows of one function: places and parameters of each, its atoms, and its first atom."""
+class _Alike(NamedTuple):
+    """Rows of one function: the first of them; places and parameters of each, its atoms, and atoms of its places."""
 
-    number: int
+    row: Any
     places: Tensor
     parameters: Tensor
     atoms: Tensor
@@ -110,31 +105,26 @@ class Levels(Clusters):
 
     def __init__(self, pattern: Pattern, device: torch.device) -> None:
         super().__init__(pattern)
-        self.program = _moved(_program(pattern), device)
-        rows, numbers = pattern.rows, self.program.numbers
+        self.program, numbers = _program(pattern, device)
+        rows = pattern.rows
         alike: dict[Any, list[int]] = {}
+        places, parameters, slots = [], [], []
+        place = number = slot = 0
         for k, row in enumerate(rows):
             alike.setdefault((row.function, row.relative), []).append(k)
-        place, number, slot = 0, 0, 0
-        places, parameters, slots = [], [], []
-        for row in rows:
             places.append(range(place, place := place + len(row.places)))
             parameters.append(range(number, number := number + row.parameters))
             slots.append(range(slot, slot := slot + len(row.atoms)))
-        self.groups = [
-            _Group(
-                some[0],
-                *(_table([t[k] for k in some], device) for t in (places, parameters)),
-                *(_table([t(rows[k]) for k in some], device) for t in (lambda r: r.atoms, lambda r: r.places)),
-            )
-            for some in alike.values()
-        ]
+        self.alike = []
+        for some in alike.values():
+            tables = [[t[k] for k in some] for t in (places, parameters)]
+            tables += [[rows[k].atoms for k in some], [rows[k].places for k in some]]
+            self.alike.append(_Alike(rows[some[0]], *(_table(t, len(t[0]), device).T for t in tables)))
         order = [k for some in alike.values() for k in some]
         self.order = torch.tensor(order, device=device).argsort()
         self.slots = torch.tensor([i for k in order for i in slots[k]], device=device).argsort()
-        self.atom = torch.tensor([a for row in rows for a in row.atoms], device=device)
-        self.row = torch.tensor([k for k, row in enumerate(rows) for _ in row.atoms], device=device)
-        self.period = torch.tensor([[row.period] for row in rows], device=device, dtype=torch.float64)
+        self.atom, self.row = _table(((a, k) for k, row in enumerate(rows) for a in row.atoms), 2, device)
+        self.period = torch.tensor([[row.period or torch.inf] for row in rows], device=device)
         products = [
             (entry, slots[k][i], slots[other][j], atom)
             for (k, other), entry in numbers.items()
@@ -142,7 +132,7 @@ class Levels(Clusters):
             for j, same in enumerate(rows[other].atoms)
             if atom == same and atom not in pattern.fixed
         ]
-        self.products = _table(products, device).T
+        self.products = _table(products, 4, device)
 
     def rows_of(self, packed: Tensor) -> Vector:
         return [packed]
@@ -154,46 +144,38 @@ class Levels(Clusters):
         return [w.unsqueeze(1)]
 
     def packed(self, vector: Vector, like: Tensor) -> Tensor:
-        (found,) = vector
-        return found.expand(*found.shape[:-1], like.shape[-1]).reshape(-1, like.shape[-1])
+        return vector[0].expand(*vector[0].shape[:-1], like.shape[-1]).reshape(-1, like.shape[-1])
 
-    def evaluate(
-        self, base: Tensor, u: Vector | None, p: Tensor, t: Any, flight: Flight | None = None, slope: bool = True
-    ) -> tuple[Vector, Any]:
-        n = base.shape[-1]
-        places = base.reshape(-1, 3, n)
+    def evaluate(self, of: Problem, u: Vector | None, slope: bool = True) -> tuple[Vector, Any]:
+        n, zero = of.base.shape[-1], of.base.new_zeros(())
         values, slopes = [], []
-        for group in self.groups:
-            row = self.pattern.rows[group.number]
-            r = places[group.places]
+        for some in self.alike:
+            row, function = some.row, some.row.function
+            flies = of.way is not None and not function.holonomic
+            r = of.base.reshape(-1, 3, n)[some.places]
             if u is not None:
-                r = r + (u[0][group.taken] - u[0][group.atoms[:, :1]] if row.relative else u[0][group.taken])
-            if flight is not None and not row.function.holonomic:
-                r = 0.5 * (r + flight.start.reshape(-1, 3, n)[group.places])
+                r = r + (u[0][some.taken] - u[0][some.atoms[:, :1]] if row.relative else u[0][some.taken])
+            if flies:
+                r = 0.5 * (r + of.start.reshape(-1, 3, n)[some.places])
             if row.relative:
                 r = torch.cat([torch.zeros_like(r[:, :1]), r], 1)
-            if not row.function.holonomic:
-                way = torch.zeros_like(r)
-                if flight is not None:
-                    come = flight.way.reshape(-1, 3, n)
-                    way = (come if u is None else come + u[0])[group.atoms]
-                r = torch.cat([r, way], 1)
-            time = t if flight is None or row.function.holonomic else flight.time
-            numbers = p[group.parameters].unbind(1)
-            coordinates = r.reshape(len(r), -1, n).unbind(1)
+            if not function.holonomic:
+                come = torch.zeros_like(r)
+                if of.way is not None:
+                    come = of.way.reshape(-1, 3, n)[some.atoms] + (0.0 if u is None else u[0][some.atoms])
+                r = torch.cat([r, come], 1)
+            numbers, coordinates = of.p[some.parameters].unbind(1), r.reshape(len(r), -1, n).unbind(1)
+            given = coordinates, numbers, 0.5 * (of.t + of.t_start) if flies else of.t
+            value, steep = function(*given) if slope else (function.value(*given), [])
+            values.append((zero + value).expand(len(r), n))
             if slope:
-                value, steep = row.function(coordinates, numbers, time)
-                full = [base.new_zeros(()) + each for each in steep]
-                slopes.append(torch.stack([e.expand(len(r), n) for e in full], 1).reshape(-1, 3, n))
-            else:
-                value = row.function.value(coordinates, numbers, time)
-            values.append((base.new_zeros(()) + value).expand(len(r), n))
+                slopes.append(torch.stack([(zero + e).expand(len(r), n) for e in steep], 1).reshape(-1, 3, n))
         return [torch.cat(values)[self.order]], torch.cat(slopes)[self.slots] if slope else None
 
     def couple(self, left: Any, right: Any, weights: Vector) -> Tensor:
         entry, one, other, atom = self.products
         terms = (left[one] * (weights[0][atom] * right[other])).sum(1)
-        return terms.new_zeros(len(self.program.row), terms.shape[-1]).index_add(0, entry, terms)
+        return _summed(terms, entry, len(self.program.row))
 
     def solve(self, s: Tensor, b: Vector, transposed: bool = False) -> Vector:
         return [_Solution.apply(s[self.program.across] if transposed else s, b[0], self.program)]
@@ -202,18 +184,12 @@ class Levels(Clusters):
         return [s[self.program.diagonal]]
 
     def spread(self, slope: Any, lam: Vector) -> Vector:
-        some = slice(None) if len(lam[0]) == len(self.pattern.rows) else self.row < len(lam[0])
+        some = self.row < len(lam[0])
         terms = slope[some] * lam[0][self.row[some]].unsqueeze(1)
-        return [terms.new_zeros(self.pattern.n_atoms, *terms.shape[1:]).index_add(0, self.atom[some], terms)]
+        return [_summed(terms, self.atom[some], self.pattern.n_atoms)]
 
     def contract(self, slope: Any, v: Vector) -> Vector:
-        terms = (slope * v[0][self.atom]).sum(1)
-        return [terms.new_zeros(len(self.pattern.rows), terms.shape[-1]).index_add(0, self.row, terms)]
-
-    def lengths(self, slope: Any) -> Vector:
-        squares = (slope * slope).sum(1)
-        total = squares.new_zeros(len(self.pattern.rows), squares.shape[-1])
-        return [total.index_add(0, self.row, squares).sqrt()]
+        return [_summed((slope * v[0][self.atom]).sum(1), self.row, len(self.pattern.rows))]
 
     def solved(self, rows: Vector) -> Vector:
         return [rows[0][: self.pattern.rank]]
@@ -221,15 +197,9 @@ class Levels(Clusters):
     def off(self, value: Vector, targets: Vector) -> Vector:
         found = value[0] - targets[0]
         period = self.period.to(found.dtype)
-        return [
-            torch.where(period > 0, found - period * torch.round(found / torch.where(period > 0, period, 1)), found)
-        ]
+        turns = torch.round(found / period)
+        return [found - torch.where(turns != 0, period * turns, 0.0)]
 
 
-def _table(entries: Any, device: torch.device) -> Tensor:
-    return torch.tensor([list(each) for each in entries], dtype=torch.long, device=device)
-
-
-def _moved(program: _Program, device: torch.device) -> _Program:
-    levels = [_Level(*(table.to(device) for table in level)) for level in program.levels]
-    return _Program(levels, *(table.to(device) for table in program[1:5]), program.numbers)
+def _summed(terms: Tensor, index: Tensor, count: int) -> Tensor:
+    return terms.new_zeros(count, *terms.shape[1:]).index_add(0, index, terms)
