@@ -263,6 +263,7 @@ EXTRAS = {
     "sympy": "formulas",
     "pymbar": "free-energy",
     "torch": "torch",
+    "torch_sim": "torchsim",
 }
 
 

@@ -26,8 +26,8 @@ OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "
 PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
 EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
-#: Pages on a program that no extra installs.
-NEEDS = {
+#: Pages on a program that `all` does not install; those on torch run in tests/torchsim.
+NEEDS = {"batched.md": "torch_sim"} | {
     f"tutorials/{name}.md": package for name, package in runpy.run_path(ROOT / "docs/notebooks.py")["NEEDS"].items()
 }
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
