@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcons.batched.clusters import Clusters, Pattern, Problem, Vector
-from kcons.plan.clusters_alike import elimination, neighbors
+from kcons.plan.clusters_alike import elimination
 
 
 class _Level(NamedTuple):
@@ -42,8 +42,8 @@ def _table(entries: Iterable[Iterable[int]], width: int, device: torch.device) -
 def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tuple[int, int], int]]:
     """Elimination of the rows that are solved for, and their entries by number, those that fill in among them."""
     moving = [tuple(a for a in row.atoms if a not in pattern.fixed) for row in pattern.rows[: pattern.rank]]
-    order = elimination(neighbors(moving), set())
-    place, later = order.rows, [[order.rows[i] for i in some] for some in order.later]
+    order = elimination(moving, set())
+    place, later = order.rows.tolist(), [order.rows[some].tolist() for some in order.later]
     pairs = [pair for here, some in zip(place, later, strict=True) for i in some for pair in ((here, i), (i, here))]
     numbers = {pair: k for k, pair in enumerate([*((k, k) for k in place), *pairs])}
     levels = []
